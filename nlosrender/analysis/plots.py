@@ -1,0 +1,253 @@
+"""One picture of a capture: the wall over time, one histogram, the light of each bounce, one row over time."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, cast
+
+import numpy as np
+
+from nlosrender.analysis.laser_view import (
+    Float64,
+    LaserView,
+    frame_bins,
+    laser_view,
+    lit_window,
+    point_histograms,
+    row_over_time,
+    wall_frames,
+)
+from nlosrender.analysis.theme import (
+    COLORMAP,
+    FAINT,
+    GROUND,
+    INK,
+    MARK,
+    PANEL,
+    TICK_SIZE,
+    add_nanoseconds,
+    color_bar,
+    line_colors,
+    power_of_ten,
+    style,
+)
+from nlosrender.capture.bounces import FIRST_BOUNCE, LAST_FILE_BOUNCE
+from nlosrender.errors import FileError
+from nlosrender.files.reader import StoredCapture, open_capture
+from nlosrender.files.replacement import check_writable, explained_write, partial_path, publish
+from nlosrender.files.stored_header import StoredHeader
+from nlosrender.units import opl_to_seconds
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure, SubFigure
+
+FORMATS = (".png", ".pdf", ".svg")
+DECADES = 5  # shown of a logarithmic axis
+ROW_LINES = 1200  # of the row over time: more than the picture has pixels
+UNIT = r"J m$^{-2}$ sr$^{-1}$"
+
+
+def plot_capture(
+    path: str | Path,
+    out_png: str | Path,
+    laser: tuple[int, int] | None = None,
+    pixel: tuple[int, int] | None = None,
+) -> Path:
+    """Draw one laser point's part of a capture; only that part is read, a few rows at a time.
+
+    Parameters
+    ----------
+    path
+        Capture file.
+    out_png
+        Picture to write: .png, .pdf or .svg.
+    laser
+        (row, column) of the laser point; the middle of the laser grid when omitted.
+    pixel
+        (row, column) of the sensor point whose histogram is shown; the brightest when omitted.
+
+    Returns
+    -------
+    Path
+        ``out_png``.
+
+    Raises
+    ------
+    FileError
+        The capture cannot be read, a point does not exist, or the picture cannot be written.
+    """
+    picture = Path(out_png)
+    if picture.suffix.lower() not in FORMATS:
+        raise FileError(f"{picture}: a picture's name ends in one of {', '.join(FORMATS)}")
+    target = check_writable(picture)
+    if target == Path(path).resolve():
+        raise FileError(f"{picture}: is the capture itself. Name another picture.")
+    with open_capture(path) as capture:
+        figure = _draw(capture, laser, pixel)
+    partial = partial_path(target)
+    with explained_write(picture):
+        try:
+            figure.savefig(partial, format=target.suffix[1:].lower(), dpi=130, facecolor=GROUND)
+            publish(partial, target)
+        finally:
+            partial.unlink(missing_ok=True)
+    return picture
+
+
+def _draw(capture: StoredCapture, laser: tuple[int, int] | None, pixel: tuple[int, int] | None) -> Figure:
+    from matplotlib.figure import Figure
+    from matplotlib.layout_engine import ConstrainedLayoutEngine
+
+    header = capture.header
+    middle = (header.sizes["laser_y"] // 2, header.sizes["laser_x"] // 2)
+    view = laser_view(capture, middle if laser is None else laser)
+    pixel = view.brightest if pixel is None else pixel
+    spacing = ConstrainedLayoutEngine(w_pad=0.08, h_pad=0.08, hspace=0.04, wspace=0.02)
+    figure = Figure(figsize=(14, 7.6), facecolor=GROUND, layout=spacing)
+    heading, upper, lower = cast("list[SubFigure]", figure.subfigures(3, 1, height_ratios=[0.17, 1, 1.12]))
+    for part in (heading, upper, lower):
+        part.set_facecolor(GROUND)
+    # a dollar sign in a file name is not the start of a formula
+    heading.text(0.012, 0.66, header.path.name, color=INK, size=15, weight="bold", va="center", parse_math=False)
+    heading.text(0.012, 0.12, _subtitle(header, view), color=FAINT, size=10.5, va="center", parse_math=False)
+    _draw_frames(upper, capture, view, pixel)
+    left, center, right = lower.subplots(1, 3, width_ratios=[1.55, 0.75, 1.2])
+    _draw_histogram(left, capture, view, pixel)
+    _draw_bounces(center, header, view)
+    _draw_row(right, capture, view)
+    return figure
+
+
+def _subtitle(header: StoredHeader, view: LaserView) -> str:
+    rows, columns = header.sensor_grid
+    parts = [header.scan_type, f"{columns} x {rows} sensor points"]
+    if header.scan_type == "exhaustive":
+        ly, lx = header.laser_grid
+        parts.append(f"laser in row {view.laser[0]}, column {view.laser[1]} of {lx} x {ly}")
+    width = header.bin_width_opl
+    parts.append(f"{header.n_bins} bins of {1000 * width:.4g} mm ({opl_to_seconds(width) * 1e12:.3g} ps)")
+    engine, error = header.attributes.get("render_engine"), header.attributes.get("error_estimate")
+    if isinstance(engine, str):
+        parts.append(f"engine {engine[:40]}")
+    if isinstance(error, (int, float)):
+        parts.append(f"estimated error {100 * error:.2g} %")
+    if not view.time.any():
+        parts.append("no light in the time window")
+    return "  ·  ".join(parts)
+
+
+def _draw_frames(figure: SubFigure, capture: StoredCapture, view: LaserView, pixel: tuple[int, int]) -> None:
+    """Draw the wall at a few moments, each scaled by itself: the last are orders of magnitude darker."""
+    header = capture.header
+    first, last = lit_window(view.time)
+    half = (last - first) // 400  # a single bin is mostly noise where bins are many
+    bins = frame_bins(view.time)
+    windows = [slice(max(index - half, 0), index + half + 1) for index in bins]
+    frames = wall_frames(capture, view.laser, windows)
+    extent, xlabel, ylabel = _wall_extent(header)
+    all_axes = np.ravel(figure.subplots(1, len(bins), sharex=True, sharey=True, squeeze=False))
+    for axes, frame, index in zip(all_axes, frames, bins, strict=True):
+        opl = header.start_opl + (index + 0.5) * header.bin_width_opl
+        style(axes, f"{opl:.3f} m   {opl_to_seconds(opl) * 1e9:.2f} ns", xlabel, ylabel if axes is all_axes[0] else "")
+        axes.imshow(frame, origin="lower", extent=extent, cmap=COLORMAP, vmin=0, vmax=frame.max() or 1, aspect="equal")
+        x, y = _wall_position(header, pixel, extent)
+        axes.plot(x, y, marker="+", markersize=9, markeredgewidth=1.2, color=MARK, clip_on=False)
+
+
+def _draw_histogram(axes: Axes, capture: StoredCapture, view: LaserView, pixel: tuple[int, int]) -> None:
+    header = capture.header
+    first, last = lit_window(view.time)
+    histograms = point_histograms(capture, view.laser, pixel)[:, first : last + 1]
+    edges = header.start_opl + np.arange(first, last + 2) * header.bin_width_opl
+    shown = [slot for slot in range(len(histograms)) if histograms[slot].any()]
+    logarithmic = len(shown) > 1  # higher bounces are orders of magnitude darker
+    factor, power = (1.0, "") if logarithmic else power_of_ten(float(histograms.max()))
+    top = float(histograms.max()) / factor
+    title = f"sensor point in row {pixel[0]}, column {pixel[1]} (+)"
+    style(axes, title, "optical path length [m]", f"H per bin [{power}{UNIT}]")
+    for slot, color in zip(shown, line_colors(len(shown)), strict=True):
+        label = _bounce_label(header, slot)
+        axes.stairs(histograms[slot] / factor, edges, baseline=None, color=color, lw=1.3, label=label)
+    if logarithmic and top > 0:
+        axes.set_yscale("log")
+        axes.set_ylim(top * 10.0**-DECADES, top * 2)
+    elif top > 0:
+        axes.set_ylim(0, top * 1.08)
+    if shown:
+        axes.legend(facecolor=PANEL, edgecolor="none", labelcolor=INK, fontsize=9, loc="upper right", framealpha=0.75)
+    axes.set_xlim(edges[0], edges[-1])
+    add_nanoseconds(axes)
+
+
+def _draw_bounces(axes: Axes, header: StoredHeader, view: LaserView) -> None:
+    energy = view.bounces
+    slots = range(len(energy))
+    lit = [slot for slot in slots if energy[slot] > 0]
+    style(axes, "light of each bounce", "bounce", f"sum over wall and time [{UNIT}]")
+    axes.bar(lit, energy[lit], color=line_colors(len(lit)), width=0.7)
+    axes.set_xticks(slots, [_bounce_label(header, slot).removeprefix("bounce ") for slot in slots])
+    axes.set_xlim(-1, len(energy))
+    if lit:
+        axes.set_yscale("log")
+        top, bottom = energy.max(), energy[lit].min()
+        axes.set_ylim(max(bottom / 10, top * 1e-12), top * 4)
+    for slot in lit:
+        percent = 100 * energy[slot] / energy[lit].sum()
+        share = f"{percent:.0f} %" if percent >= 10 else f"{percent:.2g} %"
+        at = (slot, float(energy[slot]))
+        axes.annotate(share, at, (0, 3), textcoords="offset points", ha="center", color=INK, size=TICK_SIZE)
+
+
+def _draw_row(axes: Axes, capture: StoredCapture, view: LaserView) -> None:
+    from matplotlib.colors import PowerNorm
+
+    header = capture.header
+    row = view.brightest[0]
+    first, last = lit_window(view.time)
+    light = _at_most(row_over_time(capture, view.laser, row)[:, first : last + 1].T, ROW_LINES)
+    factor, power = power_of_ten(float(light.max()))
+    (left, right, _, _), xlabel, _ = _wall_extent(header)
+    early, late = (header.start_opl + index * header.bin_width_opl for index in (first, last + 1))
+    style(axes, f"brightest row ({row}) over time", xlabel, "optical path length [m]")
+    # square root: one bright front would leave everything behind it black
+    scale = PowerNorm(0.5, vmin=0, vmax=float(light.max()) / factor or 1.0, clip=True)
+    extent = (left, right, early, late)
+    image = axes.imshow(
+        light / factor, origin="lower", extent=extent, aspect="auto", cmap=COLORMAP, norm=scale, interpolation="nearest"
+    )
+    color_bar(axes.figure, image, axes, f"H per bin [{power}{UNIT}]")
+
+
+def _bounce_label(header: StoredHeader, slot: int) -> str:
+    if header.bounces_known and not header.split_bounces:
+        return "all bounces"
+    bounce = header.bounce_indices[slot] + FIRST_BOUNCE
+    limit = header.attributes.get("max_bounces")
+    more = bounce == LAST_FILE_BOUNCE and not (isinstance(limit, int) and limit <= LAST_FILE_BOUNCE)
+    return f"bounce {bounce}{'+' if more else ''}"
+
+
+def _wall_extent(header: StoredHeader) -> tuple[tuple[float, float, float, float], str, str]:
+    """Return (left, right, bottom, top) of the sensor grid, and labels for its axes; indices without a known size."""
+    size = header.sensor_grid_size
+    if size is not None and len(size) == 2 and all(np.isfinite(length) and length > 0 for length in size):
+        width, height = size
+        return (-width / 2, width / 2, -height / 2, height / 2), "wall x [m]", "wall y [m]"
+    rows, columns = header.sensor_grid
+    return (-0.5, columns - 0.5, -0.5, rows - 0.5), "sensor column", "sensor row"
+
+
+def _wall_position(
+    header: StoredHeader, pixel: tuple[int, int], extent: tuple[float, float, float, float]
+) -> tuple[float, float]:
+    left, right, bottom, top = extent
+    rows, columns = header.sensor_grid
+    return left + (pixel[1] + 0.5) / columns * (right - left), bottom + (pixel[0] + 0.5) / rows * (top - bottom)
+
+
+def _at_most(light: Float64, lines: int) -> Float64:
+    """Join neighbouring lines (their maximum) until no more than ``lines`` are left: a front must not vanish."""
+    join = -(-len(light) // lines)
+    padded = np.pad(light, ((0, -len(light) % join), (0, 0)))
+    return padded.reshape(-1, join, light.shape[1]).max(axis=1)

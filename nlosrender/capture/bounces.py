@@ -1,0 +1,63 @@
+"""The one definition of a bounce.
+
+Bounce k is the k-th surface interaction between laser and sensor, the relay wall's two included:
+
+- bounce 2: laser point -> sensor point, straight (zero on a planar wall);
+- bounce 3: wall, hidden surface, wall ("third bounce");
+- bounce k: k - 2 further interactions between the laser point and the sensor point.
+
+Z-NLOS files keep six bounce indices: index i holds bounce i + 2, and the last one everything above.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+FIRST_BOUNCE = 2  # a path has at least the laser point and the sensor point
+THIRD_BOUNCE = 3
+FILE_BOUNCES = 6  # length of the bounce axis of a Z-NLOS file
+LAST_FILE_BOUNCE = FIRST_BOUNCE + FILE_BOUNCES - 1  # 7: bounces above it add into its index
+
+
+@dataclass(frozen=True)
+class BounceAxis:
+    """The bounces a render computes and the index on the bounce axis each one is added to.
+
+    Parameters
+    ----------
+    max_bounces
+        Highest bounce computed, >= 2; None for no limit.
+    split
+        Give each bounce its own index; otherwise the axis has a single index that holds their sum.
+    """
+
+    max_bounces: int | None
+    split: bool
+
+    @property
+    def n_slots(self) -> int:
+        """Length of the in-memory bounce axis."""
+        if not self.split:
+            return 1
+        highest = LAST_FILE_BOUNCE if self.max_bounces is None else min(self.max_bounces, LAST_FILE_BOUNCE)
+        return highest - FIRST_BOUNCE + 1
+
+    def slot(self, bounce: int) -> int:
+        """Return the index of ``bounce`` on the in-memory bounce axis.
+
+        Raises
+        ------
+        ValueError
+            ``bounce`` is below 2.
+        """
+        if bounce < FIRST_BOUNCE:
+            raise ValueError(f"bounce {bounce}: a path has at least {FIRST_BOUNCE} interactions")
+        return min(bounce - FIRST_BOUNCE, self.n_slots - 1)
+
+    @property
+    def file_indices(self) -> tuple[int, ...]:
+        """Return, for each in-memory slot, its index on the bounce axis of a Z-NLOS file.
+
+        Unsplit light goes to index 1, the third bounce's, where every loader looks.
+        """
+        return tuple(range(self.n_slots)) if self.split else (THIRD_BOUNCE - FIRST_BOUNCE,)

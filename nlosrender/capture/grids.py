@@ -1,0 +1,203 @@
+"""What is illuminated and measured: laser and sensor points on the relay wall, and the legs to them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from nlosrender.scene.pose import Float64
+from nlosrender.scene.relay_wall import EDGE_TOLERANCE, RelayWall
+
+if TYPE_CHECKING:
+    from nlosrender.config.capture import CaptureConfig, GridConfig
+
+SCAN_TYPES = ("single", "confocal", "exhaustive")
+
+
+@dataclass(frozen=True, eq=False)
+class PointGrid:
+    """Points on the relay wall: rows ascend in wall y, columns in wall x; positions and normals in the local frame."""
+
+    wall_coordinates: Float64  # (ny, nx, 2) m
+    positions: Float64  # (ny, nx, 3) m
+    normals: Float64  # (ny, nx, 3), unit
+    uvs: Float64  # (ny, nx, 2), Mitsuba's texture coordinates
+    size: tuple[float, float]  # extent the cells cover (width, height) [m]; (0, 0) for a single point
+
+    @property
+    def ny(self) -> int:
+        """Number of rows."""
+        return self.positions.shape[0]
+
+    @property
+    def nx(self) -> int:
+        """Number of columns."""
+        return self.positions.shape[1]
+
+
+@dataclass(frozen=True, eq=False)
+class Capture:
+    """One capture in the relay wall's local frame, before time and light.
+
+    Raises
+    ------
+    ValueError
+        The scan type is unknown, the grids do not fit it, or the energy or the spot's radius is out of range.
+    """
+
+    scan_type: str  # single, confocal or exhaustive
+    sensor_grid: PointGrid
+    laser_grid: PointGrid  # confocal: the sensor grid itself
+    laser_position: Float64  # (3,) m
+    sensor_position: Float64  # (3,) m
+    account_first_and_last_bounces: bool
+    laser_energy: float  # J per pulse
+    laser_spot_radius: float  # m; 0 = a point
+
+    def __post_init__(self) -> None:
+        if self.scan_type not in SCAN_TYPES:
+            raise ValueError(f"scan_type {self.scan_type!r}: need one of {', '.join(SCAN_TYPES)}")
+        if self.scan_type == "confocal" and self.laser_grid is not self.sensor_grid:
+            raise ValueError("a confocal capture has one grid: laser_grid must be sensor_grid")
+        if self.scan_type == "single" and self.n_lasers != 1:
+            raise ValueError(f"a single capture has one laser point, got {self.n_lasers}")
+        if not (np.isfinite(self.laser_energy) and self.laser_energy > 0):
+            raise ValueError(f"laser_energy: got {self.laser_energy!r}, need a finite number > 0 [J]")
+        if not (np.isfinite(self.laser_spot_radius) and self.laser_spot_radius >= 0):
+            raise ValueError(f"laser_spot_radius: got {self.laser_spot_radius!r}, need a finite number >= 0 [m]")
+
+    @property
+    def n_lasers(self) -> int:
+        """Number of laser points."""
+        return self.laser_grid.ny * self.laser_grid.nx
+
+    @property
+    def n_sensors(self) -> int:
+        """Number of sensor points."""
+        return self.sensor_grid.ny * self.sensor_grid.nx
+
+    @property
+    def laser_legs(self) -> Float64:
+        """Optical path length laser -> laser point, (ly, lx) [m]; zeros when first and last legs are not counted."""
+        return self._legs(self.laser_grid, self.laser_position)
+
+    @property
+    def sensor_legs(self) -> Float64:
+        """Optical path length sensor point -> sensor, (ny, nx) [m]; zeros when first and last legs are not counted."""
+        return self._legs(self.sensor_grid, self.sensor_position)
+
+    def _legs(self, grid: PointGrid, device_position: Float64) -> Float64:
+        if not self.account_first_and_last_bounces:
+            return np.zeros(grid.positions.shape[:2])
+        return np.linalg.norm(grid.positions - device_position, axis=-1)
+
+
+def point_grid(wall: RelayWall, nx: int, ny: int, width: float | None = None, height: float | None = None) -> PointGrid:
+    """Return the centres of nx x ny equal cells, centred on the wall.
+
+    Parameters
+    ----------
+    wall
+        The relay wall.
+    nx, ny
+        Number of columns and rows, >= 1.
+    width, height
+        Extent of all cells together in wall coordinates [m]; the whole wall when None.
+
+    Returns
+    -------
+    PointGrid
+        Point (row j, column i) at ((i + 0.5) / nx - 0.5) * width, ((j + 0.5) / ny - 0.5) * height.
+
+    Raises
+    ------
+    ValueError
+        A count is below 1, or the extent is not positive or larger than the wall.
+    """
+    if nx < 1 or ny < 1:
+        raise ValueError(f"grid of {nx} x {ny} points: need at least 1 x 1")
+    width = wall.width if width is None else float(width)
+    height = wall.height if height is None else float(height)
+    for name, extent, limit in (("width", width, wall.width), ("height", height, wall.height)):
+        if not 0 < extent <= limit * (1 + EDGE_TOLERANCE):
+            raise ValueError(f"grid {name}: got {extent:g} m, need > 0 and <= {limit:g} m, the wall's")
+    x = _cell_centres(nx) * width
+    y = _cell_centres(ny) * height
+    return _grid_at(wall, np.stack(np.meshgrid(x, y, indexing="xy"), axis=-1), (width, height))
+
+
+def single_point(wall: RelayWall, xy: ArrayLike) -> PointGrid:
+    """Return the 1 x 1 grid of one point at wall coordinates ``xy`` (2,) [m]; its size is (0, 0).
+
+    Raises
+    ------
+    ValueError
+        The point is off the wall.
+    """
+    return _grid_at(wall, np.asarray(xy, dtype=np.float64).reshape(1, 1, 2), (0.0, 0.0))
+
+
+def build_capture(capture_config: CaptureConfig, wall: RelayWall) -> Capture:
+    """Build the capture of a configuration.
+
+    Parameters
+    ----------
+    capture_config
+        ``capture``; device positions in scene coordinates [m]. A position of None is the wall's default: 1 m in front
+        of its centre, or the middle of a sphere or cylinder lit from within.
+    wall
+        The relay wall.
+
+    Returns
+    -------
+    Capture
+        In the wall's local frame.
+
+    Raises
+    ------
+    ValueError
+        A grid or point does not fit the wall, or a value is out of range.
+    """
+    sensor_grid = _configured_grid(capture_config.sensor_grid, wall)
+    if capture_config.scan_type == "confocal":
+        laser_grid = sensor_grid
+    elif capture_config.scan_type == "exhaustive":
+        if capture_config.laser_grid is None:
+            raise ValueError("an exhaustive capture needs a laser_grid")
+        laser_grid = _configured_grid(capture_config.laser_grid, wall)
+    else:
+        laser_point = capture_config.laser_point
+        laser_grid = single_point(wall, (0.0, 0.0) if laser_point is None else laser_point)
+    return Capture(
+        scan_type=capture_config.scan_type,
+        sensor_grid=sensor_grid,
+        laser_grid=laser_grid,
+        laser_position=_device_position(capture_config.laser_position, wall),
+        sensor_position=_device_position(capture_config.sensor_position, wall),
+        account_first_and_last_bounces=bool(capture_config.account_first_and_last_bounces),
+        laser_energy=float(capture_config.laser_energy),
+        laser_spot_radius=float(capture_config.laser_spot_radius),
+    )
+
+
+def _cell_centres(count: int) -> Float64:
+    # (2i + 1 - n) / 2n: symmetric about 0 to the last bit, and exactly 0 in the middle of an odd count
+    return (2 * np.arange(count) + 1 - count) / (2 * count)
+
+
+def _configured_grid(grid_config: GridConfig, wall: RelayWall) -> PointGrid:
+    return point_grid(wall, grid_config.nx, grid_config.ny, grid_config.width, grid_config.height)
+
+
+def _device_position(scene_position: ArrayLike | None, wall: RelayWall) -> Float64:
+    return wall.default_device_position if scene_position is None else wall.pose.to_local(scene_position)
+
+
+def _grid_at(wall: RelayWall, xy: Float64, size: tuple[float, float]) -> PointGrid:
+    arrays = (xy, wall.positions(xy), wall.normals(xy), wall.uv(xy))
+    for array in arrays:
+        array.flags.writeable = False
+    return PointGrid(*arrays, size)

@@ -1,0 +1,55 @@
+"""The typer application and its one error handler.
+
+Command modules import what they need inside the command: ``--help`` must not wait for Mitsuba, numpy or pydantic.
+"""
+
+from __future__ import annotations
+
+import sys
+from typing import Annotated
+
+import typer
+
+from nlosrender import __version__
+from nlosrender.cli import config_commands, file_commands, machine_commands, render_command
+from nlosrender.errors import EXIT_INTERRUPTED, NlosError
+
+app = typer.Typer(
+    name="nlosrender",
+    help="Simulate non-line-of-sight captures: one YAML in, one Z-NLOS HDF5 file out.",
+    no_args_is_help=True,
+    add_completion=False,
+    rich_markup_mode=None,
+    pretty_exceptions_enable=False,
+)
+render_command.register(app)
+config_commands.register(app)
+file_commands.register(app)
+machine_commands.register(app)
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(__version__)
+        raise typer.Exit
+
+
+@app.callback()
+def _global_options(
+    version: Annotated[
+        bool, typer.Option("--version", help="Print the version and exit.", callback=_print_version, is_eager=True)
+    ] = False,
+) -> None:
+    """Simulate non-line-of-sight captures: one YAML in, one Z-NLOS HDF5 file out."""
+
+
+def main() -> None:
+    """Run the command line; turn every explained error into a message on stderr and its exit code."""
+    try:
+        app()
+    except NlosError as error:
+        typer.echo(f"error: {error}" if "\n" not in str(error) else f"errors:\n{error}", err=True)
+        sys.exit(error.exit_code)
+    except KeyboardInterrupt:
+        typer.echo("interrupted", err=True)
+        sys.exit(EXIT_INTERRUPTED)

@@ -1,0 +1,119 @@
+"""The metadata of a capture as a table for people."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+SHOWN_LENGTH = 160  # characters of one value in the table; --json has all of it
+
+
+def summary_table(summary: dict[str, object]) -> str:
+    """Return the summary of a capture (``analysis.summary.summarise``) as lines of label and text."""
+    rows = [(label, printable(text)) for label, text in _rows(summary) if text]
+    width = max(len(label) for label, _ in rows)
+    return "\n".join(f"{label:<{width}}  {text}" for label, text in rows)
+
+
+def _rows(summary: dict[str, object]) -> list[tuple[str, str]]:
+    """Return label and text of every line; an empty text means that the file does not say."""
+    legs = {True: "included in time", False: "NOT included in time"}
+    checked = summary.get("violations")
+    verdict = "matches the Z-NLOS layout, all samples finite" if checked == [] else "FAILED, see below"
+    return [
+        ("file", f"{summary['file']} ({_bytes(summary['size_on_disk'])})"),
+        ("scan type", _text(summary["scan_type"])),
+        ("sensor points", _grid(summary["sensor_grid"], summary["sensor_grid_size"])),
+        ("laser points", _grid(summary["laser_grid"], summary["laser_grid_size"])),
+        ("sensor at", _lengths(summary["sensor_position"])),
+        ("laser at", _lengths(summary["laser_position"])),
+        ("time axis", _time_axis(summary)),
+        ("first and last legs", legs.get(summary["account_first_and_last_bounces"], "")),  # type: ignore[call-overload]
+        ("bounces", _bounces(summary)),
+        ("channels", _text(summary["channels"])),
+        ("frame", _text(summary["frame"])),
+        ("hidden volume", _hidden_volume(summary)),
+        ("data", _storage(summary)),
+        ("engine", _text(summary["engine"])),
+        ("samples per pair", _text(summary["samples"])),
+        ("seed", _text(summary["seed"])),
+        ("error estimate", _percent(summary["error_estimate"])),
+        ("outside the window", _text(summary["out_of_window_energy"])),
+        ("seconds", _named(summary["seconds"])),
+        ("created", _text(summary["created"])),
+        ("config hash", _text(summary["config_hash"])),
+        ("written by", _text(summary["written_by"])),
+        ("versions", _named(summary["versions"])),
+        ("check", "" if checked is None else verdict),
+    ]
+
+
+def _time_axis(summary: dict[str, object]) -> str:
+    window = f"{_text(summary['start_opl'])} to {_text(summary['end_opl'])} m of optical path"
+    bins = f"{_text(summary['bin_width_opl'])} m ({_text(summary['bin_width_ps'])} ps)"
+    return f"{summary['n_bins']} bins of {bins}, {window}"
+
+
+def _bounces(summary: dict[str, object]) -> str:
+    if isinstance(summary["bounces"], list):
+        listed = ", ".join(str(bounce) for bounce in summary["bounces"])
+    else:
+        listed = "" if summary["split_bounces"] is None else "all in one"
+    limit = _text(summary["max_bounces"])
+    return listed + (f" (highest rendered: {limit})" if listed and limit else "")
+
+
+def _hidden_volume(summary: dict[str, object]) -> str:
+    edges, center = summary["hidden_volume_size"], summary["hidden_volume_position"]
+    if not isinstance(edges, list) or not any(edges):
+        return ""
+    return f"{' x '.join(_text(edge) for edge in edges)} m, centre {_lengths(center)}"
+
+
+def _storage(summary: dict[str, object]) -> str:
+    shape = " x ".join(str(length) for length in _sequence(summary["data_shape"]))
+    variance = ", with variance" if summary["has_variance"] else ""
+    size = _bytes(summary["size_of_samples"])
+    return f"{shape} {summary['dtype']} ({size}), compression {summary['compression']}{variance}"
+
+
+def _grid(points: object, size: object) -> str:
+    extent = f" over {' x '.join(_text(length) for length in _sequence(size))} m" if size else ""
+    return " x ".join(str(number) for number in _sequence(points)) + extent
+
+
+def _lengths(position: object) -> str:
+    return f"({', '.join(_text(length) for length in _sequence(position))}) m" if position else ""
+
+
+def _named(values: object) -> str:
+    return (
+        ", ".join(f"{name} {_text(value)}" for name, value in values.items())
+        if isinstance(values, dict)
+        else _text(values)
+    )
+
+
+def _percent(value: object) -> str:
+    return f"{100 * value:.3g} % (relative L2)" if isinstance(value, (int, float)) else _text(value)
+
+
+def _bytes(size: object) -> str:
+    amount, units = float(size) if isinstance(size, (int, float)) else 0.0, ["B", "KiB", "MiB", "GiB", "TiB"]
+    while amount >= 1024 and len(units) > 1:
+        amount, units = amount / 1024, units[1:]
+    return f"{amount:.4g} {units[0]}"
+
+
+def _text(value: object) -> str:
+    return "" if value is None else f"{value:.6g}" if isinstance(value, float) else str(value)
+
+
+def _sequence(value: object) -> Sequence[object]:
+    return value if isinstance(value, (list, tuple)) else [value]
+
+
+def printable(text: object) -> str:
+    """Return text from a file as one line that is safe to print."""
+    # attributes are anybody's: control characters would reach the terminal
+    shown = "".join(character if character.isprintable() else ascii(character)[1:-1] for character in str(text))
+    return shown if len(shown) <= SHOWN_LENGTH else shown[:SHOWN_LENGTH] + " ..."

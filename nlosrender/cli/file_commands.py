@@ -1,0 +1,89 @@
+"""Commands that look at capture files: info, plot."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from nlosrender.cli.capture_table import printable, summary_table
+
+CaptureFile = Annotated[Path, typer.Argument(metavar="FILE", help="Capture in Z-NLOS HDF5, by any writer.")]
+
+
+def register(app: typer.Typer) -> None:
+    """Add this module's commands to ``app``."""
+    app.command("info")(info)
+    app.command("plot")(plot)
+
+
+def info(
+    file: CaptureFile,
+    json_output: Annotated[bool, typer.Option("--json", help="Print one JSON object instead of a table.")] = False,
+    check: Annotated[
+        bool, typer.Option("--check", help="Also check the layout and every sample; exit code 3 if anything is wrong.")
+    ] = False,
+) -> None:
+    """Show what a capture file holds, from its metadata alone.
+
+    Example: `nlosrender info two-planes.hdf5 --check` prints the grids, the time axis, the bounces and where the
+    file comes from, then reads all samples to see that third-party loaders will accept it. It creates nothing.
+    """
+    import json
+
+    from nlosrender.analysis.summary import summarise
+    from nlosrender.errors import FileError
+
+    summary = summarise(file)
+    if check:
+        from nlosrender.files.validation import validate_file
+
+        summary["violations"] = validate_file(file)
+    typer.echo(json.dumps(summary, allow_nan=False) if json_output else summary_table(summary))
+    violations = summary.get("violations")
+    if violations and isinstance(violations, list):
+        listed = "\n".join(f"{file}: {printable(violation)}" for violation in violations)
+        raise FileError(f"{listed}\nThe file deviates from the Z-NLOS layout: other loaders may refuse or misread it.")
+
+
+def plot(
+    file: CaptureFile,
+    output: Annotated[
+        Path | None,
+        typer.Option("-o", "--output", metavar="OUT.png", help="Picture to write.", show_default="FILE.png"),
+    ] = None,
+    laser: Annotated[
+        str | None,
+        typer.Option(
+            metavar="IY,IX", help="Laser point (row, column) of an exhaustive capture.", show_default="the middle"
+        ),
+    ] = None,
+    pixel: Annotated[
+        str | None,
+        typer.Option(
+            metavar="IY,IX", help="Sensor point (row, column) of the histogram.", show_default="the brightest"
+        ),
+    ] = None,
+) -> None:
+    """Draw a capture: the relay wall over time, one histogram, the light of each bounce, one row over time.
+
+    Example: `nlosrender plot two-planes.hdf5 --pixel 6,8` creates two-planes.png and prints its path.
+    """
+    laser_at, pixel_at = _index(laser, "--laser"), _index(pixel, "--pixel")
+
+    from nlosrender.analysis.plots import plot_capture
+
+    picture = output or file.with_suffix(".png")
+    typer.echo(str(plot_capture(file, picture, laser=laser_at, pixel=pixel_at)))
+
+
+def _index(text: str | None, option: str) -> tuple[int, int] | None:
+    if text is None:
+        return None
+    parts = [part.strip() for part in text.split(",")]
+    if len(parts) != 2 or not all(part.isascii() and part.isdigit() and len(part) < 10 for part in parts):
+        raise typer.BadParameter(
+            f"got {text!r}, need a row and a column counted from 0, such as 6,8", param_hint=option
+        )
+    return int(parts[0]), int(parts[1])

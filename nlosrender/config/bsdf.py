@@ -1,0 +1,189 @@
+"""BSDFs: a Mitsuba BSDF as a dictionary, checked against the table of plugins without starting Mitsuba.
+
+A reflectance is a number (grey), ``[r, g, b]``, or a texture/spectrum dictionary.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Annotated, Any
+
+from pydantic import ValidationInfo
+
+from nlosrender.config.bsdf_table import (
+    BSDF_PARAMETERS,
+    BSDF_REQUIRED,
+    BSDF_TYPES,
+    COLORED_TYPES,
+    NESTED_BSDFS,
+    TEXTURE_REQUIRED,
+    TEXTURE_TYPES,
+    TRANSMITTING,
+    Kind,
+)
+from nlosrender.config.fields import Checked, as_finite
+from nlosrender.config.frozen import FrozenDict
+from nlosrender.config.plugin_check import TRANSFORM_KEYS, PluginCheck, checked_plugin
+from nlosrender.config.refusal import KeyPath, listed
+from nlosrender.errors import nearest
+
+_WITH_RGB = (Kind.REFLECTANCE, Kind.SPECTRUM)
+_WITH_TEXTURE = (Kind.REFLECTANCE, Kind.UNIT, Kind.SPECTRUM)
+_NUMBER_RANGES = {  # lowest and highest number allowed
+    Kind.REFLECTANCE: (0.0, 1.0),
+    Kind.UNIT: (0.0, 1.0),
+    Kind.UNIT_NUMBER: (0.0, 1.0),
+    Kind.SPECTRUM: (0.0, float("inf")),
+    Kind.IOR: (1e-6, float("inf")),
+    Kind.IOR_NUMBER: (1e-6, float("inf")),
+}
+
+
+def check_bsdf(value: Any, info: ValidationInfo) -> FrozenDict:
+    """Return the BSDF dictionary frozen, numbers as floats and file names absolute.
+
+    Raises
+    ------
+    pydantic.ValidationError
+        Unknown type or parameter, a value out of range, a missing file; all of them at once.
+    """
+    return checked_plugin(lambda check, bsdf: _bsdf(check, bsdf, ()), value, info)
+
+
+BsdfMapping = Annotated[
+    FrozenDict,
+    Checked(
+        check_bsdf,
+        {"type": "object", "required": ["type"], "properties": {"type": {"enum": list(BSDF_TYPES)}}},
+        with_info=True,
+    ),
+]
+WHITE_DIFFUSE = FrozenDict(type="diffuse", reflectance=1.0)
+
+
+def is_colored(value: object) -> bool:
+    """Return whether a checked BSDF, or a part of one, differs between colour channels (or may: textures)."""
+    if isinstance(value, Mapping):
+        kind = value.get("type")
+        metal = value.get("material", "none") != "none"
+        spectrum = kind == "spectrum" and as_finite(value.get("value")) is None
+        parts = (item for key, item in value.items() if key not in TRANSFORM_KEYS)
+        return kind in COLORED_TYPES or metal or spectrum or any(is_colored(part) for part in parts)
+    if not isinstance(value, tuple) or len(value) != 3 or any(as_finite(item) is None for item in value):
+        return False
+    return len(set(value)) > 1
+
+
+def _bsdf(check: PluginCheck, value: Any, path: KeyPath) -> Any:
+    kind = check.plugin_type(value, path, BSDF_TYPES, "Mitsuba BSDF")
+    if kind is None:
+        return value
+    known = BSDF_PARAMETERS.get(kind)
+    nested = [key for key, item in value.items() if key != "type" and _is_bsdf(item, key, kind)]
+    result: dict[str, Any] = {"type": kind}
+    for key, item in value.items():
+        at = (*path, key)
+        if key in nested:
+            result[key] = _bsdf(check, item, at)
+        elif known is None:
+            result[key] = _texture(check, item, at) if _is_texture(item) else check.generic(item, at)
+        elif key in known:
+            result[key] = _parameter(check, item, at, known[key])
+        elif key != "type":
+            _unknown_parameter(check, kind, key, at)
+    _check_combination(check, kind, value, nested, path)
+    return result
+
+
+def _is_bsdf(value: object, key: str, parent: str) -> bool:
+    """Tell a nested BSDF from a texture: by its type; a wrong type counts as a BSDF where only those may be."""
+    if not isinstance(value, Mapping) or parent not in NESTED_BSDFS or key in BSDF_PARAMETERS.get(parent, {}):
+        return False
+    return value.get("type") in BSDF_TYPES or (parent in BSDF_PARAMETERS and not _is_texture(value))
+
+
+def _is_texture(value: object) -> bool:
+    return isinstance(value, Mapping) and value.get("type") in TEXTURE_TYPES
+
+
+def _unknown_parameter(check: PluginCheck, kind: str, key: str, path: KeyPath) -> None:
+    known = list(BSDF_PARAMETERS[kind])
+    close = nearest(key, known)
+    hint = f" Did you mean {close}?" if close else ""
+    allowed = listed(known) if known else "nested BSDFs only"
+    check.fault(path, f"unknown parameter of the {kind} BSDF, it has: {allowed}.{hint}", at_key=True)
+
+
+def _check_combination(
+    check: PluginCheck, kind: str, value: Mapping[str, Any], nested: list[str], path: KeyPath
+) -> None:
+    for key in BSDF_REQUIRED.get(kind, ()):
+        if key not in value:
+            check.fault((*path, key), f"missing, the {kind} BSDF needs it.")
+    fewest, most = NESTED_BSDFS.get(kind, (0, 0))
+    if not fewest <= len(nested) <= most and kind in NESTED_BSDFS:
+        count = str(fewest) if fewest == most else f"{fewest} to {most}"
+        check.fault(path, f"got {len(nested)} nested BSDFs, need {count} in a {kind} BSDF.", at_key=True)
+    for key in nested:
+        if kind == "twosided" and value[key].get("type") in TRANSMITTING:
+            message = f"got {value[key]['type']}, which lets light through; need a BSDF that only reflects."
+            check.fault((*path, key, "type"), message)
+    if ("alpha_u" in value) != ("alpha_v" in value):
+        given, absent = ("alpha_u", "alpha_v") if "alpha_u" in value else ("alpha_v", "alpha_u")
+        check.fault((*path, given), f"{given} needs {absent} beside it; use alpha for both.", at_key=True)
+    if "alpha" in value and "alpha_u" in value:
+        check.fault((*path, "alpha"), "alpha and alpha_u, alpha_v exclude each other; keep one.", at_key=True)
+    if value.get("material", "none") != "none" and ("eta" in value or "k" in value):
+        check.fault((*path, "material"), "material and eta, k exclude each other; keep one.", at_key=True)
+    if kind == "principled" and "eta" in value and "specular" in value:
+        check.fault((*path, "specular"), "eta and specular exclude each other; keep one.", at_key=True)
+
+
+def _parameter(check: PluginCheck, value: Any, path: KeyPath, kind: Kind) -> Any:
+    if isinstance(value, Mapping) and kind in _WITH_TEXTURE:
+        return _texture(check, value, path, unit=kind is Kind.REFLECTANCE)
+    if kind is Kind.FLAG and isinstance(value, bool):
+        return value
+    if kind is Kind.DISTRIBUTION and value in ("beckmann", "ggx"):
+        return value
+    if kind in (Kind.MATERIAL, Kind.IOR) and isinstance(value, str) and value.strip():
+        return value
+    low, high = _NUMBER_RANGES.get(kind, (1.0, 0.0))  # an empty range: no number is allowed
+    if isinstance(value, (list, tuple)) and len(value) == 3 and kind in _WITH_RGB:
+        numbers = [as_finite(item) for item in value]
+    else:
+        numbers = [as_finite(value)]
+    if any(number is None or not low <= number <= high for number in numbers):
+        check.refuse(path, value, kind.value)
+        return value
+    return numbers[0] if len(numbers) == 1 else numbers
+
+
+def _texture(check: PluginCheck, value: Any, path: KeyPath, *, unit: bool = False) -> Any:
+    kind = check.plugin_type(value, path, TEXTURE_TYPES, "Mitsuba texture or spectrum")
+    if kind is None:
+        return value
+    for key in TEXTURE_REQUIRED.get(kind, ()):
+        if key not in value:
+            check.fault((*path, key), f"missing, the {kind} texture needs it.")
+    if kind == "spectrum" and len({"value", "filename"} & set(value)) != 1:
+        check.fault(path, "need either value or filename in a spectrum.", at_key=True)
+    result: dict[str, Any] = {"type": kind}
+    for key, item in value.items():
+        at = (*path, key)
+        if isinstance(item, Mapping) and key not in TRANSFORM_KEYS:
+            result[key] = _texture(check, item, at, unit=unit)
+        elif kind in ("rgb", "srgb") and key in ("value", "color"):
+            result[key] = _channels(check, item, at, unit)
+        elif unit and (key in ("color0", "color1") or (key == "value" and not isinstance(item, (list, tuple)))):
+            result[key] = _parameter(check, item, at, Kind.REFLECTANCE)
+        elif key != "type":
+            result[key] = check.generic(item, at)
+    return result
+
+
+def _channels(check: PluginCheck, value: Any, path: KeyPath, unit: bool) -> Any:
+    numbers = [as_finite(item) for item in value] if isinstance(value, (list, tuple)) else []
+    if len(numbers) != 3 or any(number is None or number < 0 or (unit and number > 1) for number in numbers):
+        check.refuse(path, value, f"[r, g, b] with each {'from 0 to 1' if unit else '>= 0'}")
+    return numbers or value

@@ -1,0 +1,120 @@
+"""The BSDF and texture plugins of Mitsuba 3.9 and the parameters of the common ones, as data.
+
+Static, so that validating a config does not start Mitsuba; checked against the plugins by hand (each parameter was
+loaded once with Mitsuba 3.9.1).
+"""
+
+from __future__ import annotations
+
+from enum import Enum
+
+
+class Kind(Enum):
+    """What a BSDF parameter may hold."""
+
+    REFLECTANCE = "a number from 0 to 1, [r, g, b] with each from 0 to 1, or a texture"
+    UNIT = "a number from 0 to 1, or a texture"
+    UNIT_NUMBER = "a number from 0 to 1"
+    SPECTRUM = "a number >= 0, [r, g, b] with each >= 0, or a spectrum"
+    IOR = "a number > 0 or the name of a medium"
+    IOR_NUMBER = "a number > 0"
+    MATERIAL = "the name of a metal, such as Au, Ag, Cu or none"
+    DISTRIBUTION = "beckmann or ggx"
+    FLAG = "true or false"
+
+
+def _names(words: str) -> tuple[str, ...]:
+    return tuple(words.split())
+
+
+BSDF_TYPES = _names(
+    "blendbsdf bumpmap circular conductor dielectric diffuse hair mask measured measured_polarized normalmap null "
+    "plastic polarizer pplastic principled principledthin retarder roughconductor roughdielectric roughplastic "
+    "thindielectric twosided"
+)
+TEXTURE_TYPES = _names(
+    "bitmap blackbody checkerboard d65 irregular mesh_attribute rawconstant regular rgb spectrum srgb uniform volume"
+)
+# Mitsuba crashes the process (bitmap) or fails late without these.
+TEXTURE_REQUIRED: dict[str, tuple[str, ...]] = {
+    "bitmap": ("filename",),
+    "blackbody": ("temperature",),
+    "irregular": ("wavelengths", "values"),
+    "mesh_attribute": ("name",),
+    "regular": ("wavelength_min", "wavelength_max", "values"),
+    "rgb": ("value",),
+    "srgb": ("color",),
+    "uniform": ("value",),
+}
+COLORED_TYPES = ("bitmap", "blackbody", "d65", "hair", "irregular", "measured", "mesh_attribute", "regular", "volume")
+
+_CONDUCTOR = {
+    "material": Kind.MATERIAL,
+    "eta": Kind.SPECTRUM,
+    "k": Kind.SPECTRUM,
+    "specular_reflectance": Kind.REFLECTANCE,
+}
+_DIELECTRIC = {
+    "int_ior": Kind.IOR,
+    "ext_ior": Kind.IOR,
+    "specular_reflectance": Kind.REFLECTANCE,
+    "specular_transmittance": Kind.REFLECTANCE,
+}
+_MICROFACETS = {
+    "distribution": Kind.DISTRIBUTION,
+    "alpha": Kind.UNIT,
+    "alpha_u": Kind.UNIT,
+    "alpha_v": Kind.UNIT,
+    "sample_visible": Kind.FLAG,
+}
+_PLASTIC = {
+    "diffuse_reflectance": Kind.REFLECTANCE,
+    "specular_reflectance": Kind.REFLECTANCE,
+    "int_ior": Kind.IOR,
+    "ext_ior": Kind.IOR,
+    "nonlinear": Kind.FLAG,
+}
+_UNIT_PRINCIPLED = _names(
+    "anisotropic metallic spec_trans spec_tint sheen sheen_tint flatness clearcoat clearcoat_gloss"
+)
+_PRINCIPLED_RATES = _names("main_specular_sampling_rate clearcoat_sampling_rate diffuse_reflectance_sampling_rate")
+
+BSDF_PARAMETERS: dict[str, dict[str, Kind]] = {
+    "diffuse": {"reflectance": Kind.REFLECTANCE},
+    "conductor": _CONDUCTOR,
+    "roughconductor": {**_CONDUCTOR, **_MICROFACETS},
+    "dielectric": _DIELECTRIC,
+    "thindielectric": _DIELECTRIC,
+    "roughdielectric": {**_DIELECTRIC, **_MICROFACETS},
+    "plastic": _PLASTIC,
+    "roughplastic": {
+        **_PLASTIC,
+        "distribution": Kind.DISTRIBUTION,
+        "alpha": Kind.UNIT_NUMBER,
+        "sample_visible": Kind.FLAG,
+    },
+    "principled": {
+        "base_color": Kind.REFLECTANCE,
+        "roughness": Kind.UNIT,
+        **dict.fromkeys(_UNIT_PRINCIPLED, Kind.UNIT),
+        "eta": Kind.IOR_NUMBER,
+        "specular": Kind.UNIT_NUMBER,
+        **dict.fromkeys(_PRINCIPLED_RATES, Kind.UNIT_NUMBER),
+    },
+    "twosided": {},
+    "mask": {"opacity": Kind.UNIT},
+    "blendbsdf": {"weight": Kind.UNIT},
+}
+BSDF_REQUIRED: dict[str, tuple[str, ...]] = {"blendbsdf": ("weight",), "measured": ("filename",)}
+NESTED_BSDFS: dict[str, tuple[int, int]] = {  # how few and how many BSDFs it holds, under any key
+    "twosided": (1, 2),
+    "mask": (1, 1),
+    "blendbsdf": (2, 2),
+    "bumpmap": (1, 1),
+    "normalmap": (1, 1),
+}
+# Only materials that reflect may be wrapped: Mitsuba refuses the others inside twosided.
+TRANSMITTING = ("dielectric", "roughdielectric", "thindielectric", "null", "mask", "twosided", "polarizer", "retarder")
+SHAPE_TYPES = _names(
+    "bsplinecurve cube cylinder disk ellipsoids ellipsoidsmesh linearcurve obj ply rectangle sdfgrid serialized sphere"
+)

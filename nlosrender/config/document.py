@@ -1,0 +1,128 @@
+"""The root of the config, and the rules between its sections."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+from pydantic import Field, ValidationInfo, model_validator
+
+from nlosrender.config.capture import CaptureConfig, TimeAxisConfig
+from nlosrender.config.fields import Name
+from nlosrender.config.refusal import Fault, KeyPath
+from nlosrender.config.relay_wall import EDGE_TOLERANCE
+from nlosrender.config.render import OutputConfig, RenderConfig
+from nlosrender.config.scene import SceneConfig
+from nlosrender.config.section import Section
+
+MAX_BINS = 2**40  # 4 TiB of float32: beyond it a grid or bin count is a slip of the pen
+_WALL: KeyPath = ("scene", "relay_wall")
+_LASER_GRID: KeyPath = ("capture", "laser_grid")
+
+
+class Config(Section):
+    """One capture: the whole YAML, validated, defaults filled in, frozen."""
+
+    name: Name = "capture"
+    """what the capture is called; default: the name of the YAML file"""
+    scene: SceneConfig
+    """what is rendered"""
+    capture: CaptureConfig
+    """which points are lit and measured"""
+    time_axis: TimeAxisConfig = Field(default_factory=TimeAxisConfig)
+    """the bins"""
+    render: RenderConfig = Field(default_factory=lambda: RenderConfig.model_validate({}))
+    """how it is computed"""
+    output: OutputConfig = Field(default_factory=OutputConfig)
+    """the file that is written"""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _default_names(cls, raw: Any, info: ValidationInfo) -> Any:
+        if not isinstance(raw, Mapping):
+            return raw
+        stem = info.context.get("stem", "capture") if info.context else "capture"
+        filled = {"name": stem, **raw}
+        output = filled.get("output", {})
+        if isinstance(output, Mapping) and isinstance(filled["name"], str):
+            filled["output"] = {"path": f"{filled['name']}.hdf5", **output}
+        return _grids_on_patch(filled)
+
+    def rules(self) -> Iterator[Fault]:
+        """Yield the faults between sections."""
+        yield from self._points_off_the_wall()
+        yield from self._devices_behind_the_wall()
+        yield from self._laser_spot()
+        pairs = self.capture.sensor_grid.n_points * self.capture.n_lasers
+        n_bins = 1 if self.time_axis.n_bins == "auto" else self.time_axis.n_bins
+        if pairs * n_bins > MAX_BINS:
+            path: KeyPath = ("time_axis", "n_bins") if pairs <= MAX_BINS else ("capture", "sensor_grid")
+            message = (
+                f"got {pairs:_} pairs of laser and sensor points with {n_bins:_} bins each, need at most 2**40 bins "
+                "in all. Use fewer points or bins."
+            )
+            yield Fault(path, message, needs=(("time_axis", "n_bins"), ("capture", "sensor_grid"), _LASER_GRID))
+
+    def _points_off_the_wall(self) -> Iterator[Fault]:
+        extent, wall = self.scene.relay_wall.extent, self.scene.relay_wall.type
+        grids = {"sensor_grid": self.capture.sensor_grid, "laser_grid": self.capture.laser_grid}
+        for key, grid in grids.items():
+            sizes = (grid.width, grid.height) if grid else (None, None)
+            for axis, size, largest in zip(("width", "height"), sizes, extent, strict=True):
+                if size is not None and size > largest * (1 + EDGE_TOLERANCE):
+                    message = f"got {size} m, need at most {largest:.6g} m, the {axis} of the {wall} relay wall."
+                    path: KeyPath = ("capture", key, axis)
+                    yield Fault(path, message, needs=(path, _WALL))
+        point = self.capture.laser_point or (0.0, 0.0)
+        if any(abs(x) > size / 2 * (1 + EDGE_TOLERANCE) for x, size in zip(point, extent, strict=True)):
+            message = (
+                f"got {list(point)}, off the relay wall; need x from {-extent[0] / 2:.6g} to {extent[0] / 2:.6g} m "
+                f"and y from {-extent[1] / 2:.6g} to {extent[1] / 2:.6g} m."
+            )
+            yield Fault(("capture", "laser_point"), message, needs=(("capture", "laser_point"), _WALL))
+
+    def _devices_behind_the_wall(self) -> Iterator[Fault]:
+        wall = self.scene.relay_wall
+        if wall.type != "rectangle":
+            return
+        for key in ("laser_position", "sensor_position"):
+            position = getattr(self.capture, key)
+            if position is None:
+                continue
+            height = wall.height_above(position)
+            if height <= 0:
+                where = f"{-height:.6g} m behind the relay wall" if height < 0 else "in the plane of the relay wall"
+                message = f"got {list(position)}, {where}; need a point on the side its normal looks to."
+                yield Fault(("capture", key), message, needs=(("capture", key), _WALL))
+
+    def _laser_spot(self) -> Iterator[Fault]:
+        path: KeyPath = ("capture", "laser_spot_radius")
+        radius = self.capture.laser_spot_radius
+        if radius > 0 and self.scene.relay_wall.type != "rectangle":
+            message = f"got {radius} on a {self.scene.relay_wall.type} wall; need 0 there, or a rectangle wall."
+            yield Fault(path, message, needs=(path, (*_WALL, "type")))
+        if not self.render.laser_sampling and radius == 0:
+            message = "got false with a laser that is a point, which no path finds by chance; "
+            message += "need capture.laser_spot_radius > 0, such as 0.01."
+            key: KeyPath = ("render", "laser_sampling")
+            yield Fault(key, message, needs=(path, key))
+
+    @property
+    def is_colored(self) -> bool:
+        """Whether three channels are rendered: ``render.color``, or for ``auto`` what the scene needs."""
+        return self.render.color == "rgb" or (self.render.color == "auto" and self.scene.is_colored)
+
+
+def _grids_on_patch(raw: dict[str, Any]) -> dict[str, Any]:
+    """Give grids without an extent the ``width`` and ``height`` of a sphere wall, whose whole is rarely meant."""
+    scene, capture = raw.get("scene"), raw.get("capture")
+    wall = scene.get("relay_wall") if isinstance(scene, Mapping) else None
+    if not isinstance(wall, Mapping) or wall.get("type") != "sphere" or not isinstance(capture, Mapping):
+        return raw
+    patch = {key: wall[key] for key in ("width", "height") if wall.get(key) is not None}
+    changed = {
+        key: {**grid, **{axis: size for axis, size in patch.items() if grid.get(axis) is None}}
+        for key in ("sensor_grid", "laser_grid")
+        if isinstance(grid := capture.get(key), Mapping)
+    }
+    return {**raw, "capture": {**capture, **changed}}

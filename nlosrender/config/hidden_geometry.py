@@ -1,0 +1,213 @@
+"""``scene.hidden_geometry``: everything that is not the relay wall, as a list of items told apart by ``type``."""
+
+from __future__ import annotations
+
+import string
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import Field, ValidationInfo
+
+from nlosrender.config.bsdf import WHITE_DIFFUSE, BsdfMapping
+from nlosrender.config.bsdf_table import SHAPE_TYPES
+from nlosrender.config.fields import Checked, Direction, Flag, Name, NonNegative, Point3, Positive, Sizes3
+from nlosrender.config.frozen import FrozenDict
+from nlosrender.config.plugin_check import PluginCheck, checked_plugin, config_folder, existing_file
+from nlosrender.config.refusal import Fault, refusal, refuse
+from nlosrender.config.section import Section, pose_faults
+
+LETTERS = string.ascii_uppercase + string.digits + " "
+_MESH_SUFFIXES = (".ply", ".obj")
+_TOWARDS_WALL = (0.0, 0.0, -1.0)  # a default wall looks along +z
+_NO_ROTATION = (0.0, 0.0, 0.0)
+
+
+def _letters(value: object) -> str:
+    need = "A-Z, 0-9 and spaces, at least one of them visible"
+    if not isinstance(value, str):
+        raise refuse(value, need, "" if value is None else "Put it in quotes.")
+    if value.strip(" ") and all(letter in LETTERS for letter in value):
+        return value
+    upper = value.upper()
+    hint = f"Write it in upper case: {upper}." if value.strip() and all(c in LETTERS for c in upper) else ""
+    raise refuse(value, need, hint)
+
+
+def _mesh_file(value: object, info: ValidationInfo) -> Path:
+    if not isinstance(value, str) or not value.lower().endswith(_MESH_SUFFIXES):
+        raise refuse(value, f"the name of a {' or '.join(_MESH_SUFFIXES)} file")
+    path, problem = existing_file(value, config_folder(info))
+    if problem:
+        raise Fault((), problem).as_error()
+    return path
+
+
+def _shape(value: Any, info: ValidationInfo) -> FrozenDict:
+    return checked_plugin(_check_shape, value, info)
+
+
+def _check_shape(check: PluginCheck, value: Any) -> Any:
+    if check.plugin_type(value, (), SHAPE_TYPES, "Mitsuba shape") is None:
+        return value
+    result = {}
+    for key, item in value.items():
+        if key == "bsdf":
+            check.fault((key,), "the BSDF belongs beside shape, not in it; move it one level up.", at_key=True)
+        elif isinstance(item, dict) and key != "to_world":
+            check.refuse((key,), item, "a number, text or list", "Emitters and sensors cannot be part of a shape.")
+        else:
+            result[key] = check.generic(item, (key,))
+    return result
+
+
+LetterText = Annotated[str, Checked(_letters, {"type": "string", "pattern": "^[A-Z0-9 ]*[A-Z0-9][A-Z0-9 ]*$"})]
+MeshFilename = Annotated[
+    Path, Checked(_mesh_file, {"type": "string", "pattern": r"\.([pP][lL][yY]|[oO][bB][jJ])$"}, with_info=True)
+]
+ShapeMapping = Annotated[
+    FrozenDict,
+    Checked(
+        _shape,
+        {"type": "object", "required": ["type"], "properties": {"type": {"enum": list(SHAPE_TYPES)}}},
+        with_info=True,
+    ),
+]
+
+
+class _HiddenItem(Section):
+    name: Name = ""
+    """what the item is called in messages and files; default: its type and its index in the list"""
+    bsdf: BsdfMapping = Field(default_factory=lambda: WHITE_DIFFUSE)
+    """any Mitsuba BSDF; default {type: diffuse, reflectance: 1.0}"""
+
+
+class _FacingItem(_HiddenItem):
+    center: Point3
+    """m, scene coordinates"""
+    normal: Direction = _TOWARDS_WALL
+    """direction the front side looks in, any length"""
+    up: Direction = (0.0, 1.0, 0.0)
+    """direction of the item's y axis, made perpendicular to normal"""
+
+    def rules(self) -> Iterator[Fault]:
+        """Yield the fault of a pose without an up direction."""
+        yield from pose_faults(self.normal, self.up)
+
+
+class RectangleConfig(_FacingItem):
+    """A flat rectangle, seen from the side of its normal."""
+
+    type: Literal["rectangle"]
+    width: Positive
+    """m, along the item's x axis (up x normal)"""
+    height: Positive
+    """m, along the item's y axis (up)"""
+
+
+class LettersConfig(_FacingItem):
+    """Generated stroke letters, readable from the side of their normal, centred on ``center``."""
+
+    type: Literal["letters"]
+    text: LetterText
+    """A-Z, 0-9 and spaces"""
+    height: Positive
+    """m, height of the letters"""
+    thickness: NonNegative = 0.0
+    """m; 0: a sheet, more: a solid"""
+    stroke_width: Positive | None = None
+    """m; null: 0.2 height"""
+    spacing: NonNegative | None = None
+    """m, gap between letters; null: 0.2 height"""
+
+    def rules(self) -> Iterator[Fault]:
+        """Yield the faults of the pose and of strokes as wide as the letter is high."""
+        yield from super().rules()
+        if self.stroke_width is not None and self.stroke_width >= 0.5 * self.height:
+            message = refusal(self.stroke_width, f"less than half the height of {self.height} m")
+            yield Fault(("stroke_width",), message, needs=(("stroke_width",), ("height",)))
+
+
+class MeshConfig(_HiddenItem):
+    """A triangle mesh from a file: scaled, then rotated about x, then y, then z, then translated."""
+
+    type: Literal["mesh"]
+    filename: MeshFilename
+    """a .ply or .obj file; relative names start at the YAML's folder"""
+    scale: Positive = 1.0
+    """m per unit of the file"""
+    rotate_deg: Point3 = _NO_ROTATION
+    """degrees about x, y, z, in this order"""
+    translate: Point3 = (0.0, 0.0, 0.0)
+    """m, scene coordinates"""
+    face_normals: Flag = False
+    """true: flat shading; false: the file's vertex normals"""
+
+
+class BoxConfig(_HiddenItem):
+    """A closed box, seen from outside."""
+
+    type: Literal["box"]
+    center: Point3
+    """m, scene coordinates"""
+    size: Sizes3
+    """m, edge lengths along x, y, z before the rotation"""
+    rotate_deg: Point3 = _NO_ROTATION
+    """degrees about x, y, z, in this order"""
+
+
+class SphereConfig(_HiddenItem):
+    """A sphere, by default seen from outside."""
+
+    type: Literal["sphere"]
+    center: Point3
+    """m, scene coordinates"""
+    radius: Positive
+    """m"""
+    inside: Flag = False
+    """true: the surface seen from within"""
+
+
+class CylinderConfig(_HiddenItem):
+    """An open tube, by default seen from outside."""
+
+    type: Literal["cylinder"]
+    center: Point3
+    """m, scene coordinates, the middle of the axis"""
+    axis: Direction = (0.0, 1.0, 0.0)
+    """direction of the axis, any length"""
+    radius: Positive
+    """m"""
+    height: Positive
+    """m, along the axis"""
+    inside: Flag = False
+    """true: the surface seen from within"""
+
+
+class RoomConfig(_HiddenItem):
+    """Five sides of a box seen from within, open towards the relay wall and centred on it."""
+
+    type: Literal["room"]
+    size: Sizes3
+    """m, width and height along the wall's axes, depth along its normal"""
+
+
+class MitsubaConfig(_HiddenItem):
+    """Any Mitsuba shape as a dictionary, in scene coordinates."""
+
+    type: Literal["mitsuba"]
+    shape: ShapeMapping
+    """the shape's parameters; to_world: a 4x4 matrix or a list of translate, rotate, scale, applied in order"""
+
+
+HiddenItemConfig = Annotated[
+    RectangleConfig
+    | MeshConfig
+    | LettersConfig
+    | BoxConfig
+    | SphereConfig
+    | CylinderConfig
+    | RoomConfig
+    | MitsubaConfig,
+    Field(discriminator="type"),
+]

@@ -1,0 +1,85 @@
+"""``--set a.b.c=VALUE``: single values put over those of the file, before validation."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from nlosrender.config.refusal import KeyPath, shown
+from nlosrender.config.yaml_tree import Document, Place, read_document
+from nlosrender.errors import ConfigError, Problem
+
+
+def apply_overrides(document: Document, overrides: Sequence[str]) -> None:
+    """Put each ``a.b.c=VALUE`` into the document; mistakes become problems of the document.
+
+    Parameters
+    ----------
+    document
+        Changed in place; its tree must be a mapping.
+    overrides
+        Keys joined by dots, numbers index lists; the value is YAML. Missing mappings are created.
+    """
+    for override in overrides:
+        place = f"--set {override}"
+        key, equals, text = override.partition("=")
+        parts = [part.strip() for part in key.split(".")]
+        if not equals or not all(parts):
+            message = "need KEY=VALUE with dots between keys, such as --set capture.sensor_grid.nx=16."
+            document.problems.append(Problem(place, "", message))
+            continue
+        try:
+            value = _value(document, key, text, place)
+            _put(document, parts, value, place)
+        except ConfigError as error:
+            document.problems.extend(error.problems)
+
+
+def _value(document: Document, key: str, text: str, place: str) -> Any:
+    """Read VALUE; where it stands inside the override is not worth telling."""
+    try:
+        read = read_document(text, place)
+    except ConfigError as error:
+        raise ConfigError([Problem(place, key, problem.message) for problem in error.problems]) from error
+    if read.problems:
+        raise ConfigError([Problem(place, key, problem.message) for problem in read.problems])
+    return read.tree
+
+
+def _put(document: Document, parts: list[str], value: Any, place: str) -> None:
+    """Set the value, creating mappings on the way; from there on its places are the override's."""
+    container, path = document.tree, ()  # type: tuple[Any, KeyPath]
+    for depth, part in enumerate(parts):
+        step = _step(container, part, path, place)
+        path = (*path, step)
+        if depth == len(parts) - 1:
+            container[step] = value
+        elif isinstance(container, list):
+            container = container[step]  # type: ignore[index]
+        else:
+            if container.get(step) is None:
+                container[step] = {}
+                _own(document, path, place)
+            container = container[step]
+    _own(document, path, place)
+
+
+def _own(document: Document, path: KeyPath, place: str) -> None:
+    for known in [known for known in document.places if known[: len(path)] == path]:
+        del document.places[known]
+    document.places[path] = Place(place, place)
+
+
+def _step(container: Any, part: str, path: KeyPath, place: str) -> str | int:
+    """Return the key or index ``part`` stands for in ``container``."""
+    where = ".".join(map(str, path))
+    if isinstance(container, dict):
+        return part
+    if not isinstance(container, list):
+        message = f"cannot set {part} in {where}, which holds {shown(container)}; need a mapping or a list there."
+        raise ConfigError(Problem(place, where, message))
+    if not part.isdecimal() or int(part) >= len(container):
+        allowed = f"an index from 0 to {len(container) - 1}" if container else "a non-empty list"
+        message = f"got {part} in a list of {len(container)}, need {allowed}."
+        raise ConfigError(Problem(place, f"{where}.{part}", message))
+    return int(part)

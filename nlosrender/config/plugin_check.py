@@ -1,0 +1,170 @@
+"""What BSDF, texture and shape dictionaries share: file names, transforms, a list of faults found on the way down."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from pydantic import ValidationInfo
+
+from nlosrender.config.fields import as_finite
+from nlosrender.config.frozen import freeze
+from nlosrender.config.refusal import Fault, KeyPath, raise_faults, refusal, shown
+from nlosrender.errors import nearest
+
+TRANSFORM_KEYS = ("to_world", "to_uv")
+_OPERATIONS = "translate: [x, y, z], rotate: {axis: [x, y, z], angle_deg: a}, scale: s or [x, y, z]"
+
+
+@dataclass
+class PluginCheck:
+    """One walk down a plugin dictionary; collects every fault instead of stopping at the first.
+
+    Parameters
+    ----------
+    folder
+        Where relative file names start.
+    """
+
+    folder: Path
+    faults: list[Fault] = field(default_factory=list)
+
+    def fault(self, path: KeyPath, message: str, *, at_key: bool = False) -> None:
+        """Note one mistake at ``path`` below the dictionary."""
+        self.faults.append(Fault(path, message, "key" if at_key else "value"))
+
+    def refuse(self, path: KeyPath, value: object, need: str, advice: str = "") -> None:
+        """Note that ``value`` at ``path`` is not what is needed."""
+        self.fault(path, refusal(value, need, advice))
+
+    def plugin_type(self, value: object, path: KeyPath, allowed: Sequence[str], what: str) -> str | None:
+        """Return the plugin's type; None after noting why there is none."""
+        if not isinstance(value, Mapping):
+            self.refuse(path, value, f"a mapping with a type, such as {{type: {allowed[0]}}}")
+            return None
+        name = value.get("type")
+        if "type" not in value:
+            self.fault((*path, "type"), f"missing, need the {what}: one of {', '.join(allowed)}.")
+        elif name not in allowed:
+            close = nearest(str(name), allowed)
+            hint = f"Did you mean {close}?" if close else ""
+            self.refuse((*path, "type"), name, f"one of {', '.join(allowed)}", hint)
+        else:
+            return str(name)
+        return None
+
+    def generic(self, value: Any, path: KeyPath) -> Any:
+        """Return a parameter of an unknown kind, with its file names absolute and its transforms checked."""
+        key = path[-1] if path else ""
+        if key == "filename":
+            return self.file(value, path)
+        if key in TRANSFORM_KEYS:
+            return self.transform(value, path)
+        if isinstance(value, Mapping):
+            return {name: self.generic(item, (*path, name)) for name, item in value.items()}
+        if value is None:
+            self.refuse(path, value, "a value")
+        return value
+
+    def file(self, value: object, path: KeyPath) -> str:
+        """Return the absolute name of an existing file."""
+        if not isinstance(value, str) or not value.strip():
+            self.refuse(path, value, "the name of a file")
+            return ""
+        absolute, problem = existing_file(value, self.folder)
+        if problem:
+            self.fault(path, problem)
+        return str(absolute)
+
+    def transform(self, value: Any, path: KeyPath) -> Any:
+        """Return a checked transform: a 4x4 matrix, or operations applied in order, the first listed first."""
+        items = value if isinstance(value, (list, tuple)) else None
+        if items and all(isinstance(item, Mapping) for item in items):
+            return [self._operation(item, (*path, index)) for index, item in enumerate(items)]
+        rows = [_finite_list(row, (4,)) for row in items] if items is not None else []
+        if len(rows) != 4 or any(row is None for row in rows):
+            self.refuse(path, value, f"4 rows of 4 finite numbers, or a list of {_OPERATIONS}")
+            return value
+        matrix = [row for row in rows if row is not None]
+        if matrix[3] != [0, 0, 0, 1]:
+            self.refuse((*path, 3), value[3], "[0, 0, 0, 1] as last row")
+        elif abs(_determinant(matrix)) < 1e-30:
+            self.fault(path, "the matrix is singular: it flattens space, need one that can be inverted.")
+        return matrix
+
+    def _operation(self, item: Mapping[str, Any], path: KeyPath) -> dict[str, Any]:
+        if len(item) != 1 or next(iter(item)) not in ("translate", "rotate", "scale"):
+            self.refuse(path, item, f"exactly one of {_OPERATIONS}")
+            return dict(item)
+        ((name, value),) = item.items()
+        at = (*path, name)
+        if name == "rotate":
+            return {name: self._rotation(value, at)}
+        numbers = _finite_list(value, (3,))
+        if name == "scale" and as_finite(value) is not None:
+            numbers = [as_finite(value) or 0.0] * 3
+        need = "3 finite numbers [x, y, z]" if name == "translate" else "a number or [x, y, z], none of them 0"
+        if numbers is None or (name == "scale" and 0.0 in numbers):
+            self.refuse(at, value, need)
+        return {name: numbers}
+
+    def _rotation(self, value: Any, path: KeyPath) -> Any:
+        if not isinstance(value, Mapping) or set(value) != {"axis", "angle_deg"}:
+            self.refuse(path, value, "{axis: [x, y, z], angle_deg: a}")
+            return value
+        axis, angle = _finite_list(value["axis"], (3,)), as_finite(value["angle_deg"])
+        if axis is None or not any(axis):
+            self.refuse((*path, "axis"), value["axis"], "3 finite numbers [x, y, z], not all zero")
+        if angle is None:
+            self.refuse((*path, "angle_deg"), value["angle_deg"], "a finite number in degrees")
+        return {"axis": axis, "angle_deg": angle}
+
+
+def checked_plugin(walk: Callable[[PluginCheck, Any], Any], value: Any, info: ValidationInfo) -> Any:
+    """Run ``walk`` over a plugin dictionary and return its result frozen.
+
+    Raises
+    ------
+    pydantic.ValidationError
+        With every fault found.
+    """
+    check = PluginCheck(config_folder(info))
+    result = walk(check, value)
+    raise_faults("plugin", check.faults)
+    return freeze(result)
+
+
+def config_folder(info: ValidationInfo) -> Path:
+    """Return the folder relative file names start from: the YAML's, else the current directory."""
+    return Path(info.context["folder"] if info.context and "folder" in info.context else ".").absolute()
+
+
+def existing_file(name: str, folder: Path) -> tuple[Path, str]:
+    """Return the absolute path of ``name`` and the problem with it; the problem is empty for a readable file."""
+    try:
+        path = (folder / name).resolve()
+        if path.is_file():
+            return path, ""
+        found = "a folder" if path.is_dir() else "no file"
+    except (OSError, ValueError, RuntimeError):  # too long, a null character, a loop of links
+        return Path(folder), f"got {shown(name)}, which is no possible file name."
+    hint = nearest(path.name, (entry.name for entry in path.parent.iterdir())) if path.parent.is_dir() else None
+    advice = f" Did you mean {hint}?" if hint and found == "no file" else ""
+    return path, f"got {name}, but there is {found} at {path}. Relative names start at the YAML's folder.{advice}"
+
+
+def _finite_list(value: object, sizes: tuple[int, ...]) -> list[float] | None:
+    if not isinstance(value, (list, tuple)) or len(value) not in sizes:
+        return None
+    numbers = [as_finite(item) for item in value]
+    return None if None in numbers else [number for number in numbers if number is not None]
+
+
+def _determinant(m: list[list[float]]) -> float:
+    return (
+        m[0][0] * (m[1][1] * m[2][2] - m[1][2] * m[2][1])
+        - m[0][1] * (m[1][0] * m[2][2] - m[1][2] * m[2][0])
+        + m[0][2] * (m[1][0] * m[2][1] - m[1][1] * m[2][0])
+    )

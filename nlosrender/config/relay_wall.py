@@ -1,0 +1,99 @@
+"""``scene.relay_wall``: the visible surface that laser and sensor points lie on."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from typing import Annotated, Literal
+
+from pydantic import Field
+
+from nlosrender.config.bsdf import WHITE_DIFFUSE, BsdfMapping
+from nlosrender.config.fields import Direction, Flag, Point3, Positive
+from nlosrender.config.refusal import Fault
+from nlosrender.config.section import Section, pose_faults
+from nlosrender.config.vectors import height_above
+
+EDGE_TOLERANCE = 1e-9  # relative: a decimal such as 0.1 * 3 may pass the edge by its rounding
+
+
+class _Wall(Section):
+    center: Point3 = (0.0, 0.0, 0.0)
+    """m, scene coordinates; the origin of the wall coordinates"""
+    bsdf: BsdfMapping = Field(default_factory=lambda: WHITE_DIFFUSE)
+    """any Mitsuba BSDF; default {type: diffuse, reflectance: 1.0}"""
+
+
+class RectangleWallConfig(_Wall):
+    """A flat wall; hidden geometry lies on the side of its normal."""
+
+    type: Literal["rectangle"]
+    width: Positive
+    """m, along the wall's x axis (up x normal)"""
+    height: Positive
+    """m, along the wall's y axis (up)"""
+    normal: Direction = (0.0, 0.0, 1.0)
+    """direction the lit side looks in, any length"""
+    up: Direction = (0.0, 1.0, 0.0)
+    """direction of the wall's y axis, made perpendicular to normal"""
+
+    def rules(self) -> Iterator[Fault]:
+        """Yield the fault of a pose without an up direction."""
+        yield from pose_faults(self.normal, self.up)
+
+    @property
+    def extent(self) -> tuple[float, float]:
+        """Extent of the wall coordinates (x, y) [m]."""
+        return self.width, self.height
+
+    def height_above(self, point: tuple[float, float, float]) -> float:
+        """Return how far a scene point [m] lies in front of the wall's plane; negative behind it."""
+        return height_above(point, self.center, self.normal)
+
+
+class SphereWallConfig(_Wall):
+    """A sphere, by default lit from within; wall coordinates are its equal-area cylindrical projection."""
+
+    type: Literal["sphere"]
+    radius: Positive
+    """m"""
+    inside: Flag = True
+    """true: laser and sensor points lie on the surface seen from within"""
+    width: Positive | None = None
+    """m, default width of the grids along the equator; null: the whole circumference 2 pi radius"""
+    height: Positive | None = None
+    """m, default height of the grids along the polar axis; null: the whole diameter"""
+
+    def rules(self) -> Iterator[Fault]:
+        """Yield the faults of a default grid extent larger than the sphere."""
+        for key, given, largest in zip(("width", "height"), (self.width, self.height), self.extent, strict=True):
+            if given is not None and given > largest * (1 + EDGE_TOLERANCE):
+                message = f"got {given}, need at most {largest:.6g} m, the whole sphere of radius {self.radius}."
+                yield Fault((key,), message, needs=((key,), ("radius",)))
+
+    @property
+    def extent(self) -> tuple[float, float]:
+        """Extent of the wall coordinates (x, y) [m]: circumference and diameter."""
+        return 2 * math.pi * self.radius, 2 * self.radius
+
+
+class CylinderWallConfig(_Wall):
+    """An open tube, by default lit from within; wall coordinates are arc length and position along the axis."""
+
+    type: Literal["cylinder"]
+    axis: Direction = (0.0, 1.0, 0.0)
+    """direction of the wall's y axis, any length"""
+    radius: Positive
+    """m"""
+    height: Positive
+    """m, along the axis"""
+    inside: Flag = True
+    """true: laser and sensor points lie on the surface seen from within"""
+
+    @property
+    def extent(self) -> tuple[float, float]:
+        """Extent of the wall coordinates (x, y) [m]: circumference and height."""
+        return 2 * math.pi * self.radius, self.height
+
+
+RelayWallConfig = Annotated[RectangleWallConfig | SphereWallConfig | CylinderWallConfig, Field(discriminator="type")]

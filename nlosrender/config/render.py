@@ -1,0 +1,112 @@
+"""``render`` and ``output``: how it is computed and where it goes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import model_validator
+
+from nlosrender.config.fields import (
+    BounceCount,
+    Checked,
+    Count,
+    Flag,
+    MemoryLimit,
+    OpenUnit,
+    Positive,
+    Seed,
+    memory_bytes,
+)
+from nlosrender.config.refusal import Fault, refuse
+from nlosrender.config.section import Section
+from nlosrender.errors import nearest
+
+_STOPPING = ("spp", "target_error", "time_limit_s")
+_ENGINES = ("auto", "path")
+DEFAULT_TARGET_ERROR = 0.05
+
+
+def _engine(value: object) -> str:
+    if value == "virtual_lights":
+        raise refuse(value, "auto or path", "This version has only the path engine.")
+    if not isinstance(value, str) or value not in _ENGINES:
+        close = nearest(value, _ENGINES) if isinstance(value, str) else None
+        raise refuse(value, "one of auto, path", f"Did you mean {close}?" if close else "")
+    return value
+
+
+def _output_path(value: object) -> Path:
+    if not isinstance(value, str) or not value.strip() or any(ord(character) < 32 for character in value):
+        raise refuse(value, "the name of the file to write", "Leave it out for <name>.hdf5.")
+    if value.endswith(("/", "\\")) or Path(value).name in ("", "..", "."):
+        raise refuse(value, "the name of a file, not of a folder")
+    return Path(value)
+
+
+Engine = Annotated[Literal["auto", "path"], Checked(_engine, {"enum": list(_ENGINES)})]
+OutputPath = Annotated[Path, Checked(_output_path, {"type": "string", "minLength": 1})]
+
+
+class RenderConfig(Section):
+    """What is computed, how well, and on what."""
+
+    engine: Engine = "auto"
+    """auto: the cheapest engine that is right for the scene; path: the path tracer"""
+    max_bounces: BounceCount | None = 7
+    """highest bounce, counting both points on the wall: 3 is the third bounce; null: no limit"""
+    split_bounces: Flag = True
+    """give each bounce an index of its own in the file; false: all in index 1"""
+    spp: Count | None = None
+    """paths per pair of laser and sensor point; excludes target_error"""
+    target_error: OpenUnit | None = None
+    """relative L2 error of H to stop at; default 0.05 when neither spp nor time_limit_s is given"""
+    time_limit_s: Positive | None = None
+    """s, stop after this time"""
+    laser_sampling: Flag = True
+    """connect paths to the laser point; false: find the laser spot by chance (needs capture.laser_spot_radius)"""
+    hidden_geometry_sampling: Flag = True
+    """sample points on the hidden geometry beside the BSDF"""
+    russian_roulette: Flag = True
+    """end paths of low weight early, without bias"""
+    seed: Seed = 0
+    """start of the random numbers; the same seed gives the same file"""
+    backend: Literal["auto", "llvm", "cuda"] = "auto"
+    """llvm: processor, cuda: NVIDIA GPU, auto: the GPU where there is one"""
+    color: Literal["auto", "grey", "rgb"] = "auto"
+    """auto: three channels only when the scene has colours"""
+    memory_limit: MemoryLimit = "auto"
+    """auto, or a size such as 600MB, 8GB, 2GiB"""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _default_target_error(cls, raw: Any) -> Any:
+        unbounded = isinstance(raw, Mapping) and all(raw.get(key) is None for key in _STOPPING)
+        return {**raw, "target_error": DEFAULT_TARGET_ERROR} if unbounded else raw
+
+    def rules(self) -> Iterator[Fault]:
+        """Yield the fault of two goals at once."""
+        if self.spp is not None and self.target_error is not None:
+            message = f"got {self.target_error} beside spp {self.spp}; they exclude each other, keep one."
+            yield Fault(("target_error",), message, "key", (("spp",), ("target_error",)))
+
+    @property
+    def memory_limit_bytes(self) -> int | None:
+        """Memory the render may use [bytes]; None: the engine decides."""
+        return memory_bytes(self.memory_limit)
+
+
+class OutputConfig(Section):
+    """The file that is written."""
+
+    path: OutputPath = Path("capture.hdf5")
+    """default <name>.hdf5; relative to the current directory"""
+    format: Literal["znlos"] = "znlos"
+    """znlos: the HDF5 layout of the Z-NLOS dataset"""
+    frame: Literal["znlos", "scene"] = "znlos"
+    """coordinates in the file: znlos: wall in y = 0, hidden scene at y < 0; scene: as in the config"""
+    compression: Literal["gzip", "none"] = "gzip"
+    """gzip (with shuffle) or none"""
+    variance: Flag = True
+    """store the variance of the estimate per bin"""

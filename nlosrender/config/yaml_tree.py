@@ -1,0 +1,272 @@
+"""YAML text -> plain values, with the place of every key and value, and a bound on what the text may grow to.
+
+The node composer of PyYAML is used, never its constructors, so no tag can run code. Values are read as YAML 1.2 has
+them: ``1e-3`` is a number, ``NO`` and ``12:30`` are text.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, field
+from typing import Any
+
+import yaml
+from yaml.composer import Composer
+from yaml.nodes import MappingNode, Node, ScalarNode, SequenceNode
+from yaml.parser import Parser
+from yaml.reader import Reader, ReaderError
+from yaml.resolver import BaseResolver
+from yaml.scanner import Scanner
+
+from nlosrender.config.refusal import KeyPath, shown
+from nlosrender.errors import ConfigError, Problem
+
+MAX_BYTES = 2**20
+MAX_NODES = 100_000  # keys and values after every alias is written out
+MAX_DEPTH = 32
+_LONGEST_INTEGER = 100  # digits; Python itself refuses more than 4300, slowly
+_TAG = "tag:yaml.org,2002:"
+_KNOWN_TAGS = tuple(_TAG + name for name in ("null", "bool", "int", "float", "str", "map", "seq"))
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where a key and its value stand, as ``z.yaml:14:3``."""
+
+    key: str
+    value: str
+
+
+@dataclass
+class Document:
+    """The values of a YAML text, where they stand, and what is wrong with the text itself."""
+
+    source: str
+    tree: Any
+    places: dict[KeyPath, Place] = field(default_factory=dict)
+    problems: list[Problem] = field(default_factory=list)
+    unread: set[KeyPath] = field(default_factory=set)  # paths whose value is a stand-in for one that is no value
+
+    def place(self, path: KeyPath, at: str = "value") -> str:
+        """Return the place of ``path``, or of the nearest mapping around it that is in the text."""
+        for end in range(len(path), -1, -1):
+            if path[:end] in self.places:
+                place = self.places[path[:end]]
+                return place.value if at == "value" and end == len(path) else place.key
+        return f"{self.source}:1:1"
+
+
+class _Composer(Reader, Scanner, Parser, Composer, BaseResolver):
+    """PyYAML's composer with the scalars of YAML 1.2 and a bound on depth and size."""
+
+    def __init__(self, text: str):
+        Reader.__init__(self, text)
+        Scanner.__init__(self)
+        Parser.__init__(self)
+        Composer.__init__(self)
+        BaseResolver.__init__(self)
+        self._depth = 0
+        self._n_nodes = 0
+
+    def compose_node(self, parent: Node | None, index: Any) -> Node | None:
+        self._depth += 1
+        self._n_nodes += 1
+        mark = self.peek_event().start_mark
+        if self._depth > MAX_DEPTH:
+            raise yaml.MarkedYAMLError(problem=f"nested deeper than {MAX_DEPTH} levels", problem_mark=mark)
+        if self._n_nodes > MAX_NODES:
+            raise yaml.MarkedYAMLError(problem=f"more than {MAX_NODES} keys and values", problem_mark=mark)
+        node: Node | None = super().compose_node(parent, index)
+        self._depth -= 1
+        return node
+
+
+for _name, _pattern, _first in (
+    ("null", r"~|null|Null|NULL|", ["~", "n", "N", ""]),
+    ("bool", r"true|True|TRUE|false|False|FALSE", list("tTfF")),
+    ("int", r"[-+]?[0-9]+|0o[0-7]+|0x[0-9a-fA-F]+", list("-+0123456789")),
+    (
+        "float",
+        r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?|[-+]?\.(inf|Inf|INF)|\.(nan|NaN|NAN)",
+        list("-+.0123456789"),
+    ),
+):
+    _Composer.add_implicit_resolver(_TAG + _name, re.compile(rf"(?:{_pattern})\Z"), _first)
+
+
+def read_document(text: str, source: str) -> Document:
+    """Read one YAML document.
+
+    Parameters
+    ----------
+    text
+        The YAML, at most 1 MiB, at most 100_000 values and 32 levels after aliases are written out.
+    source
+        What to call it in places, such as the file name.
+
+    Returns
+    -------
+    Document
+        With problems that do not stop the reading (duplicate keys, numbers that are not finite, foreign tags).
+
+    Raises
+    ------
+    ConfigError
+        The text is no YAML, or grows beyond the bounds.
+    """
+    if len(text.encode("utf-8", "surrogatepass")) > MAX_BYTES:
+        raise ConfigError(Problem(source, "", f"larger than {MAX_BYTES // 1024} KiB, which no configuration needs."))
+    try:
+        node = _Composer(text).get_single_node()
+        if node is not None:
+            _check_growth(node)
+    except yaml.MarkedYAMLError as error:
+        raise ConfigError(_syntax_problem(error, source)) from error
+    except ReaderError as error:
+        before = text[: error.position]
+        place = f"{source}:{before.count(chr(10)) + 1}:{len(before) - before.rfind(chr(10))}"
+        message = f"character U+{ord(error.character):04X} may not stand in YAML; remove it."
+        raise ConfigError(Problem(place, "", message)) from error
+    document = Document(source, None)
+    if node is not None:
+        document.places[()] = Place(_at(node, source), _at(node, source))
+        document.tree = _Builder(document).build(node, ())
+    return document
+
+
+def _syntax_problem(error: yaml.MarkedYAMLError, source: str) -> Problem:
+    mark = error.problem_mark or error.context_mark
+    place = f"{source}:{mark.line + 1}:{mark.column + 1}" if mark else source
+    context = f" ({error.context})" if error.context else ""
+    hint = " Indent with spaces." if "'\\t'" in str(error.problem) else ""
+    return Problem(place, "", f"not usable as YAML: {error.problem or 'syntax error'}{context}.{hint}")
+
+
+def _check_growth(root: Node) -> None:
+    """Count the nodes every alias written out would give, without writing them out.
+
+    Each node is visited once: an alias can only name an earlier node, whose count is then known.
+    """
+    sizes: dict[int, tuple[int, int] | None] = {}  # id -> (nodes, levels); None while it is being counted
+
+    def measure(node: Node) -> tuple[int, int]:
+        if id(node) in sizes:
+            known = sizes[id(node)]
+            if known is None:
+                message = "an alias inside its own anchor never ends"
+                raise yaml.MarkedYAMLError(problem=message, problem_mark=node.start_mark)
+            return known
+        sizes[id(node)] = None
+        n_nodes, levels = 1, 1
+        for child in _children(node):
+            n_child, child_levels = measure(child)
+            n_nodes, levels = n_nodes + n_child, max(levels, child_levels + 1)
+        if n_nodes > MAX_NODES or levels > MAX_DEPTH:
+            message = f"aliases grow it beyond {MAX_NODES} values or {MAX_DEPTH} levels"
+            raise yaml.MarkedYAMLError(problem=message, problem_mark=node.start_mark)
+        sizes[id(node)] = (n_nodes, levels)
+        return n_nodes, levels
+
+    measure(root)
+
+
+def _children(node: Node) -> list[Node]:
+    if isinstance(node, MappingNode):
+        return [child for pair in node.value for child in pair]
+    return list(node.value) if isinstance(node, SequenceNode) else []
+
+
+def _at(node: Node, source: str) -> str:
+    return f"{source}:{node.start_mark.line + 1}:{node.start_mark.column + 1}"
+
+
+class _Builder:
+    """Turns nodes into values, noting places and problems in the document."""
+
+    def __init__(self, document: Document):
+        self.document = document
+
+    def build(self, node: Node, path: KeyPath) -> Any:
+        """Return the value of ``node`` at ``path``."""
+        if node.tag not in _KNOWN_TAGS:
+            known = "only plain values, lists and mappings"
+            return self._unread(node, path, f"tag {node.tag.replace(_TAG, '!!')} is not allowed, {known}.")
+        if isinstance(node, ScalarNode):
+            return self._scalar(node, path)
+        if isinstance(node, SequenceNode):
+            items = []
+            for index, item in enumerate(node.value):
+                place = _at(item, self.document.source)
+                self.document.places[(*path, index)] = Place(place, place)
+                items.append(self.build(item, (*path, index)))
+            return items
+        return self._mapping(node, path)
+
+    def _mapping(self, node: Node, path: KeyPath) -> dict[str, Any]:
+        values: dict[str, Any] = {}
+        source = self.document.source
+        merged = [value for key, value in node.value if _is_merge(key)]
+        for key_node, value_node in node.value:
+            if _is_merge(key_node):
+                continue
+            if not isinstance(key_node, ScalarNode) or key_node.tag != _TAG + "str":
+                self._problem(key_node, path, f"got {shown(key_node.value)} as a key, need text; put it in quotes.")
+                continue
+            key, at = key_node.value, (*path, key_node.value)
+            if key in values:
+                message = f"appears twice, first at {self.document.places[at].key}; keep one of them."
+                self._problem(key_node, at, message)
+                continue
+            self.document.places[at] = Place(_at(key_node, source), _at(value_node, source))
+            values[key] = self.build(value_node, at)
+        for value in merged:
+            self._merge(value, path, values)
+        return values
+
+    def _merge(self, node: Node, path: KeyPath, values: dict[str, Any]) -> None:
+        """Add what ``<<: *anchor`` brings; keys of the mapping itself, and of earlier anchors, win."""
+        parts = node.value if isinstance(node, SequenceNode) else [node]
+        for part in parts:
+            if not isinstance(part, MappingNode):
+                self._problem(part, path, "got no mapping after <<, need the alias of a mapping or a list of them.")
+                continue
+            # Only new keys are built: places of keys that win must stay.
+            fresh = MappingNode(part.tag, [p for p in part.value if p[0].value not in values], part.start_mark)
+            values.update(self._mapping(fresh, path))
+
+    def _scalar(self, node: ScalarNode, path: KeyPath) -> Any:
+        text, kind = node.value, node.tag.removeprefix(_TAG)
+        if kind == "null":
+            return None
+        if kind == "bool":
+            return text.lower() == "true"
+        if kind == "int" and len(text) > _LONGEST_INTEGER:
+            return self._unread(node, path, f"got an integer of {len(text)} digits, need at most {_LONGEST_INTEGER}.")
+        try:
+            if kind == "int":
+                return int(text, 0) if text[:2] in ("0x", "0o") else int(text)
+            if kind == "float":
+                number = float(text.replace(".inf", "inf").replace(".nan", "nan") if "." in text else text)
+                return self._finite(number, node, path)
+        except ValueError:
+            return self._unread(node, path, f"got {shown(text)} with the tag !!{kind}, need a number.")
+        return text
+
+    def _finite(self, number: float, node: ScalarNode, path: KeyPath) -> float:
+        # x - x is 0 for finite numbers only.
+        if number - number != 0:
+            self._unread(node, path, f"got {node.value}, need a finite number.")
+            return 0.0
+        return number
+
+    def _unread(self, node: Node, path: KeyPath, message: str) -> None:
+        self.document.unread.add(path)
+        self._problem(node, path, message)
+
+    def _problem(self, node: Node, path: KeyPath, message: str) -> None:
+        place = _at(node, self.document.source)
+        self.document.problems.append(Problem(place, ".".join(map(str, path)), message))
+
+
+def _is_merge(key: Node) -> bool:
+    return isinstance(key, ScalarNode) and key.value == "<<" and key.style is None

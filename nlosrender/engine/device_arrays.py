@@ -1,0 +1,76 @@
+"""The capture as device arrays: what a lane knows about its sensor point, and every lane about the lasers.
+
+Positions and grids are data, never constants of a kernel: one compiled kernel serves a whole sweep.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+
+from nlosrender.capture.grids import Capture
+from nlosrender.capture.time_axis import TimeAxis
+from nlosrender.scene.build import BuiltScene
+from nlosrender.scene.pose import Float64
+
+
+@dataclass(frozen=True, eq=False)
+class WallPoints:
+    """Points of the relay wall on the device, in engine units, seen from a device (laser or sensor).
+
+    ``delay_bins`` and ``delay_fraction`` are the constant part of the point's delay in bins, split in float64:
+    a leg of kilometres must not eat the float32 precision of the path between the two legs.
+    """
+
+    interaction: mi.SurfaceInteraction3f  # on the wall; wi points to the device
+    delay_bins: mi.Int32
+    delay_fraction: mi.Float  # in [0, 1)
+
+    def gather(self, index: mi.UInt32) -> WallPoints:
+        """Return the points at ``index``, one per lane."""
+        return WallPoints(
+            dr.gather(mi.SurfaceInteraction3f, self.interaction, index),
+            dr.gather(mi.Int32, self.delay_bins, index),
+            dr.gather(mi.Float, self.delay_fraction, index),
+        )
+
+
+def sensor_points(
+    built: BuiltScene, capture: Capture, time_axis: TimeAxis, index: NDArray[np.intp] | slice
+) -> WallPoints:
+    """Return the sensor points with flat indices ``index``, legs and the window's start as their delay."""
+    grid = capture.sensor_grid
+    delay = (capture.sensor_legs.reshape(-1)[index] - time_axis.start_opl) / time_axis.bin_width_opl
+    positions, normals = grid.positions.reshape(-1, 3)[index], grid.normals.reshape(-1, 3)[index]
+    return _wall_points(built, positions, normals, capture.sensor_position, delay)
+
+
+def laser_points(
+    built: BuiltScene, capture: Capture, time_axis: TimeAxis, index: NDArray[np.intp] | slice
+) -> WallPoints:
+    """Return the laser points with flat indices ``index``, their legs as delay."""
+    grid = capture.laser_grid
+    delay = capture.laser_legs.reshape(-1)[index] / time_axis.bin_width_opl
+    positions, normals = grid.positions.reshape(-1, 3)[index], grid.normals.reshape(-1, 3)[index]
+    return _wall_points(built, positions, normals, capture.laser_position, delay)
+
+
+def _wall_points(
+    built: BuiltScene, positions: Float64, normals: Float64, device: Float64, delay: Float64
+) -> WallPoints:
+    point = mi.Point3f((positions / built.unit).T.astype(np.float32))
+    normal = mi.Vector3f(normals.T.astype(np.float32))
+    # The wall's own intersection gives shading frame and texture coordinates for every wall type and BSDF.
+    interaction = built.wall_shape.ray_intersect(mi.Ray3f(point + 1e-2 * normal, -normal))
+    interaction.p = point  # the exact grid point, not where a float32 ray met the wall
+    to_device = device - positions
+    to_device /= np.maximum(np.linalg.norm(to_device, axis=-1, keepdims=True), 1e-300)
+    interaction.wi = interaction.to_local(mi.Vector3f(to_device.T.astype(np.float32)))
+    whole = np.floor(delay)
+    points = WallPoints(interaction, mi.Int32(np.clip(whole, -(2**30), 2**30).astype(np.int32)), mi.Float((delay - whole).astype(np.float32)))
+    dr.eval(points.interaction, points.delay_bins, points.delay_fraction)
+    return points

@@ -1,0 +1,137 @@
+"""The time-resolved histogram on the device: one block of rows per lane, float64, and the statistics over replicas.
+
+A lane owns its rows, so a deposit is an unguarded add: no atomics, and the same bits whatever the thread count.
+Sums are float64: float32 stops growing when a deposit is below 6e-8 of what is there already.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+
+BYTES_PER_BIN = 8
+MAX_ELEMENTS = 2**32 - 1  # Dr.Jit indexes with 32 bits
+
+
+@dataclass(frozen=True)
+class HistogramShape:
+    """Sizes of a batch's histogram; a row is one (sensor, laser, bounce slot, channel) and has ``n_bins`` + 1 entries.
+
+    The entry past the last bin collects what falls outside the time window.
+    """
+
+    replicas: int
+    sensors: int
+    lasers: int  # per sensor: 1 for single and confocal captures
+    slots: int  # bounce slots
+    channels: int
+    n_bins: int
+
+    @property
+    def lanes(self) -> int:
+        """Number of lanes: every replica of every sensor point."""
+        return self.replicas * self.sensors
+
+    @property
+    def row(self) -> int:
+        """Entries of a row."""
+        return self.n_bins + 1
+
+    @property
+    def entries_per_lane(self) -> int:
+        """Entries a lane owns."""
+        return self.lasers * self.slots * self.channels * self.row
+
+    @property
+    def size(self) -> int:
+        """Entries of all lanes."""
+        return self.lanes * self.entries_per_lane
+
+    @property
+    def axes(self) -> tuple[int, ...]:
+        """Shape of the statistics: (sensor, laser, slot, channel, bin and outside)."""
+        return (self.sensors, self.lasers, self.slots, self.channels, self.row)
+
+
+class DeviceHistogram:
+    """Deposits of a batch, summed per lane in float64."""
+
+    def __init__(self, shape: HistogramShape):
+        self.shape = shape
+        self.sums = dr.zeros(mi.Float64, shape.size)
+        dr.make_opaque(self.sums)
+
+    def deposit(
+        self,
+        lane: mi.UInt32,
+        laser: mi.UInt32,
+        slot: mi.UInt32,
+        bins: mi.Int32,
+        value: mi.Spectrum,
+        active: mi.Bool,
+    ) -> None:
+        """Add ``value`` to bin ``bins`` (any integer: outside the window it goes to the outside entry) of a row."""
+        shape = self.shape
+        inside = (bins >= 0) & (bins < shape.n_bins)
+        entry = dr.select(inside, mi.UInt32(bins), mi.UInt32(shape.n_bins))
+        row = (lane * shape.lasers + laser) * shape.slots + slot
+        for channel in range(shape.channels):
+            index = (row * shape.channels + channel) * shape.row + entry
+            dr.scatter_add(self.sums, mi.Float64(value[channel]), index, active, dr.ReduceMode.NoConflicts)
+
+    def statistics(self, samples_per_lane: int) -> tuple[mi.Float64, mi.Float64]:
+        """Return mean and variance of the mean over replicas, each (sensor, laser, slot, channel, row) flattened.
+
+        The replicas are independent, so their spread estimates the variance whatever correlates within one.
+        """
+        shape = self.shape
+        size = shape.size // shape.replicas
+        index = dr.arange(mi.UInt32, size)
+        scale = 1.0 / samples_per_lane
+        replicas = [dr.gather(mi.Float64, self.sums, index + r * size) * scale for r in range(shape.replicas)]
+        mean = sum(replicas[1:], replicas[0]) / shape.replicas
+        squares = [dr.square(replica - mean) for replica in replicas]
+        variance = sum(squares[1:], squares[0]) / ((shape.replicas - 1) * shape.replicas)
+        return mean, variance
+
+    def relative_error(self, samples_per_lane: int) -> float:
+        """Return the estimated relative L2 error of H inside the time window."""
+        mean, variance = self.statistics(samples_per_lane)
+        inside = dr.arange(mi.UInt32, dr.width(mean)) % self.shape.row < self.shape.n_bins
+        noise = dr.sum(dr.select(inside, variance, 0))
+        energy = dr.sum(dr.select(inside, dr.square(mean), 0))
+        return relative_l2_error(float(noise[0]), float(energy[0]))
+
+
+@dataclass(frozen=True, eq=False)
+class Histogram:
+    """What an engine returns for a batch, in memory order (channel, bounce, laser, sensor, bin).
+
+    ``mean`` is H [J m^-2 sr^-1 per pulse], ``variance`` the variance of that estimate; zero where H is exact.
+    """
+
+    mean: NDArray[np.float64]
+    variance: NDArray[np.float64]
+    outside: NDArray[np.float64]  # (channel, bounce, laser, sensor): H outside the time window
+    samples: int  # per sensor point; 0 for a deterministic engine
+
+
+def to_memory_order(values: NDArray[np.float64], shape: HistogramShape) -> NDArray[np.float64]:
+    """Bring flat statistics to (channel, slot, laser, sensor, row)."""
+    return values.reshape(shape.axes).transpose(3, 2, 1, 0, 4)
+
+
+def relative_l2_error(noise: float, energy: float) -> float:
+    """Return sqrt(sum of variances / sum of squared truths) from sums over bins of variance and squared estimate.
+
+    E[estimate^2] = truth^2 + variance, so the variances are subtracted; 0 for an empty capture, inf for pure noise.
+    """
+    if noise <= 0:
+        return 0.0
+    truth = energy - noise
+    return math.sqrt(noise / truth) if truth > 0 else math.inf

@@ -1,0 +1,169 @@
+"""Hidden geometry sampling: points uniform by area on the hidden surfaces (Royo et al. 2022, section 4).
+
+Triangles of all meshes lie in one table, analytic shapes are entries beside them; one search in the integer
+cumulative distribution picks an entry and hands its remainder on, so that low-discrepancy numbers stay so.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+
+from nlosrender.scene.build import WALL_ID, BuiltScene, wall_box
+from nlosrender.scene.pose import Float64
+
+SAMPLEABLE_PLUGINS = ("Rectangle", "Disk", "Sphere", "Cylinder")
+_FULL = 2.0**32
+ANALYTIC = 0xFFFFFFFF  # primitive of a point that lies on no triangle
+
+
+@dataclass(frozen=True, eq=False)
+class SurfaceSample:
+    """A point on the hidden geometry, one per lane."""
+
+    p: mi.Point3f
+    shape: mi.ShapePtr
+    primitive: mi.UInt32  # triangle within the shape; ANALYTIC for a shape without triangles
+
+
+class SurfaceSampler:
+    """Samples points of the hidden geometry uniformly by area.
+
+    Triangles that no point of the wall can see from their reflecting side are left out: they return no light.
+
+    Parameters
+    ----------
+    built
+        The scene. Shapes of other kinds than meshes, rectangles, disks, spheres and cylinders are not sampled.
+    """
+
+    def __init__(self, built: BuiltScene):
+        shapes = built.scene.shapes()
+        wall_corners = wall_box(built.wall) / built.unit
+        corners: list[Float64] = []
+        owners: list[NDArray[np.uint32]] = []
+        primitives: list[NDArray[np.uint32]] = []
+        analytic: list[tuple[int, float]] = []
+        self.covers_everything = True
+        for index, shape in enumerate(shapes):
+            if shape.id() == WALL_ID:
+                continue
+            if shape.is_mesh():
+                triangles = _triangles(shape)
+                kept = np.flatnonzero(_visible_from(wall_corners, triangles, _is_one_sided(shape), built.wall.is_planar))
+                corners.append(triangles[kept])
+                owners.append(np.full(len(kept), index, np.uint32))
+                primitives.append(kept.astype(np.uint32))
+            elif shape.class_name() in SAMPLEABLE_PLUGINS:
+                analytic.append((index, float(np.ravel(shape.surface_area())[0])))
+            else:
+                self.covers_everything = False
+        triangles = np.concatenate(corners) if corners else np.zeros((0, 3, 3))
+        areas = np.linalg.norm(np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]), axis=-1) / 2
+        self.n_triangles = len(triangles)
+        self.has_analytic = bool(analytic)
+        owner = np.concatenate([*owners, np.array([index for index, _ in analytic], np.uint32)]).astype(np.uint32)
+        areas = np.concatenate([areas, [area for _, area in analytic]])
+        self.area = float(areas.sum())  # engine units squared
+        self.is_empty = self.area <= 0
+        if self.is_empty:
+            return
+        cumulative = np.minimum(np.rint(np.cumsum(areas) / self.area * _FULL), _FULL - 1)
+        # entry i covers the integers [edges[i], edges[i + 1]); the last one also takes 2^32 - 1
+        self._edges = mi.UInt32(np.concatenate([[0], cumulative]).astype(np.uint32))
+        self._n_entries = len(areas)
+        self._owner = mi.UInt32(owner)
+        if self.n_triangles:
+            self._primitive = mi.UInt32(np.concatenate(primitives))
+            self._corners = [mi.Float(triangles[:, i, j].astype(np.float32)) for i in range(3) for j in range(3)]
+        self._shapes = built.scene.shapes_dr()
+        dr.eval(self._edges, self._owner)
+
+    def sample(self, bits: mi.UInt32, v: mi.Float, active: mi.Bool) -> SurfaceSample:
+        """Sample a point with density 1 / ``area`` over the sampled surfaces.
+
+        Parameters
+        ----------
+        bits
+            Uniform 32-bit integers: choose the entry, the remainder serves as first coordinate in it.
+        v
+            Uniform numbers in [0, 1): second coordinate.
+        active
+            Lanes that need a sample.
+        """
+        entry = dr.binary_search(
+            0, self._n_entries - 1, lambda i: dr.gather(mi.UInt32, self._edges, i + 1, active) <= bits
+        )
+        low = dr.gather(mi.UInt32, self._edges, entry, active)
+        high = dr.gather(mi.UInt32, self._edges, entry + 1, active)
+        u = dr.minimum((mi.Float(bits - low) + 0.5) / dr.maximum(mi.Float(high - low), 1.0), dr.one_minus_epsilon(mi.Float))
+        shape = dr.gather(mi.ShapePtr, self._shapes, dr.gather(mi.UInt32, self._owner, entry, active), active)
+        is_triangle = entry < self.n_triangles
+        point, primitive = mi.Point3f(0), mi.UInt32(ANALYTIC)
+        if self.n_triangles:
+            on_triangle = active & is_triangle
+            a, b, c = (self._corner(k, entry, on_triangle) for k in range(3))
+            root = dr.sqrt(u)  # uniform on the triangle: (1 - sqrt u, sqrt u (1 - v), sqrt u v)
+            point = a + (b - a) * (root * (1 - v)) + (c - a) * (root * v)
+            primitive = dr.select(on_triangle, dr.gather(mi.UInt32, self._primitive, entry, on_triangle), ANALYTIC)
+        if self.has_analytic:
+            on_analytic = active & ~is_triangle
+            analytic = shape.sample_position(mi.Float(0), mi.Point2f(u, v), on_analytic)
+            point = dr.select(on_analytic, analytic.p, point)
+        return SurfaceSample(point, shape, primitive)
+
+    def reached(
+        self, si: mi.SurfaceInteraction3f, point: mi.Point3f, shape: mi.ShapePtr, primitive: mi.UInt32
+    ) -> mi.Bool:
+        """Return whether a ray sent to a sampled point arrived at it, instead of at something in front of it.
+
+        A straight line meets a triangle once, so there the primitive decides; a curved shape has a near side.
+        """
+        near = dr.squared_norm(si.p - point) < 1e-6 * (1e-6 + dr.square(si.t))
+        same = si.shape == shape
+        if not self.has_analytic:
+            return same & (si.prim_index == primitive)
+        return same & dr.select(primitive == ANALYTIC, near, si.prim_index == primitive)
+
+    def covers(self, si: mi.SurfaceInteraction3f, wall: mi.ShapePtr) -> mi.Bool:
+        """Return whether the density of ``sample`` at ``si`` is 1 / ``area`` (hidden, of a sampled kind)."""
+        hidden = si.is_valid() & (si.shape != wall)
+        if self.covers_everything:
+            return hidden
+        sampled = mi.Bool(False)
+        for name in ("Mesh", *SAMPLEABLE_PLUGINS):
+            sampled |= si.shape.shape_type() == int(getattr(mi.ShapeType, name))
+        return hidden & sampled
+
+    def _corner(self, k: int, entry: mi.UInt32, active: mi.Bool) -> mi.Point3f:
+        return mi.Point3f(*(dr.gather(mi.Float, self._corners[3 * k + j], entry, active) for j in range(3)))
+
+
+def _triangles(mesh: mi.Mesh) -> Float64:
+    """Return the corners (n, 3, 3) of a mesh's triangles [engine units]."""
+    parameters = mi.traverse(mesh)
+    vertices = np.asarray(parameters["vertex_positions"], dtype=np.float64).reshape(-1, 3)
+    return vertices[np.asarray(parameters["faces"]).reshape(-1, 3)]
+
+
+def _is_one_sided(shape: mi.Shape) -> bool:
+    return not bool(shape.bsdf().flags() & mi.BSDFFlags.BackSide)
+
+
+def _visible_from(
+    wall_corners: Float64, triangles: Float64, one_sided: bool, wall_is_planar: bool
+) -> NDArray[np.bool_]:
+    """Return which triangles some point of the box ``wall_corners`` (8, 3) may see on a side that reflects."""
+    normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+    visible = np.linalg.norm(normals, axis=-1) > 0
+    if wall_is_planar:
+        visible &= triangles[:, :, 2].max(axis=1) > 0  # nothing behind the wall's plane is lit or seen
+    if not one_sided:
+        return visible
+    # A plane has the whole box behind it when it has every corner of the box behind it.
+    height = np.einsum("ckj,kj->ck", wall_corners[:, None, :] - triangles[None, :, 0, :], normals)
+    return visible & (height.max(axis=0) > 0)

@@ -1,0 +1,76 @@
+"""Everything a user can run into, as exceptions that carry the process exit code.
+
+Only ``cli/`` catches these and exits; everything else raises them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+EXIT_OK = 0
+EXIT_FAILURE = 1
+EXIT_USAGE = 2
+EXIT_BAD_INPUT = 3
+EXIT_COMPARISON_EXCEEDED = 4
+EXIT_INCOMPLETE = 5
+EXIT_ENVIRONMENT = 6
+EXIT_INTERRUPTED = 130
+
+
+class NlosError(Exception):
+    """Base of every error that is explained to the user instead of traced."""
+
+    exit_code: int = EXIT_FAILURE
+
+
+@dataclass(frozen=True)
+class Problem:
+    """One mistake in a configuration: where it is and what to do about it."""
+
+    place: str  # "z.yaml:14:3" or "--set capture.laser_grid.nx=0"
+    key: str  # dotted key, "capture.laser_grid.nx"; empty when the whole file is meant
+    message: str  # what was found, what is allowed, what to do
+
+    def __str__(self) -> str:
+        return ": ".join(part for part in (self.place, self.key, self.message) if part)
+
+
+class ConfigError(NlosError):
+    """The configuration cannot be used; holds every problem found, not only the first."""
+
+    exit_code = EXIT_BAD_INPUT
+
+    def __init__(self, problems: Sequence[Problem] | Problem):
+        self.problems: tuple[Problem, ...] = (problems,) if isinstance(problems, Problem) else tuple(problems)
+        super().__init__("\n".join(str(problem) for problem in self.problems))
+
+
+class FileError(NlosError):
+    """A capture or mesh file cannot be read, written or understood."""
+
+    exit_code = EXIT_BAD_INPUT
+
+
+class BackendError(NlosError):
+    """The machine lacks what a render needs: no usable LLVM, no GPU."""
+
+    exit_code = EXIT_ENVIRONMENT
+
+
+class RenderError(NlosError):
+    """The render itself failed: a non-finite result, not enough memory, a scene the renderer rejects."""
+
+
+class InterruptedRender(NlosError):
+    """The user stopped the render; what was finished has been saved or removed as documented."""
+
+    exit_code = EXIT_INTERRUPTED
+
+
+def nearest(name: str, known: Iterable[str]) -> str | None:
+    """Return the known name closest in spelling to ``name``, or None when none is close."""
+    import difflib
+
+    matches = difflib.get_close_matches(name, list(known), n=1, cutoff=0.6)
+    return matches[0] if matches else None

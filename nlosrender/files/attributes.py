@@ -1,0 +1,102 @@
+"""Values as HDF5 attributes that every reader copes with.
+
+Text and plain numbers only: h5py would store a Python bool as an enumeration, which MATLAB loaders refuse, and one
+loader passes every text *dataset* through YAML, so that text belongs into attributes.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+
+import h5py
+import numpy as np
+
+# An object header holds an attribute of at most 64 KiB. Variable-length text lies in the heap and is not bound by
+# it; arrays are, and go there as JSON text when they are larger.
+MAX_ARRAY_BYTES = 60_000
+
+
+def attribute_value(value: object) -> str | int | float | np.ndarray:
+    """Return ``value`` as what is stored: text, a number, or a numeric array.
+
+    Booleans become 0 / 1. Numbers that are not finite, None, mappings, sequences of anything but numbers and
+    large arrays become text (JSON where there is structure): NaN and infinity never reach a file as numbers.
+    """
+    if isinstance(value, str):
+        return _clean(value)
+    if value is None:
+        return "none"
+    if isinstance(value, (bool, np.bool_)):
+        return int(value)
+    if isinstance(value, (int, np.integer)):
+        number = int(value)
+        return number if -(2**63) <= number < 2**63 else str(number)
+    if isinstance(value, (float, np.floating)):
+        return float(value) if math.isfinite(value) else str(float(value))
+    if isinstance(value, Mapping):
+        return _clean(json.dumps(_plain(value), ensure_ascii=False))
+    if isinstance(value, (list, tuple, np.ndarray)):
+        return _array(value)
+    return _clean(str(value))
+
+
+def set_attributes(target: h5py.Group | h5py.Dataset, values: Mapping[str, object]) -> None:
+    """Store ``values`` as attributes of ``target``, replacing those of the same name."""
+    for name, value in values.items():
+        target.attrs[name] = attribute_value(value)
+
+
+def get_attributes(source: h5py.Group | h5py.Dataset) -> dict[str, object]:
+    """Return the attributes of ``source`` as Python text, numbers and lists; those h5py cannot read are left out."""
+    found: dict[str, object] = {}
+    for name in source.attrs:
+        try:
+            found[str(name)] = _native(source.attrs[name])
+        except (OSError, TypeError, ValueError, RuntimeError, KeyError):
+            continue  # written by someone else in a type that has no meaning here
+    return found
+
+
+def _array(values: object) -> str | np.ndarray:
+    try:
+        array = np.asarray(values)
+    except ValueError:  # rows of different length
+        array = np.empty(0, dtype=object)
+    numeric = array.dtype.kind in "iuf" and array.size > 0
+    if numeric and array.nbytes <= MAX_ARRAY_BYTES and bool(np.isfinite(array).all()):
+        return array
+    return _clean(json.dumps(_plain(values), ensure_ascii=False))
+
+
+def _plain(value: object) -> object:
+    """Return ``value`` with everything in it as JSON knows it."""
+    if isinstance(value, Mapping):
+        return {str(key): _plain(entry) for key, entry in value.items()}
+    if isinstance(value, np.ndarray):
+        return _plain(value.tolist())
+    if isinstance(value, (list, tuple)):
+        return [_plain(entry) for entry in value]
+    if isinstance(value, np.generic):
+        return _plain(value.item())
+    if isinstance(value, float) and not math.isfinite(value):
+        return str(value)
+    return value if isinstance(value, (str, int, float, type(None))) else str(value)
+
+
+def _clean(text: str) -> str:
+    # file names that are not UTF-8 arrive with surrogates, which HDF5's text cannot hold; nor can it a zero byte
+    return text.encode("utf-8", "backslashreplace").decode("utf-8").replace("\0", "\\0")
+
+
+def _native(value: object) -> object:
+    if isinstance(value, bytes):
+        return value.decode("utf-8", "backslashreplace")
+    if isinstance(value, np.generic):
+        return _native(value.item())
+    if isinstance(value, np.ndarray):
+        return [_native(entry) for entry in value.tolist()]
+    if isinstance(value, (list, tuple)):
+        return [_native(entry) for entry in value]
+    return value if isinstance(value, (str, int, float)) else str(value)

@@ -1,0 +1,122 @@
+"""From a ``CaptureHeader`` to the datasets and attributes of a Z-NLOS file, samples excepted."""
+
+from __future__ import annotations
+
+import h5py
+import numpy as np
+
+from nlosrender.capture.bounces import FIRST_BOUNCE, LAST_FILE_BOUNCE, THIRD_BOUNCE
+from nlosrender.files import layout
+from nlosrender.files.attributes import set_attributes
+from nlosrender.files.capture_file import CaptureHeader
+from nlosrender.scene.pose import Pose
+
+CHANNELS = {3: "rgb"}  # grey has no name: it is what every file without the attribute holds
+
+
+def write_header(file: h5py.File, header: CaptureHeader) -> None:
+    """Create every dataset but ``data`` in ``file``, and the attributes that explain them."""
+    for name, values in dataset_values(header).items():
+        spec = layout.SPECS[name]
+        dataset = file.create_dataset(name, data=np.asarray(values, dtype=spec.dtype))
+        set_attributes(dataset, {"meaning": spec.meaning} | ({"unit": spec.unit} if spec.unit else {}))
+    # float32 holds 3 mm to one part in 1.7e7 only: over 2048 bins that is visible against the exact width
+    set_attributes(file["deltaT"], {"exact": np.float64(header.bin_width_opl)})
+    set_attributes(file["t0"], {"exact": np.float64(header.start_opl)})
+    set_attributes(file["hiddenVolumeSize"], {"exact": _hidden_volume(header)[2]})
+    set_attributes(file, root_attributes(header))
+
+
+def dataset_values(header: CaptureHeader) -> dict[str, object]:
+    """Return the value of every small dataset of the layout, in the file's frame."""
+    frame = layout.file_frame(header.frame, header.pose)
+    sizes = layout.grid_sizes(header.sizes, header.confocal)
+    center, rotation, edges = _hidden_volume(header)
+    return {
+        "cameraGridPositions": layout.axes_first(frame.positions(header.sensor_positions)),
+        "cameraGridNormals": layout.axes_first(frame.directions(header.sensor_normals)),
+        "laserGridPositions": layout.axes_first(frame.positions(header.laser_positions)),
+        "laserGridNormals": layout.axes_first(frame.directions(header.laser_normals)),
+        "cameraPosition": frame.positions(header.sensor_position),
+        "laserPosition": frame.positions(header.laser_position),
+        "cameraGridSize": header.sensor_grid_size,
+        "laserGridSize": header.laser_grid_size,
+        "cameraGridPoints": (sizes["sensor_x"], sizes["sensor_y"]),
+        "laserGridPoints": (sizes["laser_x"], sizes["laser_y"]),
+        "t": header.n_bins,
+        "t0": header.start_opl,
+        "deltaT": header.bin_width_opl,
+        "hiddenVolumePosition": center,
+        "hiddenVolumeRotation": rotation,
+        "hiddenVolumeSize": edges.max(),
+        "isConfocal": int(header.confocal),
+    }
+
+
+def root_attributes(header: CaptureHeader) -> dict[str, object]:
+    """Return the attributes of the file itself that follow from the header."""
+    legs = header.account_first_and_last_bounces
+    attributes: dict[str, object] = {
+        **layout.ROOT_TEXT,
+        "nlosrender_format_version": layout.FORMAT_VERSION,
+        "scan_type": header.scan_type,
+        "units": "lengths in m, times in m of optical path (divide by c = 299792458 m/s), angles in rad",
+        "frame": header.frame,
+        "frame_convention": layout.FRAME_TEXT[header.frame],
+        "file_to_scene": layout.file_to_scene(header.frame, header.pose),
+        "relay_wall_to_scene": header.pose.matrix(),
+        "planar_wall": header.planar_wall,
+        "account_first_and_last_bounces": legs,
+        "first_and_last_legs": "included: laser -> wall and wall -> sensor count in the optical path length"
+        if legs
+        else "NOT included: optical path lengths run from the laser point to the sensor point only",
+        "max_bounces": "no limit" if header.max_bounces is None else header.max_bounces,
+        "split_bounces": header.split_bounces,
+    }
+    if header.n_channels in CHANNELS:
+        attributes["channels"] = CHANNELS[header.n_channels]
+    return attributes
+
+
+def sample_attributes(header: CaptureHeader) -> dict[str, object]:
+    """Return the attributes of ``data`` (and of ``variance``): axes, bounces, unit."""
+    if not header.split_bounces:
+        bounces = f"the sum of all bounces is in index {header.bounce_indices[0]}"
+    else:
+        bounces = f"index k of the bounce axis holds bounce k + {FIRST_BOUNCE}"
+        if header.max_bounces is None or header.max_bounces > LAST_FILE_BOUNCE:
+            last = LAST_FILE_BOUNCE - FIRST_BOUNCE
+            bounces += f"; bounces above {LAST_FILE_BOUNCE} are added into index {last}"
+    return {
+        "third_bounce": np.int32(THIRD_BOUNCE - FIRST_BOUNCE),
+        "bounces": bounces,
+        "bounce_indices": np.asarray(header.bounce_indices, dtype=np.int32),
+        "axes": " ".join(layout.file_axes(header.confocal)),
+        "unit": layout.DATA_UNIT,
+    }
+
+
+def _hidden_volume(header: CaptureHeader) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return centre (file's frame), rotation [rad] and edges of the box around the hidden geometry.
+
+    The box lies along the relay wall's axes. In the Z-NLOS frame these are the file's own axes (and the edges are
+    given in their order); in the scene's frame the box is turned with the wall, and the edges are along the wall's
+    x, y and z.
+    """
+    if header.hidden_bounds is None:
+        return np.zeros(3), np.zeros(3), np.zeros(3)
+    low, high = header.hidden_bounds
+    center = layout.file_frame(header.frame, header.pose).positions((low + high) / 2)
+    edges = high - low
+    if header.frame == "znlos":
+        return center, np.zeros(3), np.abs(layout.ZNLOS_FROM_LOCAL @ edges)
+    return center, _euler_angles(header.pose), edges
+
+
+def _euler_angles(pose: Pose) -> np.ndarray:
+    """Return the angles (3,) [rad] about x, then y, then z of a pose's rotation (inverse of ``euler_xyz``)."""
+    rotation = pose.rotation
+    y = np.arcsin(np.clip(-rotation[2, 0], -1, 1))
+    if abs(rotation[2, 0]) > 1 - 1e-12:  # looking along y: x and z turn about the same axis, give all of it to z
+        return np.array([0.0, y, np.arctan2(-rotation[0, 1], rotation[1, 1])])
+    return np.array([np.arctan2(rotation[2, 1], rotation[2, 2]), y, np.arctan2(rotation[1, 0], rotation[0, 0])])

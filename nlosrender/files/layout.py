@@ -1,0 +1,190 @@
+"""The Z-NLOS HDF5 layout (Galindo et al. 2019), declared once as data.
+
+The writer creates what is listed here, the reader looks for it and the validation checks it. Shapes are as h5py
+shows them. The class of a number (floating point or integer) is part of the layout: C++ loaders choose the type
+they read into by it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from nlosrender.capture.bounces import FILE_BOUNCES
+from nlosrender.scene.pose import Pose
+
+Float64 = NDArray[np.float64]
+T = TypeVar("T")
+
+FORMAT_VERSION = 1  # of the attributes this program adds; the layout itself has no version
+FLOAT = "<f4"
+INTEGER = "<i4"
+SCAN_TYPES = ("single", "confocal", "exhaustive")
+FRAMES = ("znlos", "scene")
+
+MEMORY_AXES = ("channel", "bounce", "laser_y", "laser_x", "sensor_y", "sensor_x", "bin")
+CONFOCAL_AXES = ("channel", "bin", "bounce", "sensor_y", "sensor_x")
+PAIR_AXES = (*CONFOCAL_AXES, "laser_y", "laser_x")  # single and exhaustive captures
+
+THREE = 3  # coordinates of a position
+
+
+@dataclass(frozen=True)
+class DatasetSpec:
+    """One dataset at the root of a file."""
+
+    name: str
+    dtype: str  # FLOAT or INTEGER, little-endian 32 bit
+    shape: tuple[str | int, ...]  # names of axes (their length is meant) or fixed lengths
+    meaning: str
+    unit: str = ""
+
+
+DATA = "data"
+VARIANCE = "variance"
+
+DATASETS: tuple[DatasetSpec, ...] = (
+    DatasetSpec("cameraGridPositions", FLOAT, (THREE, "sensor_y", "sensor_x"), "sensor points on the relay wall", "m"),
+    DatasetSpec("cameraGridNormals", FLOAT, (THREE, "sensor_y", "sensor_x"), "unit normals at the sensor points"),
+    DatasetSpec("laserGridPositions", FLOAT, (THREE, "laser_y", "laser_x"), "laser points on the relay wall", "m"),
+    DatasetSpec("laserGridNormals", FLOAT, (THREE, "laser_y", "laser_x"), "unit normals at the laser points"),
+    DatasetSpec("cameraPosition", FLOAT, (3,), "position of the sensor", "m"),
+    DatasetSpec("laserPosition", FLOAT, (3,), "position of the laser", "m"),
+    DatasetSpec("cameraGridSize", FLOAT, (2,), "width and height of the sensor grid along the wall", "m"),
+    DatasetSpec("laserGridSize", FLOAT, (2,), "width and height of the laser grid along the wall", "m"),
+    DatasetSpec("cameraGridPoints", FLOAT, (2,), "number of sensor points (Nx, Ny)"),
+    DatasetSpec("laserGridPoints", FLOAT, (2,), "number of laser points (Lx, Ly)"),
+    DatasetSpec("t", INTEGER, (), "number of bins"),
+    DatasetSpec("t0", FLOAT, (), "optical path length at the start of bin 0", "m"),
+    DatasetSpec("deltaT", FLOAT, (), "width of a bin in optical path length", "m"),
+    DatasetSpec("hiddenVolumePosition", FLOAT, (3,), "centre of the hidden geometry's bounding box", "m"),
+    DatasetSpec("hiddenVolumeRotation", FLOAT, (3,), "rotation of that box about x, then y, then z", "rad"),
+    DatasetSpec("hiddenVolumeSize", FLOAT, (), "full edge of the hidden geometry's bounding cube", "m"),
+    DatasetSpec("isConfocal", INTEGER, (), "1 for a confocal capture, else 0"),
+)
+SPECS: Mapping[str, DatasetSpec] = {spec.name: spec for spec in DATASETS}
+
+ROOT_TEXT = {"data order": "column-major", "engine": "nlosrender"}  # attributes of the file
+DATA_UNIT = "J m^-2 sr^-1"  # radiance leaving a sensor point, integrated over the bin, for one pulse
+
+
+def file_axes(confocal: bool) -> tuple[str, ...]:
+    """Return the names of the axes of ``data``, in the order h5py shows them."""
+    return CONFOCAL_AXES if confocal else PAIR_AXES
+
+
+def data_shape(sizes: Mapping[str, int], confocal: bool) -> tuple[int, ...]:
+    """Return the shape of ``data`` from the length of every in-memory axis; the bounce axis is always 6 long."""
+    return in_file_order({**sizes, "bounce": FILE_BOUNCES}, confocal)
+
+
+def in_file_order(by_axis: Mapping[str, T], confocal: bool) -> tuple[T, ...]:
+    """Arrange one value per axis name (a length, an index, a slice) in the order of the file's axes."""
+    return tuple(by_axis[axis] for axis in file_axes(confocal))
+
+
+def to_file_order(array: NDArray[np.float32], axes: tuple[str, ...], confocal: bool) -> NDArray[np.float32]:
+    """Transpose an array whose axes are named ``axes`` (a subset of the file's) into the order of the file."""
+    return array.transpose([axes.index(axis) for axis in file_axes(confocal) if axis in axes])
+
+
+def from_file_order(array: NDArray[np.float32], axes: tuple[str, ...], confocal: bool) -> NDArray[np.float32]:
+    """Transpose what was read from the file's axes (those in ``axes``) into the order given by ``axes``."""
+    stored = [axis for axis in file_axes(confocal) if axis in axes]
+    return array.transpose([stored.index(axis) for axis in axes])
+
+
+def resolve_shape(spec: DatasetSpec, sizes: Mapping[str, int]) -> tuple[int, ...]:
+    """Return the shape of a dataset, axis names replaced by their lengths."""
+    return tuple(length if isinstance(length, int) else sizes[length] for length in spec.shape)
+
+
+def grid_sizes(sizes: Mapping[str, int], confocal: bool) -> dict[str, int]:
+    """Return ``sizes`` with the lengths of the stored laser grid: in a confocal file it is a copy of the sensor's."""
+    return {**sizes, "laser_y": sizes["sensor_y"], "laser_x": sizes["sensor_x"]} if confocal else dict(sizes)
+
+
+# rows: X, Y, Z of a Z-NLOS file in terms of the wall's own x, y, z: (X, Y, Z) = (x, -z, y)
+ZNLOS_FROM_LOCAL: Float64 = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+ZNLOS_FROM_LOCAL.setflags(write=False)
+
+FRAME_TEXT = {
+    "znlos": (
+        "X = x, Y = -z, Z = y, where x, y are the relay wall's axes, z its normal and its centre the origin; "
+        "file_to_scene takes positions of this file to the scene's coordinates"
+    ),
+    "scene": "coordinates of the scene as configured",
+}
+
+
+@dataclass(frozen=True)
+class FileFrame:
+    """The frame positions are written in, seen from the local frame: ``p_file = rotation @ p_local + origin``."""
+
+    rotation: Float64  # (3, 3)
+    origin: Float64  # (3,) m
+
+    def positions(self, local: ArrayLike) -> Float64:
+        """Take positions (..., 3) [m] of the local frame to the file's."""
+        return self.directions(local) + self.origin
+
+    def directions(self, local: ArrayLike) -> Float64:
+        """Take directions (..., 3) of the local frame to the file's."""
+        return np.asarray(local, dtype=np.float64) @ self.rotation.T
+
+
+def file_frame(frame: str, pose: Pose) -> FileFrame:
+    """Return the conversion from the local frame (wall in z = 0, normal +z) to the file's frame.
+
+    Parameters
+    ----------
+    frame
+        ``znlos``: wall in Y = 0 with normal (0, -1, 0), Z up; ``scene``: the scene's own coordinates.
+    pose
+        Pose of the local frame in the scene.
+
+    Raises
+    ------
+    ValueError
+        ``frame`` is neither of the two.
+    """
+    if frame == "znlos":
+        return FileFrame(ZNLOS_FROM_LOCAL, np.zeros(3))
+    if frame == "scene":
+        return FileFrame(pose.rotation, pose.origin)
+    raise ValueError(f"frame: got {frame!r}, need one of {', '.join(FRAMES)}")
+
+
+def file_to_scene(frame: str, pose: Pose) -> Float64:
+    """Return the (4, 4) matrix from positions in the file to scene coordinates.
+
+    Raises
+    ------
+    ValueError
+        ``frame`` is unknown.
+    """
+    conversion = file_frame(frame, pose)
+    local_from_file = np.eye(4)
+    local_from_file[:3, :3] = conversion.rotation.T
+    local_from_file[:3, 3] = -conversion.rotation.T @ conversion.origin
+    return pose.matrix() @ local_from_file
+
+
+def axes_last(array: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Turn the file's (3, rows, columns) into (rows, columns, 3)."""
+    return np.moveaxis(array, 0, -1)
+
+
+def axes_first(array: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Turn (rows, columns, 3) into the file's (3, rows, columns)."""
+    return np.moveaxis(array, -1, 0)
+
+
+def missing_datasets(present: Iterable[str]) -> list[str]:
+    """Return the names of the layout that are not among ``present``."""
+    names = set(present)
+    return [name for name in (DATA, *SPECS) if name not in names]

@@ -1,0 +1,213 @@
+"""Reads capture files: metadata at once, samples lazily and back in the in-memory axis order."""
+
+from __future__ import annotations
+
+import stat
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from nlosrender.errors import FileError
+from nlosrender.files import layout
+from nlosrender.files.stored_header import StoredHeader, header_of, samples_of, stored_points
+
+Part = int | slice | None  # of one axis; None: all of it
+TILE_AXES = ("channel", "sensor_y", "sensor_x", "bin")  # what one read of one laser and one bounce returns
+
+
+@dataclass(frozen=True, eq=False)
+class StoredPositions:
+    """Points and unit normals of both grids, (rows, columns, 3) float64 [m], in the file's frame."""
+
+    sensor_positions: NDArray[np.float64]
+    sensor_normals: NDArray[np.float64]
+    laser_positions: NDArray[np.float64]
+    laser_normals: NDArray[np.float64]
+
+
+class StoredCapture:
+    """An open capture file; made by :func:`open_capture`."""
+
+    def __init__(self, file: h5py.File, path: Path):
+        self._file = file
+        self.path = path
+        self.header: StoredHeader = header_of(file, path)
+
+    @property
+    def positions(self) -> StoredPositions:
+        """Points and normals of both grids.
+
+        Raises
+        ------
+        FileError
+            The file does not have them, or not one per point.
+        """
+        sizes = layout.grid_sizes(self.header.sizes, self.header.confocal)
+        names = ("cameraGridPositions", "cameraGridNormals", "laserGridPositions", "laserGridNormals")
+        with explained_read(self.path):
+            return StoredPositions(*(stored_points(self._file, self.path, name, sizes) for name in names))
+
+    def read_block(
+        self,
+        lasers: tuple[Part, Part] | None = None,
+        sensors: tuple[Part, Part] | None = None,
+        bounces: Sequence[int] | None = None,
+        dataset: str = layout.DATA,
+    ) -> NDArray[np.float32]:
+        """Read part of the samples.
+
+        Parameters
+        ----------
+        lasers, sensors
+            (row, column), each an index, a slice of step 1 or None for all; None for the whole grid.
+        bounces
+            Indices on the file's bounce axis; None for those that hold light (``header.bounce_indices``).
+        dataset
+            ``data`` or ``variance``.
+
+        Returns
+        -------
+        NDArray
+            (channel, bounce, laser_y, laser_x, sensor_y, sensor_x, bin) float32; an index keeps its axis.
+
+        Raises
+        ------
+        FileError
+            A part lies outside the capture, the file has no such dataset, or its content is damaged.
+        """
+        sizes = self.header.sizes
+        parts = (*(lasers or (None, None)), *(sensors or (None, None)))
+        axes = ("laser_y", "laser_x", "sensor_y", "sensor_x")
+        where = {axis: self._range(part, axis) for axis, part in zip(axes, parts, strict=True)}
+        chosen = self.header.bounce_indices if bounces is None else tuple(bounces)
+        if any(not 0 <= bounce < sizes["bounce"] for bounce in chosen):
+            raise FileError(f"{self.path}: no bounce index {chosen}, the file has 0 to {sizes['bounce'] - 1}")
+        with explained_read(self.path):
+            samples = samples_of(self._file, self.path, dataset)
+            if samples.shape != self.header.data_shape:
+                raise FileError(f"{self.path}: {dataset} has shape {samples.shape}, data {self.header.data_shape}")
+            return self._gather(samples, where, chosen)
+
+    def _gather(self, samples: h5py.Dataset, where: dict[str, slice], bounces: tuple[int, ...]) -> NDArray[np.float32]:
+        sizes = self.header.sizes
+        lengths = {axis: part.stop - part.start for axis, part in where.items()}
+        lengths |= {"channel": sizes["channel"], "bounce": len(bounces), "bin": sizes["bin"]}
+        block = np.empty([lengths[axis] for axis in layout.MEMORY_AXES], dtype=np.float32)
+        tile: dict[str, int | slice] = {"channel": slice(None), "bin": slice(None)}
+        tile |= {axis: where[axis] for axis in ("sensor_y", "sensor_x")}
+        # laser by laser, bounce by bounce: chunks hold one of each, and HDF5 copies across them element by element
+        for row, column in np.ndindex(lengths["laser_y"], lengths["laser_x"]):
+            laser = {"laser_y": where["laser_y"].start + row, "laser_x": where["laser_x"].start + column}
+            for slot, bounce in enumerate(bounces):
+                stored = samples[layout.in_file_order({**tile, **laser, "bounce": bounce}, self.header.confocal)]
+                block[:, slot, row, column] = layout.from_file_order(stored, TILE_AXES, self.header.confocal)
+        return block
+
+    def _range(self, part: Part, axis: str) -> slice:
+        length = self.header.sizes[axis]
+        if isinstance(part, slice) and part.step in (None, 1):
+            start, stop, _ = part.indices(length)
+            if start < stop:
+                return slice(start, stop)
+        elif part is None:
+            return slice(0, length)
+        elif isinstance(part, (int, np.integer)) and 0 <= part < length:
+            return slice(int(part), int(part) + 1)
+        raise FileError(f"{self.path}: {axis} {part} is outside the capture, which has 0 to {length - 1}")
+
+
+def read_header(path: str | Path) -> StoredHeader:
+    """Read a capture's metadata; its samples are not touched, whatever their size.
+
+    Raises
+    ------
+    FileError
+        The file is missing, damaged or not a capture.
+    """
+    with open_capture(path) as capture:
+        return capture.header
+
+
+@contextmanager
+def open_capture(path: str | Path) -> Iterator[StoredCapture]:
+    """Open a capture for reading.
+
+    Raises
+    ------
+    FileError
+        The file is missing, damaged or not a capture.
+    """
+    path = Path(path)
+    with open_hdf5(path) as file:
+        with explained_read(path):
+            capture = StoredCapture(file, path)
+        yield capture
+
+
+@contextmanager
+def open_hdf5(path: Path) -> Iterator[h5py.File]:
+    """Open any HDF5 file for reading.
+
+    Raises
+    ------
+    FileError
+        There is no such file, it cannot be read, or it is not an HDF5 file or cut short.
+    """
+    with explained_read(path):
+        _check_regular(path)
+        if not h5py.is_hdf5(path):
+            with path.open("rb") as stream:
+                start = stream.read(16)
+            content = f"it starts with {start!r}" if start else "it is empty"
+            raise FileError(f"{path}: is not an HDF5 file ({content}). Captures are HDF5 files, usually named .hdf5")
+        file = h5py.File(path, "r")
+    try:
+        yield file
+    finally:
+        file.close()
+
+
+@contextmanager
+def explained_read(path: Path) -> Iterator[None]:
+    """Turn whatever a damaged file makes h5py raise into a FileError.
+
+    Raises
+    ------
+    FileError
+        An error of the system or of HDF5 left the block.
+    """
+    try:
+        yield
+    except MemoryError as error:
+        raise FileError(
+            f"{path}: claims to hold more than fits into memory. Read a part of it, or render it again."
+        ) from error
+    except PermissionError as error:
+        raise FileError(f"{path}: may not be read: {error}") from error
+    # h5py passes on HDF5's complaints about damaged content as any of these
+    except (OSError, RuntimeError, KeyError, ValueError, TypeError, OverflowError) as error:
+        raise FileError(f"{path}: cannot be read: {error}. {_advice(error)}") from error
+
+
+def _advice(error: Exception) -> str:
+    if "truncated" in str(error):
+        return "The file is cut short: copy it again completely, or render it again."
+    if "lock" in str(error):
+        return "Another program has it open for writing: wait for it, or set HDF5_USE_FILE_LOCKING=FALSE."
+    return "The file may be damaged: copy it again, or render it again."
+
+
+def _check_regular(path: Path) -> None:
+    try:
+        mode = path.stat().st_mode
+    except FileNotFoundError as error:
+        raise FileError(f"{path}: there is no such file") from error
+    if stat.S_ISDIR(mode):
+        raise FileError(f"{path}: is a folder. Name the capture file in it.")
+    if not stat.S_ISREG(mode):  # a pipe would wait for its other end forever
+        raise FileError(f"{path}: is not a regular file. Name a capture file.")

@@ -1,0 +1,173 @@
+"""Checks a file against the Z-NLOS layout as strictly as the strictest of its loaders."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import h5py
+import numpy as np
+
+from nlosrender.capture.bounces import FILE_BOUNCES, THIRD_BOUNCE
+from nlosrender.capture.bounces import FIRST_BOUNCE as FIRST
+from nlosrender.files import layout
+from nlosrender.files.attributes import get_attributes
+from nlosrender.files.reader import explained_read, open_hdf5
+from nlosrender.files.stored_header import samples_of, small_numbers, stored_points
+
+CLASSES = {layout.FLOAT: h5py.h5t.FLOAT, layout.INTEGER: h5py.h5t.INTEGER}
+WORDS = {h5py.h5t.FLOAT: "floating point", h5py.h5t.INTEGER: "integer"}
+NORMAL_TOLERANCE = 1e-5  # three float32 components: 1e-7, with room for other writers' float32 arithmetic
+PLANE_TOLERANCE = 1e-5  # m, a wall a few metres wide in float32
+
+
+def validate_file(path: str | Path) -> list[str]:
+    """Return every way in which a file deviates from the layout; an empty list for a flawless one.
+
+    Reads all samples, chunk by chunk; chunks that were never written are skipped.
+
+    Raises
+    ------
+    FileError
+        The file cannot be read at all: missing, damaged, without samples.
+    """
+    path = Path(path)
+    with open_hdf5(path) as file, explained_read(path):
+        samples = samples_of(file, path)
+        confocal = samples.ndim == len(layout.CONFOCAL_AXES)
+        sizes = layout.grid_sizes(dict(zip(layout.file_axes(confocal), samples.shape, strict=True)), confocal)
+        missing = layout.missing_datasets(file)
+        found = [f"{name}: missing" for name in missing]
+        found += _samples(samples, sizes)
+        for spec in layout.DATASETS:
+            if spec.name not in missing:
+                found += _dataset(file[spec.name], spec, sizes)
+        if not found:  # values mean something only where types and shapes are right
+            found += _values(file, path, sizes, confocal) + _points(file, path, sizes, confocal)
+        found += _attributes(file, samples)
+        found += _finite(samples, layout.DATA)
+        if layout.VARIANCE in file:
+            variance = samples_of(file, path, layout.VARIANCE)
+            if variance.shape != samples.shape:
+                found.append(f"variance: shape {variance.shape}, need that of data, {samples.shape}")
+            found += _finite(variance, layout.VARIANCE)
+    return found
+
+
+def _samples(samples: h5py.Dataset, sizes: Mapping[str, int]) -> list[str]:
+    found = _number(samples, layout.DATA, layout.FLOAT)
+    if sizes["bounce"] != FILE_BOUNCES:
+        found.append(f"data: bounce axis of length {sizes['bounce']}, need {FILE_BOUNCES}")
+    if sizes["channel"] not in (1, 3):
+        found.append(f"data: {sizes['channel']} channels, need 1 or 3")
+    return found
+
+
+def _dataset(dataset: object, spec: layout.DatasetSpec, sizes: Mapping[str, int]) -> list[str]:
+    if not isinstance(dataset, h5py.Dataset):
+        return [f"{spec.name}: is not a dataset"]
+    found = _number(dataset, spec.name, spec.dtype)
+    need = layout.resolve_shape(spec, sizes)
+    if dataset.shape != need:
+        found.append(f"{spec.name}: shape {dataset.shape}, need {need}")
+    elif not found and not np.isfinite(dataset[()]).all():
+        found.append(f"{spec.name}: holds a value that is not finite")
+    return found
+
+
+def _number(dataset: h5py.Dataset, name: str, dtype: str) -> list[str]:
+    kind, size = CLASSES[dtype], np.dtype(dtype).itemsize
+    stored = dataset.id.get_type()
+    if stored.get_class() == kind and stored.get_size() == size:
+        return []
+    return [f"{name}: {dataset.dtype}, need {8 * size}-bit {WORDS[kind]}"]
+
+
+def _values(file: h5py.File, path: Path, sizes: Mapping[str, int], confocal: bool) -> list[str]:
+    """Check the small datasets against the shape of ``data``."""
+    expected: dict[str, tuple[float, ...]] = {
+        "t": (sizes["bin"],),
+        "isConfocal": (int(confocal),),
+        "cameraGridPoints": (sizes["sensor_x"], sizes["sensor_y"]),
+        "laserGridPoints": (sizes["laser_x"], sizes["laser_y"]),
+    }
+    found = []
+    for name, need in expected.items():
+        values = small_numbers(file, path, name)
+        if values != tuple(float(number) for number in need):
+            found.append(f"{name}: {_listed(values)}, but the shape of data says {_listed(need)}")
+    if file["deltaT"][()] <= 0:
+        found.append(f"deltaT: {file['deltaT'][()]}, need a length > 0")
+    for name in ("hiddenVolumeSize", "cameraGridSize", "laserGridSize"):
+        if np.any(file[name][()] < 0):
+            found.append(f"{name}: a negative length")
+    return found
+
+
+def _points(file: h5py.File, path: Path, sizes: Mapping[str, int], confocal: bool) -> list[str]:
+    found = []
+    grids = {
+        name: stored_points(file, path, name, sizes) for name in layout.SPECS if name.endswith(("itions", "ormals"))
+    }
+    for name in ("cameraGridNormals", "laserGridNormals"):
+        if np.abs(np.linalg.norm(grids[name], axis=-1) - 1).max() > NORMAL_TOLERANCE:
+            found.append(f"{name}: not unit normals")
+    for name in ("Positions", "Normals"):
+        if confocal and not np.array_equal(grids[f"cameraGrid{name}"], grids[f"laserGrid{name}"]):
+            found.append(f"laserGrid{name}: differs from cameraGrid{name} although the capture is confocal")
+    attributes = get_attributes(file)
+    if attributes.get("frame") == "znlos" and attributes.get("planar_wall") == 1:
+        for name in ("cameraGrid", "laserGrid"):
+            points = grids[f"{name}Positions"]
+            if np.abs(points[..., 1]).max() > PLANE_TOLERANCE:
+                found.append(f"{name}Positions: a planar wall lies in Y = 0 in the Z-NLOS frame")
+            if not np.allclose(grids[f"{name}Normals"], (0, -1, 0), atol=NORMAL_TOLERANCE):
+                found.append(f"{name}Normals: a planar wall faces (0, -1, 0) in the Z-NLOS frame")
+            if (np.diff(points[..., 2], axis=0) <= 0).any() or (np.diff(points[..., 0], axis=1) <= 0).any():
+                found.append(f"{name}Positions: rows must ascend in Z and columns in X")
+    return found
+
+
+def _attributes(file: h5py.File, samples: h5py.Dataset) -> list[str]:
+    attributes, data_attributes = get_attributes(file), get_attributes(samples)
+    found = [
+        f"attribute {name!r}: {attributes.get(name, 'missing')}, need {text!r}"
+        for name, text in layout.ROOT_TEXT.items()
+        if attributes.get(name) != text
+    ]
+    if data_attributes.get("third_bounce") != THIRD_BOUNCE - FIRST:
+        stored = data_attributes.get("third_bounce", "missing")
+        found.append(f"attribute 'third_bounce' of data: {stored}, need {THIRD_BOUNCE - FIRST}")
+    if samples.shape[0] == 3 and "channels" not in attributes:
+        found.append("attribute 'channels': missing, need the names of the three channels")
+    return found
+
+
+def _finite(samples: h5py.Dataset, name: str) -> list[str]:
+    for part in _stored_parts(samples):
+        values = samples[part]
+        if not np.isfinite(values).all():
+            first = np.argwhere(~np.isfinite(values))[0]
+            at = tuple(int(index + axis.start) for index, axis in zip(first, part, strict=True))
+            return [f"{name}: {values[tuple(first)]} at index {at}"]
+    return []
+
+
+def _stored_parts(samples: h5py.Dataset) -> list[tuple[slice, ...]]:
+    """Return the parts of a dataset that take space: its chunks, or for one without chunks its bins one by one."""
+    if samples.chunks is None:
+        whole = [slice(0, length) for length in samples.shape]
+        return [(whole[0], slice(index, index + 1), *whole[2:]) for index in range(samples.shape[1])]
+    offsets: list[tuple[int, ...]] = []
+    samples.id.chunk_iter(lambda chunk: offsets.append(chunk.chunk_offset))
+    return [
+        tuple(
+            slice(start, min(start + step, length))
+            for start, step, length in zip(offset, samples.chunks, samples.shape, strict=True)
+        )
+        for offset in offsets
+    ]
+
+
+def _listed(values: tuple[float, ...] | None) -> str:
+    return " x ".join(f"{value:g}" for value in values or ())

@@ -1,0 +1,194 @@
+"""Hidden geometry: configuration -> surfaces in the relay wall's local frame, in float64.
+
+Flat shapes become triangle meshes here. Spheres, cylinders and any other Mitsuba shape stay descriptions, and mesh
+files stay files with the matrix that brings them to the local frame; the scene builder turns these into shapes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from nlosrender.scene.letters import letters_mesh
+from nlosrender.scene.pose import Float64, Pose, euler_xyz
+from nlosrender.scene.primitives import box_mesh, rectangle_mesh, room_mesh
+from nlosrender.scene.relay_wall import RelayWall
+from nlosrender.scene.transforms import transform_matrix
+from nlosrender.scene.triangle_mesh import TriangleMesh
+
+if TYPE_CHECKING:
+    from nlosrender.config.hidden_geometry import CylinderConfig, HiddenItemConfig, MeshConfig, SphereConfig
+
+Bounds = tuple[Float64, Float64]  # smallest and largest coordinates, (3,) and (3,) m
+
+
+@dataclass(frozen=True, eq=False)
+class MeshFile:
+    """A .ply or .obj file and the (4, 4) matrix from its coordinates to the local frame [m]."""
+
+    filename: str
+    to_local: Float64
+
+
+@dataclass(frozen=True, eq=False)
+class ShapeDescription:
+    """A Mitsuba shape dict in the local frame, without bsdf; ``to_world``, if any, is a (4, 4) array."""
+
+    description: Mapping[str, object]
+
+    def bounds(self) -> Bounds | None:
+        """Return a box around the shape in the local frame [m], or None for a type whose extent is not known here.
+
+        The box of a transformed shape is that of its transformed box: it may be larger than the shape.
+        """
+        box = _object_bounds(self.description)
+        if box is None:
+            return None
+        to_world = np.asarray(self.description.get("to_world", np.eye(4)), dtype=np.float64)
+        corners = box_corners(box) @ to_world[:3, :3].T + to_world[:3, 3]
+        return corners.min(axis=0), corners.max(axis=0)
+
+
+@dataclass(frozen=True, eq=False)
+class Surface:
+    """One item of the hidden geometry, placed in the local frame."""
+
+    name: str
+    key: str  # where it is configured, "scene.hidden_geometry.2": for error messages
+    shape: TriangleMesh | MeshFile | ShapeDescription
+    bsdf: Mapping[str, object]  # Mitsuba dict
+    face_normals: bool  # flat shading: a file's shading normals are not used
+
+    def bounds(self) -> Bounds | None:
+        """Return a box around the surface in the local frame [m], or None when a file or plugin must be asked."""
+        return None if isinstance(self.shape, MeshFile) else self.shape.bounds()
+
+
+def hidden_surfaces(hidden_geometry_configs: Sequence[HiddenItemConfig], wall: RelayWall) -> tuple[Surface, ...]:
+    """Place every item of the hidden geometry in the relay wall's local frame.
+
+    Parameters
+    ----------
+    hidden_geometry_configs
+        ``scene.hidden_geometry``; poses in scene coordinates [m], degrees.
+    wall
+        The relay wall that defines the local frame.
+
+    Returns
+    -------
+    tuple of Surface
+        In the order of the configuration.
+
+    Raises
+    ------
+    ValueError
+        A type is unknown, a size is out of range or a pose is degenerate; the message begins with the item's key.
+    """
+    surfaces = []
+    for index, item in enumerate(hidden_geometry_configs):
+        key = f"scene.hidden_geometry.{index}"
+        try:
+            shape = _shape(item, wall)
+        except ValueError as error:
+            raise ValueError(f"{key}: {error}") from error
+        name = item.name or f"{item.type}-{index}"
+        # Generated meshes are flat; analytic shapes bring their own normals; only files have a choice.
+        face_normals = bool(item.face_normals) if item.type == "mesh" else isinstance(shape, TriangleMesh)
+        surfaces.append(Surface(name, key, shape, item.bsdf, face_normals))
+    return tuple(surfaces)
+
+
+def bounds(surfaces: Iterable[Surface]) -> Bounds | None:
+    """Return a box around all surfaces whose extent is known without reading files [m, local frame]; None if none is.
+
+    ``Surface.bounds`` tells which are not: their boxes must be joined in once the files are loaded (``joined_bounds``).
+    """
+    return joined_bounds(surface.bounds() for surface in surfaces)
+
+
+def joined_bounds(boxes: Iterable[Bounds | None]) -> Bounds | None:
+    """Return the box around all boxes that are not None; None when there is none."""
+    known = [box for box in boxes if box is not None]
+    if not known:
+        return None
+    return np.min([low for low, _ in known], axis=0), np.max([high for _, high in known], axis=0)
+
+
+def box_corners(box: Bounds) -> Float64:
+    """Return the eight corners of a box, (8, 3) [m]."""
+    low, high = box
+    choice = np.stack(np.meshgrid([0, 1], [0, 1], [0, 1], indexing="ij"), axis=-1).reshape(-1, 3)
+    return np.where(choice == 0, low, high)
+
+
+def _shape(item: HiddenItemConfig, wall: RelayWall) -> TriangleMesh | MeshFile | ShapeDescription:
+    if item.type == "rectangle":
+        pose = Pose.from_normal_up(item.center, item.normal, item.up)
+        return rectangle_mesh(item.width, item.height, _local_pose(pose, wall))
+    if item.type == "letters":
+        pose = _local_pose(Pose.from_normal_up(item.center, item.normal, item.up), wall)
+        return letters_mesh(item.text, item.height, item.thickness, item.stroke_width, item.spacing, pose)
+    if item.type == "box":
+        pose = Pose(euler_xyz(item.rotate_deg), np.asarray(item.center, dtype=np.float64))
+        return box_mesh(item.size, _local_pose(pose, wall))
+    if item.type == "room":
+        return room_mesh(item.size)  # defined in the wall's local frame
+    if item.type == "mesh":
+        return MeshFile(str(item.filename), wall.pose.inverse_matrix() @ _mesh_matrix(item))
+    if item.type == "sphere":
+        center = wall.pose.to_local(item.center).tolist()
+        return _round_shape(item, type="sphere", center=center)
+    if item.type == "cylinder":
+        center, half = wall.pose.to_local(item.center), _half_axis(item, wall)
+        return _round_shape(item, type="cylinder", p0=(center - half).tolist(), p1=(center + half).tolist())
+    if item.type == "mitsuba":
+        to_world = wall.pose.inverse_matrix() @ transform_matrix(item.shape.get("to_world"))
+        return ShapeDescription({**item.shape, "to_world": to_world})
+    raise ValueError(f"type {item.type!r}: need rectangle, letters, box, room, mesh, sphere, cylinder or mitsuba")
+
+
+def _local_pose(pose: Pose, wall: RelayWall) -> Pose:
+    return Pose(wall.pose.rotation.T @ pose.rotation, wall.pose.to_local(pose.origin))
+
+
+def _mesh_matrix(item: MeshConfig) -> Float64:
+    """Return scale, then rotations about x, y and z, then translation, as one (4, 4) matrix."""
+    matrix = np.eye(4)
+    matrix[:3, :3] = euler_xyz(item.rotate_deg) * item.scale
+    matrix[:3, 3] = item.translate
+    return matrix
+
+
+def _half_axis(item: CylinderConfig, wall: RelayWall) -> Float64:
+    axis = wall.pose.direction_to_local(item.axis)
+    length = float(np.linalg.norm(axis))
+    if not np.isfinite(length) or length < 1e-12:
+        raise ValueError(f"axis {list(item.axis)} has no direction: need a finite, non-zero vector")
+    return axis / length * (item.height / 2)
+
+
+def _round_shape(item: SphereConfig | CylinderConfig, **where: object) -> ShapeDescription:
+    return ShapeDescription({**where, "radius": float(item.radius), "flip_normals": bool(item.inside)})
+
+
+def _object_bounds(description: Mapping[str, object]) -> Bounds | None:
+    """Return the box of a Mitsuba shape before its ``to_world``; None for types this module does not know."""
+    kind = description.get("type")
+    if kind in ("rectangle", "disk"):
+        return np.array([-1.0, -1.0, 0.0]), np.array([1.0, 1.0, 0.0])
+    if kind == "cube":
+        return -np.ones(3), np.ones(3)
+    if kind not in ("sphere", "cylinder"):
+        return None
+    radius = float(np.asarray(description.get("radius", 1.0), dtype=np.float64))
+    if kind == "sphere":
+        center = np.asarray(description.get("center", [0.0, 0.0, 0.0]), dtype=np.float64)
+        return center - radius, center + radius
+    ends = np.array([description.get("p0", [0.0, 0.0, 0.0]), description.get("p1", [0.0, 0.0, 1.0])], dtype=np.float64)
+    axis = (ends[1] - ends[0]) / max(float(np.linalg.norm(ends[1] - ends[0])), 1e-300)
+    # A disk of radius r with unit normal a reaches r * sqrt(1 - a_i^2) along axis i.
+    reach = radius * np.sqrt(np.clip(1.0 - axis**2, 0.0, 1.0))
+    return ends.min(axis=0) - reach, ends.max(axis=0) + reach
