@@ -61,3 +61,11 @@ class BounceAxis:
         Unsplit light goes to index 1, the third bounce's, where every loader looks.
         """
         return tuple(range(self.n_slots)) if self.split else (THIRD_BOUNCE - FIRST_BOUNCE,)
+
+    def name(self, slot: int) -> str:
+        """Return what an in-memory slot holds: a bounce number, "7 and above", or "all"."""
+        if not self.split:
+            return "all"
+        bounce = slot + FIRST_BOUNCE
+        has_more = self.max_bounces is None or self.max_bounces > bounce
+        return f"{bounce} and above" if bounce == LAST_FILE_BOUNCE and has_more else str(bounce)

@@ -1,8 +1,126 @@
-"""placeholder"""
+"""Commands about the config file: ``new``, ``validate``, ``schema``."""
+
 from __future__ import annotations
 
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
 import typer
+
+from nlosrender.errors import EXIT_BAD_INPUT, ConfigError, FileError, Problem
+
+if TYPE_CHECKING:
+    from nlosrender.config.document import Config
+
+
+class ScanTypeOption(StrEnum):
+    """The values of ``new --scan-type``."""
+
+    single = "single"
+    confocal = "confocal"
+    exhaustive = "exhaustive"
 
 
 def register(app: typer.Typer) -> None:
     """Add this module's commands to ``app``."""
+    app.command("new", epilog="Example: nlosrender new z.yaml --scan-type single   (writes z.yaml, ready to render)")(
+        new
+    )
+    app.command(
+        "validate",
+        epilog="Example: nlosrender validate z.yaml --set render.spp=64 --set render.target_error=null   "
+        "(creates nothing; prints ok or every mistake with its line, exit code 3)",
+    )(validate)
+    app.command(
+        "schema",
+        epilog="Example: nlosrender schema > nlosrender.schema.json   (creates a schema for editors to check by)",
+    )(schema)
+
+
+def new(
+    path: Annotated[str, typer.Argument(metavar="[PATH]", help="File to write; - for standard output.")] = "-",
+    force: Annotated[bool, typer.Option("--force", help="Overwrite PATH.")] = False,
+    scan_type: Annotated[ScanTypeOption, typer.Option(help="Scan the starter is for.")] = ScanTypeOption.confocal,
+) -> None:
+    """Write a commented starter config that can be rendered as it is."""
+    from nlosrender.config.template import starter_config
+
+    if path == "-":
+        typer.echo(starter_config(scan_type.value), nl=False)
+        return
+    target = Path(path)
+    text = starter_config(scan_type.value, target.stem, target.name)
+    try:
+        with target.open("w" if force else "x", encoding="utf-8") as file:
+            file.write(text)
+    except FileExistsError as error:
+        raise FileError(f"{path}: exists already; --force overwrites it.") from error
+    except FileNotFoundError as error:
+        raise FileError(f"{path}: there is no folder {target.parent}; create it first.") from error
+    except (OSError, ValueError) as error:
+        raise FileError(f"{path}: cannot be written: {getattr(error, 'strerror', None) or error}.") from error
+    typer.echo(f"{path}: written; nlosrender validate {path} checks it after changes.")
+
+
+def validate(
+    configs: Annotated[list[Path], typer.Argument(metavar="CONFIG...", help="Config files.")],
+    overrides: Annotated[
+        list[str] | None, typer.Option("--set", metavar="a.b.c=VALUE", help="Put a value over the file's; repeatable.")
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+) -> None:
+    """Check config files and print every mistake with its place; nothing is rendered."""
+    from nlosrender.config.load import load_config
+    from nlosrender.config.warnings import config_warnings
+
+    problems: list[Problem] = []
+    warnings: list[str] = []
+    for path in configs:
+        try:
+            config = load_config(path, overrides or ())
+        except ConfigError as error:
+            problems += error.problems
+            continue
+        found = [f"{path}: {warning}" for warning in config_warnings(config)]
+        warnings += found
+        if not as_json:
+            typer.echo(f"{path}: ok ({_summary(config)})")
+            for warning in found:
+                typer.echo(f"warning: {warning}", err=True)
+    if as_json:
+        _print_verdict(problems, warnings)
+    if problems and as_json:
+        raise typer.Exit(EXIT_BAD_INPUT)
+    if problems:
+        raise ConfigError(problems)
+
+
+def schema() -> None:
+    """Print the JSON Schema of the config."""
+    import json
+
+    from nlosrender.config.document import Config
+
+    document = {"$schema": "https://json-schema.org/draft/2020-12/schema", **Config.model_json_schema()}
+    typer.echo(json.dumps(document, indent=2))
+
+
+def _print_verdict(problems: list[Problem], warnings: list[str]) -> None:
+    import json
+    from dataclasses import asdict
+
+    verdict = {"valid": not problems, "problems": [asdict(problem) for problem in problems], "warnings": warnings}
+    typer.echo(json.dumps(verdict, indent=2))
+
+
+def _summary(config: Config) -> str:
+    """Return the capture in a few words: scan, sizes, bins, hidden items."""
+    capture, n_bins = config.capture, config.time_axis.n_bins
+    parts = [capture.scan_type, f"{capture.sensor_grid.nx} x {capture.sensor_grid.ny} sensors"]
+    if capture.laser_grid is not None:
+        parts.append(f"{capture.laser_grid.nx} x {capture.laser_grid.ny} lasers")
+    parts.append(f"{n_bins} bins of {config.time_axis.bin_width_opl:g} m")
+    n_hidden = len(config.scene.hidden_geometry)
+    parts.append(f"{n_hidden} hidden item{'' if n_hidden == 1 else 's'}")
+    return ", ".join(parts)

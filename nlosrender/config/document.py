@@ -9,7 +9,7 @@ from pydantic import Field, ValidationInfo, model_validator
 
 from nlosrender.config.capture import CaptureConfig, TimeAxisConfig
 from nlosrender.config.fields import Name
-from nlosrender.config.refusal import Fault, KeyPath
+from nlosrender.config.refusal import Fault, KeyPath, shown
 from nlosrender.config.relay_wall import EDGE_TOLERANCE
 from nlosrender.config.render import OutputConfig, RenderConfig
 from nlosrender.config.scene import SceneConfig
@@ -17,6 +17,7 @@ from nlosrender.config.section import Section
 
 MAX_BINS = 2**40  # 4 TiB of float32: beyond it a grid or bin count is a slip of the pen
 _WALL: KeyPath = ("scene", "relay_wall")
+_WALL_SHAPE = tuple((*_WALL, key) for key in ("type", "width", "height", "radius", "center", "normal"))
 _LASER_GRID: KeyPath = ("capture", "laser_grid")
 
 
@@ -70,16 +71,16 @@ class Config(Section):
             sizes = (grid.width, grid.height) if grid else (None, None)
             for axis, size, largest in zip(("width", "height"), sizes, extent, strict=True):
                 if size is not None and size > largest * (1 + EDGE_TOLERANCE):
-                    message = f"got {size} m, need at most {largest:.6g} m, the {axis} of the {wall} relay wall."
+                    message = f"got {shown(size)} m, need at most {largest:.6g} m, the {axis} of the {wall} relay wall."
                     path: KeyPath = ("capture", key, axis)
-                    yield Fault(path, message, needs=(path, _WALL))
+                    yield Fault(path, message, needs=(path, *_WALL_SHAPE))
         point = self.capture.laser_point or (0.0, 0.0)
         if any(abs(x) > size / 2 * (1 + EDGE_TOLERANCE) for x, size in zip(point, extent, strict=True)):
             message = (
-                f"got {list(point)}, off the relay wall; need x from {-extent[0] / 2:.6g} to {extent[0] / 2:.6g} m "
+                f"got {shown(point)}, off the relay wall; need x from {-extent[0] / 2:.6g} to {extent[0] / 2:.6g} m "
                 f"and y from {-extent[1] / 2:.6g} to {extent[1] / 2:.6g} m."
             )
-            yield Fault(("capture", "laser_point"), message, needs=(("capture", "laser_point"), _WALL))
+            yield Fault(("capture", "laser_point"), message, needs=(("capture", "laser_point"), *_WALL_SHAPE))
 
     def _devices_behind_the_wall(self) -> Iterator[Fault]:
         wall = self.scene.relay_wall
@@ -92,14 +93,14 @@ class Config(Section):
             height = wall.height_above(position)
             if height <= 0:
                 where = f"{-height:.6g} m behind the relay wall" if height < 0 else "in the plane of the relay wall"
-                message = f"got {list(position)}, {where}; need a point on the side its normal looks to."
-                yield Fault(("capture", key), message, needs=(("capture", key), _WALL))
+                message = f"got {shown(position)}, {where}; need a point on the side its normal looks to."
+                yield Fault(("capture", key), message, needs=(("capture", key), *_WALL_SHAPE))
 
     def _laser_spot(self) -> Iterator[Fault]:
         path: KeyPath = ("capture", "laser_spot_radius")
         radius = self.capture.laser_spot_radius
         if radius > 0 and self.scene.relay_wall.type != "rectangle":
-            message = f"got {radius} on a {self.scene.relay_wall.type} wall; need 0 there, or a rectangle wall."
+            message = f"got {shown(radius)} on a {self.scene.relay_wall.type} wall; need 0 there, or a rectangle wall."
             yield Fault(path, message, needs=(path, (*_WALL, "type")))
         if not self.render.laser_sampling and radius == 0:
             message = "got false with a laser that is a point, which no path finds by chance; "

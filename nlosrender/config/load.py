@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import hashlib
 import json
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -123,9 +124,17 @@ def _validate(document: Document, context: dict[str, Any]) -> Config:
             return config
         problems += [problem_from(detail, document) for detail in details if not _is_echo(detail, broken)]
         culprits = {_culprit(detail, broken) for detail in details}
-        if not any([_take_out(tree, culprit, broken) for culprit in sorted(culprits, key=str)]):
+        if not sum(_take_out(tree, culprit, broken) for culprit in sorted(culprits, key=str)):
             break
-    raise ConfigError(list(dict.fromkeys(problems)))
+    raise ConfigError(sorted(dict.fromkeys(problems), key=_reading_order))
+
+
+def _reading_order(problem: Problem) -> tuple[int, int]:
+    """Sort key: from the top of the file down, overrides last."""
+    match = re.search(r":(\d+):(\d+)$", problem.place)
+    if match is None or problem.place.startswith("--set"):
+        return (MAX_BYTES + 1, 0)
+    return int(match[1]), int(match[2])
 
 
 def _is_echo(detail: ErrorDetails, broken: set[KeyPath]) -> bool:

@@ -79,7 +79,7 @@ def shown(value: object) -> str:
         return f"a mapping with {', '.join(map(str, list(value)[:5]))}" if value else "an empty mapping"
     if isinstance(value, (list, tuple)):
         return _cut("[" + ", ".join(_element(item) for item in value[:12]) + (", ..." if len(value) > 12 else "") + "]")
-    return _cut(str(value))
+    return f"{value:.12g}" if isinstance(value, float) else _cut(str(value))
 
 
 def _element(value: object) -> str:

@@ -10,7 +10,7 @@ from pydantic import Field
 
 from nlosrender.config.bsdf import WHITE_DIFFUSE, BsdfMapping
 from nlosrender.config.fields import Direction, Flag, Point3, Positive
-from nlosrender.config.refusal import Fault
+from nlosrender.config.refusal import Fault, shown
 from nlosrender.config.section import Section, pose_faults
 from nlosrender.config.vectors import height_above
 
@@ -68,7 +68,7 @@ class SphereWallConfig(_Wall):
         """Yield the faults of a default grid extent larger than the sphere."""
         for key, given, largest in zip(("width", "height"), (self.width, self.height), self.extent, strict=True):
             if given is not None and given > largest * (1 + EDGE_TOLERANCE):
-                message = f"got {given}, need at most {largest:.6g} m, the whole sphere of radius {self.radius}."
+                message = f"got {shown(given)}, need at most {largest:.6g} m, the whole sphere's."
                 yield Fault((key,), message, needs=((key,), ("radius",)))
 
     @property

@@ -19,7 +19,7 @@ from nlosrender.config.fields import (
     Seed,
     memory_bytes,
 )
-from nlosrender.config.refusal import Fault, refuse
+from nlosrender.config.refusal import Fault, refuse, shown
 from nlosrender.config.section import Section
 from nlosrender.errors import nearest
 
@@ -88,7 +88,7 @@ class RenderConfig(Section):
     def rules(self) -> Iterator[Fault]:
         """Yield the fault of two goals at once."""
         if self.spp is not None and self.target_error is not None:
-            message = f"got {self.target_error} beside spp {self.spp}; they exclude each other, keep one."
+            message = f"got {shown(self.target_error)} beside spp {self.spp}; they exclude each other, keep one."
             yield Fault(("target_error",), message, "key", (("spp",), ("target_error",)))
 
     @property

@@ -7,7 +7,7 @@ from typing import Self
 
 from pydantic import BaseModel, ConfigDict, model_validator
 
-from nlosrender.config.refusal import Fault, raise_faults
+from nlosrender.config.refusal import Fault, raise_faults, shown
 from nlosrender.config.vectors import parallel
 
 
@@ -30,5 +30,5 @@ class Section(BaseModel):
 def pose_faults(normal: tuple[float, ...], up: tuple[float, ...]) -> Iterator[Fault]:
     """Yield the fault of an ``up`` that does not tell the pose's y axis."""
     if parallel(normal, up):
-        message = f"up {list(up)} is parallel to normal {list(normal)}, need two directions that span a plane."
+        message = f"up {shown(up)} is parallel to normal {shown(normal)}, need two directions that span a plane."
         yield Fault(("up",), message, needs=(("normal",), ("up",)))

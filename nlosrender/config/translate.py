@@ -29,9 +29,13 @@ def locate(location: tuple[str | int, ...]) -> tuple[KeyPath, type[BaseModel]]:
     path: list[str | int] = []
     section: type[BaseModel] = Config
     for step in location:
-        if len(sections) > 1 and isinstance(step, str):
-            sections = [each for each in sections if step in typing.get_args(each.model_fields["type"].annotation)]
-            section = sections[0]
+        tagged = [
+            each
+            for each in sections
+            if len(sections) > 1 and step in typing.get_args(each.model_fields["type"].annotation)
+        ]
+        if tagged:  # the location of a rule has no tags
+            sections, section = tagged, tagged[0]
             continue
         path.append(step)
         if isinstance(step, str) and sections:

@@ -125,7 +125,7 @@ def read_document(text: str, source: str) -> Document:
     except ReaderError as error:
         before = text[: error.position]
         place = f"{source}:{before.count(chr(10)) + 1}:{len(before) - before.rfind(chr(10))}"
-        message = f"character U+{ord(error.character):04X} may not stand in YAML; remove it."
+        message = f"character U+{error.character:04X} may not stand in YAML; remove it."
         raise ConfigError(Problem(place, "", message)) from error
     document = Document(source, None)
     if node is not None:

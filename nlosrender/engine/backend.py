@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from nlosrender.engine import llvm
-from nlosrender.errors import BackendError
+from nlosrender.errors import BackendError, RenderError
 
 BackendName = Literal["auto", "llvm", "cuda"]
 
@@ -27,7 +27,9 @@ class Backend:
     @property
     def lanes(self) -> int:
         """Number of parallel lanes that keeps this backend busy."""
-        return 2**18 if self.name == "cuda" else 2**12
+        # 128 lanes keep two cores at full speed; more replicas than needed cost memory and slow the convergence
+        # of low-discrepancy numbers
+        return 2**17 if self.name == "cuda" else 64 * (os.cpu_count() or 1)
 
 
 def cuda_available() -> bool:
@@ -81,3 +83,25 @@ def _load_llvm() -> str:
         raise BackendError(f"no usable LLVM library was found ({found or 'none at all'}). {llvm.ADVICE}")
     llvm.load_library(library.path)
     return str(library.path)
+
+
+PROCESS_BYTES = 400e6  # Python, Mitsuba, LLVM and a scene, before any histogram
+
+
+def batch_memory(limit: int | None) -> int:
+    """Return the bytes one batch may take, from the user's limit for the process; None: a quarter of the machine's.
+
+    Raises
+    ------
+    RenderError
+        The limit is below what the program itself needs.
+    """
+    if limit is None:
+        physical = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") if hasattr(os, "sysconf") else 8 << 30
+        limit = physical // 4
+    if limit <= PROCESS_BYTES:
+        raise RenderError(
+            f"render.memory_limit: got {limit / 1e6:.0f} MB, need more than {PROCESS_BYTES / 1e6:.0f} MB, "
+            "which the program takes before any histogram"
+        )
+    return int(limit - PROCESS_BYTES)

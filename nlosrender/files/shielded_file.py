@@ -27,7 +27,7 @@ class ShieldedFile:
     """
 
     def __init__(self, path: Path):
-        self.error: BaseException | None = None
+        self.error: OSError | None = None
         self._held: list[tuple[int, bytes]] = []  # position and content of what the disk did not take, oldest first
         self._position = 0
         self._descriptor: int | None = os.open(path, os.O_RDWR | os.O_CREAT | os.O_TRUNC, 0o666)
@@ -39,8 +39,6 @@ class ShieldedFile:
         ------
         OSError
             The system refused to write.
-        KeyboardInterrupt
-            The user interrupted a write.
         """
         if self.error is not None:
             raise self.error
@@ -69,7 +67,7 @@ class ShieldedFile:
             if self.error is None:
                 self._write_to_disk(content, start)
                 return len(content)
-        except BaseException as error:  # Ctrl-C must not reach HDF5 half-way through a write either
+        except OSError as error:
             self.error = error
         self._held.append((start, bytes(content)))
         return len(content)
@@ -82,7 +80,7 @@ class ShieldedFile:
         try:
             stored = os.pread(self._open_descriptor(), length, start)
             content[: len(stored)] = stored
-        except BaseException as error:
+        except OSError as error:
             self.error = self.error or error
         for position, held in self._held:
             first, last = max(position, start), min(position + len(held), start + length)
@@ -103,7 +101,7 @@ class ShieldedFile:
         try:
             if self.error is None:
                 os.ftruncate(self._open_descriptor(), length)
-        except BaseException as error:
+        except OSError as error:
             self.error = error
         return length
 

@@ -18,6 +18,7 @@ from nlosrender.files.attributes import set_attributes
 from nlosrender.files.capture_file import CaptureHeader
 from nlosrender.files.chunks import chunk_shape, cuts
 from nlosrender.files.header_writer import root_attributes, sample_attributes, write_header
+from nlosrender.files.interruption import uninterrupted
 from nlosrender.files.replacement import check_writable, explained_write, partial_path, publish
 from nlosrender.files.shielded_file import ShieldedFile
 
@@ -272,8 +273,8 @@ class CaptureWriter:
 
     @contextmanager
     def _writing(self) -> Iterator[None]:
-        """Explain what goes wrong inside, at once or in what HDF5 writes on the way."""
-        with explained_write(self.path):
+        """Explain what goes wrong inside, at once or in what HDF5 writes on the way; let Ctrl-C wait."""
+        with uninterrupted(), explained_write(self.path):
             yield
             if self._stream is not None:
                 self._stream.raise_error()
@@ -290,7 +291,7 @@ class CaptureWriter:
     def _discard(self) -> None:
         if self._file is not None:
             # the error on its way out is the one to report
-            with suppress(OSError, RuntimeError):
+            with suppress(OSError, RuntimeError), uninterrupted():
                 self._file.close()
         self._close_stream()
         with suppress(OSError):

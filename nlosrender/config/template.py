@@ -1,0 +1,125 @@
+"""The starter config of ``nlosrender new``: every key, with unit, allowed values and default, ready to render."""
+
+from __future__ import annotations
+
+from nlosrender.config.capture import ScanType
+
+_LASER_KEYS: dict[ScanType, str] = {
+    "single": """\
+  laser_point: [0.0, 0.0]        # m, wall coordinates (x, y) from the wall's centre; default [0, 0]
+  # laser_grid: {nx: 4, ny: 3}   # scan_type: exhaustive only; keys as sensor_grid
+""",
+    "confocal": """\
+  # laser_point: [0.0, 0.0]      # m, wall coordinates; scan_type: single only
+  # laser_grid: {nx: 4, ny: 3}   # scan_type: exhaustive only; keys as sensor_grid
+""",
+    "exhaustive": """\
+  laser_grid: {nx: 4, ny: 3, width: 1.5, height: 1.5}  # the lit points; keys as sensor_grid
+  # laser_point: [0.0, 0.0]      # m, wall coordinates; scan_type: single only
+""",
+}
+
+_TEMPLATE = """\
+# A capture for nlosrender. Lengths in metres, times as optical path length (OPL) in metres.
+# Render it with: nlosrender render {file}
+name: {name}  # default: the name of this file
+
+scene:
+  relay_wall:                    # the visible surface
+    type: rectangle              # rectangle | sphere | cylinder
+    width: 2.0                   # m, along the wall's x axis (up x normal)
+    height: 2.0                  # m, along the wall's y axis (up)
+    center: [0, 0, 0]            # m; default [0, 0, 0]
+    normal: [0, 0, 1]            # any direction; hidden geometry lies on this side; default [0, 0, 1]
+    up: [0, 1, 0]                # the wall's y axis; default [0, 1, 0]
+    bsdf: {{type: diffuse, reflectance: 1.0}}  # any Mitsuba BSDF; reflectance: 0..1, [r, g, b], texture; default this
+  # A curved wall; inside: true (default) = lit from within; width, height: default extent of the grids.
+  # relay_wall: {{type: sphere, center: [0, 0, 0], radius: 1.0, inside: true, width: 2.0, height: 1.0}}
+  # relay_wall: {{type: cylinder, center: [0, 0, 0], axis: [0, 1, 0], radius: 1.0, height: 2.0, inside: true}}
+
+  hidden_geometry:               # a list; default [] (nothing hidden)
+    - name: plate                # default: type and index, here rectangle-0
+      type: rectangle            # rectangle | mesh | letters | box | sphere | cylinder | room | mitsuba
+      width: 0.6                 # m
+      height: 0.4                # m
+      center: [0, 0, 0.8]        # m
+      normal: [0, 0, -1]         # the front side; default [0, 0, -1]
+      up: [0, 1, 0]              # default [0, 1, 0]
+      bsdf: {{type: diffuse, reflectance: 0.7}}  # default reflectance 1.0
+    # Further items, one example of each type. rotate_deg: degrees about x, then y, then z.
+    # - {{type: mesh, filename: bunny.ply, scale: 1, rotate_deg: [0, 90, 0], translate: [0, 0, 1], face_normals: false}}
+    # - {{type: letters, text: Z, height: 0.8, thickness: 0.0, stroke_width: null, spacing: null, center: [0, 0, 1]}}
+    # - {{type: box, center: [0, 0, 1], size: [0.3, 0.2, 0.1], rotate_deg: [0, 0, 30]}}
+    # - {{type: sphere, center: [0, 0, 1], radius: 0.3, inside: false}}
+    # - {{type: cylinder, center: [0, 0, 1], axis: [0, 1, 0], radius: 0.1, height: 0.5, inside: false}}
+    # - {{type: room, size: [3, 2.5, 4]}}
+    # to_world: a 4x4 matrix, or translate, scale, rotate: {{axis: [0, 1, 0], angle_deg: 90}}, applied in order.
+    # - {{type: mitsuba, shape: {{type: cube, to_world: [{{scale: 0.2}}, {{translate: [0, 0, 1]}}]}}}}
+
+capture:
+  scan_type: {scan_type}{pad}# single | confocal | exhaustive
+  sensor_grid:                   # the measured points: cell centres (i + 0.5) / n
+    nx: 32                       # integer >= 1
+    ny: 32                       # integer >= 1
+    width: 2.0                   # m; default null: the whole wall
+    height: 2.0                  # m; default null: the whole wall
+{laser_keys}\
+  laser_position: [-0.5, 0, 0.25]     # m, in front of the wall; default null: 1 m in front of its centre
+  sensor_position: [-0.5, 0, 0.25]    # m, in front of the wall; default null: 1 m in front of its centre
+  laser_energy: 1.0              # J per pulse, > 0; default 1
+  laser_spot_radius: 0.0         # m, >= 0; default 0: the laser lights a point
+  account_first_and_last_bounces: true  # count the legs laser to wall and wall to sensor in time; default true
+
+time_axis:
+  start_opl: 0.0                 # m, start of bin 0; default 0
+  bin_width_opl: 0.003           # m, > 0; default 0.003 (10 ps)
+  n_bins: auto                   # auto | integer >= 1; default auto: up to the latest possible arrival
+
+render:
+  engine: auto                   # auto | path; default auto
+  max_bounces: 7                 # integer >= 2, or null for no limit; 3 = third bounce only; default 7
+  split_bounces: true            # each bounce on its own index of the file; default true
+  target_error: 0.05             # relative L2 error of H to stop at, 0..1; default 0.05; or:
+  # spp: 1024                    # paths per pair of laser and sensor point, instead of target_error
+  time_limit_s: null             # s, > 0; stop after this time; default null: no limit
+  laser_sampling: true           # connect paths to the laser point; false needs laser_spot_radius > 0; default true
+  hidden_geometry_sampling: true # sample points on the hidden geometry; default true
+  russian_roulette: true         # end weak paths early, without bias; default true
+  seed: 0                        # 0..4294967295; default 0
+  backend: auto                  # auto | llvm | cuda; default auto
+  color: auto                    # auto | grey | rgb; default auto: rgb only where the scene has colours
+  memory_limit: auto             # auto | "600MB" | "8GB" | "2GiB"; default auto
+
+output:
+  path: {name}.hdf5  # default: <name>.hdf5, in the current directory
+  format: znlos                  # znlos
+  frame: znlos                   # znlos (wall in y = 0) | scene (coordinates as above); default znlos
+  compression: gzip              # gzip | none; default gzip
+  variance: true                 # store the variance of the estimate per bin; default true
+"""
+
+
+def starter_config(scan_type: ScanType = "confocal", name: str = "capture", file: str = "capture.yaml") -> str:
+    """Return the YAML text of a commented starter config.
+
+    Parameters
+    ----------
+    scan_type
+        Scan the starter is written for.
+    name
+        Name of the capture; letters, digits, dots, dashes and underscores only, others become dashes.
+    file
+        What the first comment calls the file.
+    """
+    plain = "".join(character if character.isalnum() or character in "-_." else "-" for character in name)
+    readable = plain if plain[:1].isalpha() else f"capture-{plain}"  # 007, .5 and -x are not text in YAML
+    if readable.lower() in ("null", "true", "false"):
+        readable = f"capture-{readable}"
+    one_line = "".join(character for character in file if character.isprintable())
+    return _TEMPLATE.format(
+        name=readable,
+        file=one_line,
+        scan_type=scan_type,
+        pad=" " * (20 - len(scan_type)),
+        laser_keys=_LASER_KEYS[scan_type],
+    )
