@@ -39,7 +39,7 @@ _NUMBER_RANGES = {  # lowest and highest number allowed
 }
 
 
-def check_bsdf(value: Any, info: ValidationInfo) -> FrozenDict:
+def check_bsdf(value: Any, validation: ValidationInfo) -> FrozenDict:
     """Return the BSDF dictionary frozen, numbers as floats and file names absolute.
 
     Raises
@@ -47,7 +47,7 @@ def check_bsdf(value: Any, info: ValidationInfo) -> FrozenDict:
     pydantic.ValidationError
         Unknown type or parameter, a value out of range, a missing file; all of them at once.
     """
-    return checked_plugin(lambda check, bsdf: _bsdf(check, bsdf, ()), value, info)
+    return checked_plugin(lambda check, bsdf: _bsdf(check, bsdf, ()), value, validation)
 
 
 BsdfMapping = Annotated[
@@ -55,7 +55,7 @@ BsdfMapping = Annotated[
     Checked(
         check_bsdf,
         {"type": "object", "required": ["type"], "properties": {"type": {"enum": list(BSDF_TYPES)}}},
-        with_info=True,
+        with_context=True,
     ),
 ]
 WHITE_DIFFUSE = FrozenDict(type="diffuse", reflectance=1.0)

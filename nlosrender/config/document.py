@@ -39,10 +39,10 @@ class Config(Section):
 
     @model_validator(mode="before")
     @classmethod
-    def _default_names(cls, raw: Any, info: ValidationInfo) -> Any:
+    def _default_names(cls, raw: Any, validation: ValidationInfo) -> Any:
         if not isinstance(raw, Mapping):
             return raw
-        stem = info.context.get("stem", "capture") if info.context else "capture"
+        stem = validation.context.get("stem", "capture") if validation.context else "capture"
         filled = {"name": stem, **raw}
         output = filled.get("output", {})
         if isinstance(output, Mapping) and isinstance(filled["name"], str):

@@ -32,21 +32,21 @@ class Checked:
     Parameters
     ----------
     check
-        Takes the raw value (and pydantic's validation info when ``with_info``), returns the checked one or raises
+        Takes the raw value (and pydantic's validation info when ``with_context``), returns the checked one or raises
         what :func:`~nlosrender.config.refusal.refuse` builds.
     json_schema
         The fragment of JSON Schema for ``nlosrender schema``.
-    with_info
+    with_context
         Pass the validation info, whose context holds the config's folder.
     """
 
     check: Callable[..., Any]
     json_schema: dict[str, Any]
-    with_info: bool = False
+    with_context: bool = False
 
     def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
         """Return the validation schema: this check and nothing of pydantic's own coercion."""
-        if self.with_info:
+        if self.with_context:
             return core_schema.with_info_plain_validator_function(self.check)
         return core_schema.no_info_plain_validator_function(self.check)
 

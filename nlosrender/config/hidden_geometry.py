@@ -34,17 +34,17 @@ def _letters(value: object) -> str:
     raise refuse(value, need, hint)
 
 
-def _mesh_file(value: object, info: ValidationInfo) -> Path:
+def _mesh_file(value: object, validation: ValidationInfo) -> Path:
     if not isinstance(value, str) or not value.lower().endswith(_MESH_SUFFIXES):
         raise refuse(value, f"the name of a {' or '.join(_MESH_SUFFIXES)} file")
-    path, problem = existing_file(value, config_folder(info))
+    path, problem = existing_file(value, config_folder(validation))
     if problem:
         raise Fault((), problem).as_error()
     return path
 
 
-def _shape(value: Any, info: ValidationInfo) -> FrozenDict:
-    return checked_plugin(_check_shape, value, info)
+def _shape(value: Any, validation: ValidationInfo) -> FrozenDict:
+    return checked_plugin(_check_shape, value, validation)
 
 
 def _check_shape(check: PluginCheck, value: Any) -> Any:
@@ -63,14 +63,14 @@ def _check_shape(check: PluginCheck, value: Any) -> Any:
 
 LetterText = Annotated[str, Checked(_letters, {"type": "string", "pattern": "^[A-Z0-9 ]*[A-Z0-9][A-Z0-9 ]*$"})]
 MeshFilename = Annotated[
-    Path, Checked(_mesh_file, {"type": "string", "pattern": r"\.([pP][lL][yY]|[oO][bB][jJ])$"}, with_info=True)
+    Path, Checked(_mesh_file, {"type": "string", "pattern": r"\.([pP][lL][yY]|[oO][bB][jJ])$"}, with_context=True)
 ]
 ShapeMapping = Annotated[
     FrozenDict,
     Checked(
         _shape,
         {"type": "object", "required": ["type"], "properties": {"type": {"enum": list(SHAPE_TYPES)}}},
-        with_info=True,
+        with_context=True,
     ),
 ]
 

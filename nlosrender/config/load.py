@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import hashlib
+import itertools
 import json
 import re
 from collections.abc import Sequence
@@ -165,7 +166,7 @@ def _take_out(tree: Any, path: KeyPath, broken: set[KeyPath]) -> bool:
     A whole list goes instead of one item, because the other items are told by their index.
     """
     container, done = tree, ()  # type: tuple[Any, KeyPath]
-    for step, following in zip(path, (*path[1:], None), strict=True):
+    for step, following in itertools.zip_longest(path, path[1:]):
         here = (*done, step)
         if not isinstance(container, dict):
             return False

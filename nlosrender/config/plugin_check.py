@@ -122,7 +122,7 @@ class PluginCheck:
         return {"axis": axis, "angle_deg": angle}
 
 
-def checked_plugin(walk: Callable[[PluginCheck, Any], Any], value: Any, info: ValidationInfo) -> Any:
+def checked_plugin(walk: Callable[[PluginCheck, Any], Any], value: Any, validation: ValidationInfo) -> Any:
     """Run ``walk`` over a plugin dictionary and return its result frozen.
 
     Raises
@@ -130,15 +130,17 @@ def checked_plugin(walk: Callable[[PluginCheck, Any], Any], value: Any, info: Va
     pydantic.ValidationError
         With every fault found.
     """
-    check = PluginCheck(config_folder(info))
+    check = PluginCheck(config_folder(validation))
     result = walk(check, value)
     raise_faults("plugin", check.faults)
     return freeze(result)
 
 
-def config_folder(info: ValidationInfo) -> Path:
+def config_folder(validation: ValidationInfo) -> Path:
     """Return the folder relative file names start from: the YAML's, else the current directory."""
-    return Path(info.context["folder"] if info.context and "folder" in info.context else ".").absolute()
+    return Path(
+        validation.context["folder"] if validation.context and "folder" in validation.context else "."
+    ).absolute()
 
 
 def existing_file(name: str, folder: Path) -> tuple[Path, str]:

@@ -217,7 +217,20 @@ def trace_paths(
                 medium = dr.select(by_bsdf & (bs.eta > 0), medium * bs.eta, medium)
         if dr.hint(q > 0, mode="scalar"):
             sample = sampler.sample(bits_u, v, has_target)
-            to_target = sample.p - vertex.p
+            target, target_shape, target_primitive = sample.p, sample.shape, sample.primitive
+            if dr.hint(q == 1 and sampler.dark_behind, mode="scalar"):
+                # A point that shows its dark side ends the path here, without a ray; the next path starts at once.
+                dark = start & (dr.dot(sample.n, target - vertex.p) >= 0)
+                while dr.hint(dark & (started < n_samples), exclude=[sampler, sensors, vertex]):
+                    started += 1
+                    seq_u += steps[0]
+                    seq_v += steps[1]
+                    again = sampler.sample(seq_u, _unit_interval(seq_v), dark)
+                    target, target_shape, target_primitive = again.p, again.shape, again.primitive
+                    dark = dr.dot(again.n, target - vertex.p) >= 0
+                alive &= ~dark
+                has_target &= ~dark
+            to_target = target - vertex.p
             direction = to_target * dr.rsqrt(dr.squared_norm(to_target))
             local = vertex.to_local(direction)
             f, pdf = wall_bsdf.eval_pdf(context, vertex, local, has_target)
@@ -225,7 +238,6 @@ def trace_paths(
             value = dr.select(has_target, f, value)
             bsdf_density = dr.select(has_target, (1 - q) * pdf, bsdf_density)
             hidden_density = dr.select(on_wall & ~is_delta, q / sampler.area, 0)
-            target, target_shape, target_primitive = sample.p, sample.shape, sample.primitive
         if dr.hint(settings.goes_on and settings.russian_roulette, mode="scalar"):
             # after the connections of this vertex, by the albedo just met; never on a path's first step
             survival = dr.select(start, 1, survival)

@@ -27,6 +27,7 @@ class SurfaceSample:
 
     p: mi.Point3f
     shape: mi.ShapePtr
+    n: mi.Normal3f  # geometric normal; on triangles not of unit length
     primitive: mi.UInt32  # triangle within the shape; ANALYTIC for a shape without triangles
 
 
@@ -49,9 +50,12 @@ class SurfaceSampler:
         primitives: list[NDArray[np.uint32]] = []
         analytic: list[tuple[int, float]] = []
         self.covers_everything = True
+        self.dark_behind = True  # no surface reflects at points whose geometric normal points away
         for index, shape in enumerate(shapes):
             if shape.id() == WALL_ID:
                 continue
+            # Shading normals may light a little of a geometric back side.
+            self.dark_behind &= _is_one_sided(shape) and not (shape.is_mesh() and shape.has_vertex_normals())
             if shape.is_mesh():
                 triangles = _triangles(shape)
                 kept = np.flatnonzero(_visible_from(wall_corners, triangles, _is_one_sided(shape), built.wall.is_planar))
@@ -103,18 +107,20 @@ class SurfaceSampler:
         u = dr.minimum((mi.Float(bits - low) + 0.5) / dr.maximum(mi.Float(high - low), 1.0), dr.one_minus_epsilon(mi.Float))
         shape = dr.gather(mi.ShapePtr, self._shapes, dr.gather(mi.UInt32, self._owner, entry, active), active)
         is_triangle = entry < self.n_triangles
-        point, primitive = mi.Point3f(0), mi.UInt32(ANALYTIC)
+        point, normal, primitive = mi.Point3f(0), mi.Normal3f(0), mi.UInt32(ANALYTIC)
         if self.n_triangles:
             on_triangle = active & is_triangle
             a, b, c = (self._corner(k, entry, on_triangle) for k in range(3))
             root = dr.sqrt(u)  # uniform on the triangle: (1 - sqrt u, sqrt u (1 - v), sqrt u v)
             point = a + (b - a) * (root * (1 - v)) + (c - a) * (root * v)
+            normal = mi.Normal3f(dr.cross(b - a, c - a))
             primitive = dr.select(on_triangle, dr.gather(mi.UInt32, self._primitive, entry, on_triangle), ANALYTIC)
         if self.has_analytic:
             on_analytic = active & ~is_triangle
             analytic = shape.sample_position(mi.Float(0), mi.Point2f(u, v), on_analytic)
             point = dr.select(on_analytic, analytic.p, point)
-        return SurfaceSample(point, shape, primitive)
+            normal = dr.select(on_analytic, analytic.n, normal)
+        return SurfaceSample(point, shape, normal, primitive)
 
     def reached(
         self, si: mi.SurfaceInteraction3f, point: mi.Point3f, shape: mi.ShapePtr, primitive: mi.UInt32

@@ -252,7 +252,7 @@ MISTAKES = [
     ("spp: 16", "spp: §!!python/object/apply:os.system [ls]", "render.spp", r"tag !!python/.* is not allowed"),
     ("spp: 16", "spp: §!!int x", "render.spp", r"got 'x' \(text\) with the tag !!int, need a number"),
     ("spp: 16", "§3: 16", "render", r"got '3' \(text\) as a key, need text"),
-    ("spp: 16", "spp: 16§]", "", r"not usable as YAML: expected <block end>"),
+    ("spp: 16", "spp: [16]§]", "", r"not usable as YAML: expected <block end>"),
     ("spp: 16", "spp: [16", "", r"not usable as YAML: expected ',' or '\]'.*while parsing a flow sequence"),
     ("  spp: 16", "§\tspp: 16", "", r"not usable as YAML: .*Indent with spaces"),
     ("spp: 16", "spp: §*none", "", r"not usable as YAML: found undefined alias"),

@@ -1,0 +1,61 @@
+# Two commands do everything on a fresh machine: `make render` and `make test`.
+PYTHON ?= $(shell command -v python3.11 || command -v python3)
+VENV := .venv
+BIN := $(VENV)/bin
+PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
+# Exact versions that passed the test suite; pyproject.toml holds the ranges that are allowed.
+PINS := -c .constraints.txt
+
+.PHONY: help install render test test-slow lint format peers clean
+.DEFAULT_GOAL := help
+
+help: ## Show this list.
+	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 12
+
+install: $(VENV)/.installed ## Make .venv/bin/nlosrender, with an LLVM when the system has no usable one.
+
+$(VENV)/.installed: pyproject.toml .constraints.txt
+	@test -n "$(PYTHON)" || { echo "need Python 3.11 or newer (set PYTHON=...)"; exit 1; }
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { echo "need Python 3.11 or newer; $(PYTHON) is older (set PYTHON=...)"; exit 1; }
+	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV) || { echo "python venv is missing: on Debian and Ubuntu, apt-get install python3-venv"; exit 1; }
+	$(PIP) install $(PINS) --editable .
+	@$(BIN)/python -c 'import sys; from nlosrender.engine.llvm import choose_library; sys.exit(choose_library() is None)' \
+		|| { echo "no usable LLVM on this system: installing one into $(VENV)"; $(PIP) install $(PINS) --editable '.[llvm]'; }
+	@touch $@
+
+$(VENV)/.dev: $(VENV)/.installed
+	$(PIP) install $(PINS) --editable '.[dev]'
+	@touch $@
+
+render: install ## Render configs/z-letter.yaml to out/: an HDF5 capture and a picture of it.
+	@mkdir -p out
+	$(BIN)/nlosrender render configs/z-letter.yaml -o out/z-letter.hdf5
+	@echo "picture: $$($(BIN)/nlosrender plot out/z-letter.hdf5)"
+
+test: $(VENV)/.dev ## Run the default test suite.
+	$(BIN)/python -m pytest -m 'not slow and not peers'
+
+test-slow: $(VENV)/.dev ## Run the tests that take longer.
+	$(BIN)/python -m pytest -m slow
+
+lint: $(VENV)/.dev ## Check style and types.
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+format: $(VENV)/.dev ## Format the code.
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+# Other projects' packages live in an environment of their own: their requirements must not touch ours.
+.venv-peers/.installed: $(VENV)/.dev
+	$(PYTHON) -m venv .venv-peers
+	.venv-peers/bin/python -m pip --disable-pip-version-check --quiet install --no-deps 'y-tal==0.20.0'
+	.venv-peers/bin/python -m pip --disable-pip-version-check --quiet install numpy h5py tqdm matplotlib scipy pyyaml
+	@touch $@
+
+peers: .venv-peers/.installed ## Check our files with other projects' readers.
+	$(BIN)/python -m pytest -m peers
+
+clean: ## Remove what make made, but not out/.
+	rm -rf $(VENV) .venv-peers build *.egg-info .pytest_cache .mypy_cache .ruff_cache

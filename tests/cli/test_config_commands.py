@@ -1,0 +1,156 @@
+"""``new``, ``validate`` and ``schema`` as a user types them."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from nlosrender.cli.app import app
+from nlosrender.errors import EXIT_BAD_INPUT, EXIT_USAGE, ConfigError, FileError
+
+runner = CliRunner()
+
+
+@pytest.fixture
+def starter(tmp_path: Path) -> Path:
+    """A starter config of an exhaustive scan."""
+    path = tmp_path / "z.yaml"
+    assert runner.invoke(app, ["new", str(path), "--scan-type", "exhaustive"]).exit_code == 0
+    return path
+
+
+def nlosrender(*arguments: str, folder: Path) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "nlosrender", *arguments]
+    return subprocess.run(command, capture_output=True, text=True, cwd=folder, timeout=60, check=False)
+
+
+def test_new_writes_a_config_that_validates(starter: Path) -> None:
+    """new then validate, without touching the file, is ok and says what will be captured."""
+    result = runner.invoke(app, ["validate", str(starter)])
+    assert result.exit_code == 0
+    assert (
+        f"{starter}: ok (exhaustive, 32 x 32 sensors, 4 x 3 lasers, auto bins of 0.003 m, 1 hidden item)"
+        in result.stdout
+    )
+
+
+def test_new_without_a_path_prints_the_same_text(tmp_path: Path) -> None:
+    """Standard output is the default and has another name."""
+    printed = runner.invoke(app, ["new"]).stdout
+    assert printed == runner.invoke(app, ["new", "-"]).stdout
+    runner.invoke(app, ["new", str(tmp_path / "capture.yaml")])
+    assert (tmp_path / "capture.yaml").read_text() == printed
+
+
+def test_new_overwrites_only_by_force(starter: Path) -> None:
+    """An existing file survives without --force."""
+    starter.write_text("mine")
+    result = runner.invoke(app, ["new", str(starter)])
+    assert isinstance(result.exception, FileError)
+    assert result.exception.exit_code == EXIT_BAD_INPUT
+    assert "exists already; --force overwrites it" in str(result.exception)
+    assert starter.read_text() == "mine"
+    assert runner.invoke(app, ["new", str(starter), "--force"]).exit_code == 0
+    assert starter.read_text() != "mine"
+
+
+@pytest.mark.parametrize(("name", "message"), [("no/z.yaml", "there is no folder"), ("a\0b", "cannot be written")])
+def test_new_explains_a_place_it_cannot_write_to(name: str, message: str, tmp_path: Path) -> None:
+    """A missing folder or an impossible name is explained."""
+    result = runner.invoke(app, ["new", str(tmp_path / name)])
+    assert isinstance(result.exception, FileError)
+    assert message in str(result.exception)
+
+
+def test_new_knows_three_scans() -> None:
+    """Another scan type is a usage error."""
+    assert runner.invoke(app, ["new", "--scan-type", "raster"]).exit_code == EXIT_USAGE
+
+
+def test_validate_raises_the_problems_of_every_file(starter: Path, tmp_path: Path) -> None:
+    """All files are looked at; good ones are ok, the mistakes of the others come together."""
+    result = runner.invoke(app, ["validate", str(tmp_path / "no.yaml"), str(starter), str(tmp_path)])
+    assert f"{starter}: ok" in result.stdout
+    assert isinstance(result.exception, ConfigError)
+    assert [problem.place for problem in result.exception.problems] == [str(tmp_path / "no.yaml"), str(tmp_path)]
+
+
+def test_validate_applies_overrides(starter: Path) -> None:
+    """--set is repeatable and judged with the file."""
+    options = ["--set", "capture.sensor_grid.nx=7", "--set", "time_axis.n_bins=9"]
+    result = runner.invoke(app, ["validate", str(starter), *options])
+    assert "7 x 32 sensors, 4 x 3 lasers, 9 bins" in result.stdout
+
+
+def test_validate_as_json_is_one_object_either_way(starter: Path) -> None:
+    """--json prints valid, problems and warnings on stdout; the exit code still tells."""
+    good = runner.invoke(app, ["validate", "--json", str(starter), "--set", "scene.hidden_geometry=[]"])
+    verdict = json.loads(good.stdout)
+    assert (good.exit_code, verdict["valid"], verdict["problems"]) == (0, True, [])
+    assert "scene.hidden_geometry is empty" in verdict["warnings"][0]
+    override = "capture.laser_grid.nx=0"
+    bad = runner.invoke(app, ["validate", "--json", str(starter), "--set", override])
+    verdict = json.loads(bad.stdout)
+    assert (bad.exit_code, verdict["valid"], verdict["warnings"]) == (EXIT_BAD_INPUT, False, [])
+    (problem,) = verdict["problems"]
+    assert problem["place"] == f"--set {override}"
+    assert problem["key"] == "capture.laser_grid.nx"
+    assert problem["message"].startswith("got 0, need an integer >= 1")
+
+
+def test_warnings_go_to_stderr(starter: Path) -> None:
+    """stdout holds results only."""
+    result = runner.invoke(app, ["validate", str(starter), "--set", "render.max_bounces=2"])
+    assert result.exit_code == 0
+    assert "max_bounces is 2" in result.stderr
+    assert "max_bounces" not in result.stdout
+
+
+def test_schema_describes_every_section() -> None:
+    """The JSON Schema is one JSON document with the keys, units and required keys of the config."""
+    schema = json.loads(runner.invoke(app, ["schema"]).stdout)
+    assert set(schema["properties"]) == {"name", "scene", "capture", "time_axis", "render", "output"}
+    assert schema["required"] == ["scene", "capture"]
+    assert schema["additionalProperties"] is False
+    bins = schema["$defs"]["TimeAxisConfig"]["properties"]
+    assert bins["bin_width_opl"]["exclusiveMinimum"] == 0
+    assert "10 ps" in bins["bin_width_opl"]["description"]
+    assert set(schema["$defs"]["SceneConfig"]["properties"]["relay_wall"]["discriminator"]["mapping"]) == {
+        "rectangle",
+        "sphere",
+        "cylinder",
+    }
+
+
+@pytest.mark.parametrize("command", ["new", "validate", "schema"])
+def test_help_ends_with_an_example(command: str) -> None:
+    """The last paragraph of --help is one command to copy, and what it creates."""
+    last = runner.invoke(app, [command, "--help"]).stdout.rstrip().split("\n\n")[-1]
+    assert f"Example: nlosrender {command}" in " ".join(last.split())
+
+
+def test_the_program_exits_with_3_and_names_the_line(starter: Path) -> None:
+    """The whole program: mistakes on stderr with file:line:column, exit code 3, no traceback."""
+    text = starter.read_text()
+    starter.write_text(text.replace("nx: 32 ", "nx: 0  "))
+    line = text[: text.index("nx: 32")].count("\n") + 1
+    result = nlosrender("validate", "z.yaml", folder=starter.parent)
+    assert result.returncode == EXIT_BAD_INPUT
+    assert f"error: z.yaml:{line}:9: capture.sensor_grid.nx: got 0, need an integer >= 1." in result.stderr
+    assert "Traceback" not in result.stderr
+    assert result.stdout == ""
+
+
+def test_the_program_validates_without_the_renderer(starter: Path) -> None:
+    """A config is judged in a fraction of a second: neither Mitsuba nor numpy is loaded."""
+    code = (
+        "import sys; from typer.testing import CliRunner; from nlosrender.cli.app import app; "
+        f"assert CliRunner().invoke(app, ['validate', {str(starter)!r}]).exit_code == 0; "
+        "sys.exit(bool({'mitsuba', 'drjit', 'numpy', 'h5py', 'matplotlib'} & set(sys.modules)))"
+    )
+    assert subprocess.run([sys.executable, "-c", code], timeout=60, check=False).returncode == 0

@@ -1,0 +1,181 @@
+"""Summaries and pictures of captures."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import h5py
+import matplotlib.image
+import numpy as np
+import pytest
+
+from nlosrender.analysis import laser_view as views
+from nlosrender.analysis.plots import plot_capture
+from nlosrender.analysis.summary import summarise
+from nlosrender.errors import FileError
+from nlosrender.files.provenance import provenance_attributes
+from nlosrender.files.reader import open_capture
+from nlosrender.files.writer import CaptureWriter
+
+
+def test_summary_says_what_was_written(tmp_path: Path, header_of: Callable, write_capture: Callable) -> None:
+    """Grids as (nx, ny), the exact time axis, bounces by name, provenance unpacked; all of it JSON."""
+    provenance = provenance_attributes({"a": 1}, "abc", engine="path", seed=3, samples=64, error_estimate=0.02)
+    write_capture(tmp_path / "a.hdf5", header_of(), {**provenance, "seconds": json.dumps({"render": 1.5})})
+    summary = summarise(tmp_path / "a.hdf5")
+    assert json.loads(json.dumps(summary, allow_nan=False)) == summary
+    expected = {
+        "scan_type": "exhaustive",
+        "sensor_grid": [5, 4],
+        "laser_grid": [3, 2],
+        "n_bins": 7,
+        "bin_width_opl": 0.003,
+        "start_opl": 0.7,
+        "bounces": [2, 3],
+        "split_bounces": True,
+        "max_bounces": 3,
+        "channels": "grey",
+        "frame": "znlos",
+        "account_first_and_last_bounces": True,
+        "engine": "path",
+        "written_by": "nlosrender",
+        "samples": 64,
+        "error_estimate": 0.02,
+        "config_hash": "abc",
+        "seconds": {"render": 1.5},
+        "data_shape": [1, 7, 6, 4, 5, 2, 3],
+        "size_of_samples": 7 * 6 * 4 * 5 * 2 * 3 * 4,
+        "has_variance": False,
+    }
+    assert {key: summary[key] for key in expected} == expected
+    # 7 bins of 3 mm from 0.7 m; 3 mm of light are 10.007 ps
+    assert summary["end_opl"] == pytest.approx(0.721, rel=1e-12)
+    assert summary["bin_width_ps"] == pytest.approx(10.006923, rel=1e-7)
+
+
+def test_summary_of_files_by_others(tmp_path: Path) -> None:
+    """What a file does not say is None; NaN and text that is not JSON do no harm."""
+    with h5py.File(tmp_path / "a.hdf5", "w") as file:
+        file["data"] = np.zeros((1, 7, 6, 4, 5), "f4")
+        file["deltaT"] = 0.003
+        file["t0"] = 0.0
+        file["cameraGridSize"] = [np.nan, 1.0]
+        file.attrs["seconds"] = "[" * 100_000
+        file.attrs["error_estimate"] = np.nan
+    summary = summarise(tmp_path / "a.hdf5")
+    json.dumps(summary, allow_nan=False)
+    assert summary["sensor_grid_size"] == [None, 1.0]
+    for key in ("engine", "bounces", "split_bounces", "frame", "error_estimate", "laser_grid_size", "created"):
+        assert summary[key] is None, key
+
+
+def test_summary_reads_no_samples(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, header_of: Callable, write_capture: Callable
+) -> None:
+    """No read of a dataset with more than a handful of numbers happens."""
+    write_capture(tmp_path / "a.hdf5", header_of())
+    true_read = h5py.Dataset.__getitem__
+
+    def read(dataset: h5py.Dataset, *arguments: object) -> object:
+        assert dataset.size <= 16, dataset.name
+        return true_read(dataset, *arguments)
+
+    monkeypatch.setattr(h5py.Dataset, "__getitem__", read)
+    assert summarise(tmp_path / "a.hdf5")["n_bins"] == 7
+    with pytest.raises(AssertionError, match="data"), open_capture(tmp_path / "a.hdf5") as capture:
+        capture.read_block()  # the guard above does bite
+
+
+@pytest.mark.parametrize("band_bytes", [1, 10**9])
+def test_views_are_sums_of_the_samples(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    header_of: Callable,
+    write_capture: Callable,
+    band_bytes: int,
+) -> None:
+    """Whatever the memory allows at a time, the sums over the wall, bounces and time are those of the whole block."""
+    monkeypatch.setattr(views, "BAND_BYTES", band_bytes)
+    block = write_capture(tmp_path / "a.hdf5", header_of(n_channels=3)).astype(np.float64).mean(axis=0)
+    one = block[:, 1, 2]  # (bounce, sensor_y, sensor_x, bin)
+    with open_capture(tmp_path / "a.hdf5") as capture:
+        view = views.laser_view(capture, (1, 2))
+        frames = views.wall_frames(capture, (1, 2), [slice(0, 1), slice(2, 5)])
+        point = views.point_histograms(capture, (1, 2), (3, 4))
+        row = views.row_over_time(capture, (1, 2), 2)
+    # float64 sums of 280 numbers below 1 in another order
+    close = {"rtol": 1e-12}
+    np.testing.assert_allclose(view.wall, one.sum(axis=(0, 3)), **close)
+    np.testing.assert_allclose(view.bounces, one.sum(axis=(1, 2, 3)), **close)
+    np.testing.assert_allclose(view.time, one.sum(axis=(0, 1, 2)), **close)
+    np.testing.assert_allclose(frames, [one[..., :1].sum(axis=(0, 3)), one[..., 2:5].sum(axis=(0, 3))], **close)
+    np.testing.assert_allclose(point, one[:, 3, 4], **close)
+    np.testing.assert_allclose(row, one[:, 2].sum(axis=0), **close)
+    assert view.brightest == tuple(np.argwhere(view.wall == view.wall.max())[0])
+
+
+def test_moments_follow_the_light() -> None:
+    """Frames lie where light arrives, in order; without light or with one bin there is one frame."""
+    time = np.zeros(1000)
+    time[400:500] = 1.0
+    bins = views.frame_bins(time)
+    # shares 0.02, 0.2, 0.45, 0.7, 0.95 of 100 equal bins
+    assert bins == [401, 419, 444, 469, 494]
+    first, last = views.lit_window(time)
+    assert 380 < first < 400
+    assert 500 <= last < 520
+    assert views.frame_bins(np.zeros(9)) == [4]
+    assert views.lit_window(np.zeros(9)) == (0, 8)
+    assert views.frame_bins(np.ones(1)) == [0]
+
+
+@pytest.mark.parametrize(
+    ("scan_type", "changes"),
+    [
+        ("exhaustive", {}),
+        ("confocal", {"n_channels": 3, "bounce_indices": (1,), "split_bounces": False}),
+        ("single", {"n_bins": 1, "bounce_indices": (1,), "sensor_grid_size": (0.0, 0.0)}),
+    ],
+)
+def test_pictures(tmp_path: Path, header_of: Callable, write_capture: Callable, scan_type: str, changes: dict) -> None:
+    """Every kind of capture gives a picture of one size, that is neither empty nor accompanied by other files."""
+    name = "cost $x_{1$.hdf5"  # not a formula
+    write_capture(tmp_path / name, header_of(scan_type, **changes), {"error_estimate": 0.01})
+    assert plot_capture(tmp_path / name, tmp_path / "a.png") == tmp_path / "a.png"
+    image = matplotlib.image.imread(tmp_path / "a.png")
+    assert image.shape[:2] == (988, 1820)
+    assert image[..., :3].std() > 0.05
+    assert sorted(entry.name for entry in tmp_path.iterdir()) == ["a.png", name]
+
+
+def test_a_dark_capture_has_a_picture(tmp_path: Path, header_of: Callable) -> None:
+    """No light at all is no reason to fail."""
+    with CaptureWriter(tmp_path / "a.hdf5", header_of()):
+        pass
+    plot_capture(tmp_path / "a.hdf5", tmp_path / "a.png")
+    assert (tmp_path / "a.png").stat().st_size > 1000
+
+
+@pytest.mark.parametrize(
+    ("picture", "points", "message"),
+    [
+        ("a.png", {"laser": (2, 0)}, r"laser_y 2 is outside"),
+        ("a.png", {"pixel": (0, 5)}, r"sensor_x 5 is outside"),
+        ("a.jpeg", {}, r"a picture's name ends in one of \.png, \.pdf, \.svg"),
+        ("none/a.png", {}, r"there is no folder"),
+        ("capture.png", {}, r"is the capture itself"),
+    ],
+)
+def test_pictures_that_cannot_be(
+    tmp_path: Path, header_of: Callable, write_capture: Callable, picture: str, points: dict, message: str
+) -> None:
+    """Points outside and unusable names are refused; nothing is written, and never over the capture."""
+    path = tmp_path / "capture.png"
+    write_capture(path, header_of())
+    before = path.read_bytes()
+    with pytest.raises(FileError, match=message):
+        plot_capture(path, tmp_path / picture, **points)
+    assert path.read_bytes() == before
+    assert list(tmp_path.iterdir()) == [path]
