@@ -48,13 +48,12 @@ format: $(VENV)/.dev ## Format the code.
 	$(BIN)/ruff format .
 
 # Other projects' packages live in an environment of their own: their requirements must not touch ours.
-.venv-peers/.installed: $(VENV)/.dev
+.venv-peers/.installed: .requirements-peers.txt
 	$(PYTHON) -m venv .venv-peers
-	.venv-peers/bin/python -m pip --disable-pip-version-check --quiet install --no-deps 'y-tal==0.20.0'
-	.venv-peers/bin/python -m pip --disable-pip-version-check --quiet install numpy h5py tqdm matplotlib scipy pyyaml
+	.venv-peers/bin/python -m pip --disable-pip-version-check --quiet install --no-deps -r $<
 	@touch $@
 
-peers: .venv-peers/.installed ## Check our files with other projects' readers.
+peers: $(VENV)/.dev .venv-peers/.installed ## Check our files with other projects' readers.
 	$(BIN)/python -m pytest -m peers
 
 clean: ## Remove what make made, but not out/.

@@ -30,7 +30,10 @@ from nlosrender.scene.relay_wall import RelayWall, relay_wall_from_config
 
 if TYPE_CHECKING:
     from nlosrender.engine.path_engine import PathEngine
+    from nlosrender.engine.virtual_lights.engine import VirtualLightEngine
     from nlosrender.scene.build import BuiltScene
+
+    Engine = PathEngine | VirtualLightEngine
 
 Progress = Callable[[float], None]  # told the share of the work that is done, in [0, 1]
 
@@ -102,7 +105,7 @@ def render_capture(config: Config, progress: Progress = lambda fraction: None) -
         plan, engine = prepare(config, backend, built, capture, time_axis)
     header = describe_file(config, built, capture, time_axis)
     provenance = provenance_attributes(
-        config_to_dict(config), config_hash(config), engine="path", seed=config.render.seed
+        config_to_dict(config), config_hash(config), engine=engine.name, seed=config.render.seed
     )
     with CaptureWriter(
         config.output.path,
@@ -124,7 +127,7 @@ def render_capture(config: Config, progress: Progress = lambda fraction: None) -
         )
     return RenderReport(
         output=Path(config.output.path),
-        engine="path",
+        engine=engine.name,
         variant=backend.variant,
         samples=totals.samples or 0,
         error_estimate=totals.error_estimate,
@@ -169,9 +172,11 @@ def describe_capture(config: Config, wall: RelayWall, built: BuiltScene) -> tupl
 
 def prepare(
     config: Config, backend: Backend, built: BuiltScene, capture: Capture, time_axis: TimeAxis
-) -> tuple[Plan, PathEngine]:
+) -> tuple[Plan, Engine]:
     """Stages 3 and 4: cut the work into batches and set up the engine."""
     from nlosrender.engine.path_engine import PathEngine, PathOptions
+    from nlosrender.engine.planner import choose_engine
+    from nlosrender.engine.virtual_lights.engine import VirtualLightEngine
 
     render = config.render
     bounces = BounceAxis(render.max_bounces, render.split_bounces)
@@ -192,7 +197,9 @@ def prepare(
         seed=render.seed,
         replicas=plan.replicas,
     )
-    return plan, PathEngine(built, capture, time_axis, options)
+    if choose_engine(render, capture, built).name == "path":
+        return plan, PathEngine(built, capture, time_axis, options)
+    return plan, VirtualLightEngine(built, capture, time_axis, options, backend.lanes)
 
 
 @dataclass
@@ -218,7 +225,7 @@ class Totals:
 
 
 def render_batches(
-    config: Config, plan: Plan, engine: PathEngine, writer: CaptureWriter, stopwatch: Stopwatch, progress: Progress
+    config: Config, plan: Plan, engine: Engine, writer: CaptureWriter, stopwatch: Stopwatch, progress: Progress
 ) -> Totals:
     """Stages 4 and 6: render batch after batch, write each as it is done."""
     from nlosrender.engine.path_engine import Budget

@@ -24,16 +24,14 @@ from nlosrender.config.section import Section
 from nlosrender.errors import nearest
 
 _STOPPING = ("spp", "target_error", "time_limit_s")
-_ENGINES = ("auto", "path")
+_ENGINES = ("auto", "path", "virtual_lights")
 DEFAULT_TARGET_ERROR = 0.05
 
 
 def _engine(value: object) -> str:
-    if value == "virtual_lights":
-        raise refuse(value, "auto or path", "This version has only the path engine.")
     if not isinstance(value, str) or value not in _ENGINES:
         close = nearest(value, _ENGINES) if isinstance(value, str) else None
-        raise refuse(value, "one of auto, path", f"Did you mean {close}?" if close else "")
+        raise refuse(value, f"one of {', '.join(_ENGINES)}", f"Did you mean {close}?" if close else "")
     return value
 
 
@@ -45,7 +43,7 @@ def _output_path(value: object) -> Path:
     return Path(value)
 
 
-Engine = Annotated[Literal["auto", "path"], Checked(_engine, {"enum": list(_ENGINES)})]
+Engine = Annotated[Literal["auto", "path", "virtual_lights"], Checked(_engine, {"enum": list(_ENGINES)})]
 OutputPath = Annotated[Path, Checked(_output_path, {"type": "string", "minLength": 1})]
 
 
@@ -53,7 +51,7 @@ class RenderConfig(Section):
     """What is computed, how well, and on what."""
 
     engine: Engine = "auto"
-    """auto: the cheapest engine that is right for the scene; path: the path tracer"""
+    """auto: the cheapest engine that is right for the scene; path: the path tracer; virtual_lights: third bounce without noise"""
     max_bounces: BounceCount | None = 7
     """highest bounce, counting both points on the wall: 3 is the third bounce; null: no limit"""
     split_bounces: Flag = True

@@ -55,8 +55,9 @@ def _bounding_sphere(item: HiddenItemConfig) -> tuple[tuple[float, float, float]
     if isinstance(item, RectangleConfig):
         return item.center, math.hypot(item.width, item.height) / 2
     if isinstance(item, LettersConfig):
-        # No letter and no gap is wider than twice the height.
-        return item.center, math.hypot(2 * len(item.text) * item.height, item.height, item.thickness)
+        # Twice what is needed: no letter is wider than twice its height.
+        width = len(item.text) * (2 * item.height + (item.spacing or item.height))
+        return item.center, math.hypot(width, item.height, item.thickness)
     if isinstance(item, BoxConfig):
         return item.center, length(item.size) / 2
     if isinstance(item, SphereConfig):

@@ -99,13 +99,16 @@ class DeviceHistogram:
         variance = sum(squares[1:], squares[0]) / ((shape.replicas - 1) * shape.replicas)
         return mean, variance
 
-    def relative_error(self, samples_per_lane: int) -> float:
-        """Return the estimated relative L2 error of H inside the time window."""
+    def relative_error(self, samples_per_lane: int, known_squares: float = 0.0) -> float:
+        """Return the estimated relative L2 error of H inside the time window.
+
+        ``known_squares`` is the sum of squares of the part of H that is known from elsewhere.
+        """
         mean, variance = self.statistics(samples_per_lane)
         inside = dr.arange(mi.UInt32, dr.width(mean)) % self.shape.row < self.shape.n_bins
         noise = dr.sum(dr.select(inside, variance, 0))
         energy = dr.sum(dr.select(inside, dr.square(mean), 0))
-        return relative_l2_error(float(noise[0]), float(energy[0]))
+        return relative_l2_error(float(noise[0]), float(energy[0]) + known_squares)
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,7 +11,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from nlosrender.capture.bounces import FIRST_BOUNCE, BounceAxis
+from nlosrender.capture.bounces import FIRST_BOUNCE, THIRD_BOUNCE, BounceAxis
 from nlosrender.capture.grids import Capture
 from nlosrender.capture.plan import Batch
 from nlosrender.capture.time_axis import TimeAxis
@@ -63,15 +63,27 @@ class PathEngine:
         The scene and what is measured of it.
     options
         Techniques, bounces, seed.
+    first_bounce
+        Lowest bounce to compute, >= 3, for engines that know the lower ones.
     """
 
-    def __init__(self, built: BuiltScene, capture: Capture, time_axis: TimeAxis, options: PathOptions):
+    name = "path"
+
+    def __init__(
+        self,
+        built: BuiltScene,
+        capture: Capture,
+        time_axis: TimeAxis,
+        options: PathOptions,
+        first_bounce: int = THIRD_BOUNCE,
+    ):
         self.built, self.capture, self.time_axis, self.options = built, capture, time_axis, options
         self.sampler = SurfaceSampler(built)
         self.hidden_fraction = self._choose_hidden_fraction()
         flags = [shape.bsdf().flags() for shape in built.hidden_shapes]
         self.settings = PathSettings(
             bounces=options.bounces,
+            first_bounce=first_bounce,
             hidden_fraction=self.hidden_fraction,
             laser_sampling=options.laser_sampling,
             russian_roulette=options.russian_roulette,
@@ -83,8 +95,21 @@ class PathEngine:
         self.scale = capture.laser_energy / built.unit**2
         self.compile_seconds = 0.0
 
-    def render(self, batch: Batch, budget: Budget, progress: Progress = lambda fraction: None) -> Histogram:
+    def render(
+        self,
+        batch: Batch,
+        budget: Budget,
+        progress: Progress = lambda fraction: None,
+        known_squares: float = 0.0,
+    ) -> Histogram:
         """Render one batch.
+
+        Parameters
+        ----------
+        batch, budget, progress
+            What to render, when to stop, whom to tell the share of the work done.
+        known_squares
+            Sum of the squares of H known from elsewhere, which ``target_error`` counts in [(engine unit)^-4].
 
         Returns
         -------
@@ -97,15 +122,16 @@ class PathEngine:
             The batch is too large for 32-bit indices, or the result is not finite.
         """
         bounces = self.options.bounces
-        shape = self._shape(batch, max(1, bounces.n_slots - 1) if bounces.split else 1)
+        shape = self.shape(batch, max(1, bounces.n_slots - 1) if bounces.split else 1)
         if shape.size > MAX_ELEMENTS:
             raise RenderError(f"a batch of {shape.size:.2e} sums is more than 32-bit indices reach; lower render.memory_limit")
-        transport = self._transport(batch, shape)
-        if bounces.max_bounces is not None and bounces.max_bounces <= FIRST_BOUNCE:
+        transport = self.transport(batch, shape)
+        if bounces.max_bounces is not None and bounces.max_bounces < self.settings.first_bounce:
             mean, variance = np.zeros(shape.axes), np.zeros(shape.axes)
             per_lane = 0
         else:
-            mean, variance, per_lane = self._accumulate(batch, shape, transport, budget, progress)
+            schedule = _Schedule(budget, shape.replicas, known_squares)
+            mean, variance, per_lane = self._accumulate(batch, shape, transport, schedule, progress)
         mean, variance = to_memory_order(mean, shape), to_memory_order(variance, shape)
         if bounces.split:
             second = np.zeros((shape.channels, 1, *mean.shape[2:]))
@@ -120,14 +146,13 @@ class PathEngine:
         return Histogram(mean[..., :-1], variance[..., :-1], mean[..., -1], per_lane * shape.replicas)
 
     def _accumulate(
-        self, batch: Batch, shape: HistogramShape, transport: Transport, budget: Budget, progress: Progress
+        self, batch: Batch, shape: HistogramShape, transport: Transport, schedule: _Schedule, progress: Progress
     ) -> tuple[np.ndarray, np.ndarray, int]:
         histogram = DeviceHistogram(shape)
         lane = dr.arange(mi.UInt32, shape.lanes)
         point = dr.gather(mi.UInt32, mi.UInt32(self._sensor_indices(batch)), lane % shape.sensors)
         key = point * shape.replicas + lane // shape.sensors
         randomness = LaneRandomness.seeded(self.options.seed, key)
-        schedule = _Schedule(budget, shape.replicas)
         begun = time.perf_counter()
         done = 0
         while (more := schedule.next_samples(done, time.perf_counter() - begun)) > 0:
@@ -141,20 +166,20 @@ class PathEngine:
                 schedule.speed = more / max(seconds, 1e-6)
             done += more
             if schedule.wants_error(done):
-                schedule.record_error(done, histogram.relative_error(done))
+                schedule.record_error(done, histogram.relative_error(done, schedule.known_squares))
             progress(schedule.fraction(done, time.perf_counter() - begun))
         mean, variance = histogram.statistics(done)
         dr.eval(mean, variance)
         return mean.numpy(), variance.numpy(), done
 
-    def _shape(self, batch: Batch, slots: int) -> HistogramShape:
+    def shape(self, batch: Batch, slots: int) -> HistogramShape:
         lasers = batch.lasers.size if self.capture.scan_type == "exhaustive" else 1
         options = self.options
         return HistogramShape(
             options.replicas, batch.sensors.size, lasers, slots, options.channels, self.time_axis.n_bins
         )
 
-    def _transport(self, batch: Batch, shape: HistogramShape) -> Transport:
+    def transport(self, batch: Batch, shape: HistogramShape) -> Transport:
         sensors = sensor_points(self.built, self.capture, self.time_axis, self._sensor_indices(batch))
         lasers = laser_points(self.built, self.capture, self.time_axis, self._laser_indices(batch))
         lane = dr.arange(mi.UInt32, shape.lanes)
@@ -176,7 +201,7 @@ class PathEngine:
 
     def _second_bounce(self, batch: Batch, transport: Transport) -> np.ndarray:
         """Return the second bounce (channel, 1, laser, sensor, row): exact, so one replica computes it."""
-        shape = replace(self._shape(batch, 1), replicas=1)
+        shape = replace(self.shape(batch, 1), replicas=1)
         lanes = dr.arange(mi.UInt32, shape.lanes)
         single = replace(
             transport, sensors=transport.sensors.gather(lanes), first_laser=dr.gather(mi.UInt32, transport.first_laser, lanes)
@@ -223,8 +248,8 @@ class PathEngine:
 class _Schedule:
     """How many samples each launch takes. Only the last launches depend on time, and only with a time limit."""
 
-    def __init__(self, budget: Budget, replicas: int):
-        self.budget = budget
+    def __init__(self, budget: Budget, replicas: int, known_squares: float):
+        self.budget, self.known_squares = budget, known_squares
         self.limit = math.ceil(budget.spp / replicas) if budget.spp is not None else None
         self.errors: list[tuple[int, float]] = []  # (samples per lane, relative L2 error)
         self.speed = math.inf  # samples per lane and second

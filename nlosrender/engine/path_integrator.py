@@ -33,6 +33,7 @@ class PathSettings:
     """What the integrator computes and how; part of the compiled kernel."""
 
     bounces: BounceAxis
+    first_bounce: int  # lowest bounce that is deposited, >= 3
     hidden_fraction: float  # share of wall vertices that sample the hidden geometry; 0 = BSDF only, 1 = hidden only
     laser_sampling: bool
     russian_roulette: bool
@@ -162,6 +163,8 @@ def trace_paths(
         # ---- Connect to the lasers and deposit ---------------------------------------------------------------------
         if dr.hint(settings.laser_sampling, mode="scalar"):
             in_reach = mi.Bool(hit)
+            if dr.hint(settings.first_bounce > FIRST_BOUNCE + 1, mode="scalar"):
+                in_reach &= bounce >= settings.first_bounce
             if dr.hint(settings.goes_on and max_bounces is not None, mode="scalar"):
                 in_reach &= bounce <= max_bounces
             _connect_to_lasers(settings, transport, histogram, generator, lane, si, in_reach, bounce, opl, throughput)
@@ -239,14 +242,18 @@ def trace_paths(
             bsdf_density = dr.select(has_target, (1 - q) * pdf, bsdf_density)
             hidden_density = dr.select(on_wall & ~is_delta, q / sampler.area, 0)
         if dr.hint(settings.goes_on and settings.russian_roulette, mode="scalar"):
-            # after the connections of this vertex, by the albedo just met; never on a path's first step
-            survival = dr.select(start, 1, survival)
+            # after the connections of this vertex, by the albedo just met; never before it could deposit
+            survival = dr.select(start | (bounce < settings.first_bounce), 1, survival)
             alive &= generator.next_float32() < survival
             value /= dr.maximum(survival, 1e-9)
         alive &= dr.any(value != 0)
         world = vertex.to_world(wo)
         origin = mi.Point3f(vertex.p)
-        ray = _offset_ray(vertex, world)
+        ray_origin = _offset_origin(vertex, world)
+        if dr.hint(q > 0, mode="scalar"):
+            # from the offset origin: a parallel ray would land beside the target, in another triangle of a fine mesh
+            world = dr.select(has_target, dr.normalize(target - ray_origin), world)
+        ray = mi.Ray3f(ray_origin, world)
 
     return LaneRandomness(generator, [seq_u, seq_v, seq_t])
 
@@ -308,7 +315,7 @@ def _connect(
         cosine = dr.maximum(dr.dot(lit.n, -direction), 0)
         value *= _balance(distance2, share * pdf * cosine * dr.pi * settings.spot_radius**2)
     active &= dr.any(value > 0)
-    active &= ~built.scene.ray_test(connection_segment(si, direction, distance), coherent=False, active=active)
+    active &= ~built.scene.ray_test(connection_segment(si, direction, lit.p), coherent=False, active=active)
     bins = delay_bin(transport, points, opl + distance)
     histogram.deposit(lane, laser, slot, bins, value, active)
 
@@ -382,13 +389,12 @@ def _offset_origin(si: mi.SurfaceInteraction3f, direction: mi.Vector3f) -> mi.Po
     return si.p + si.n * dr.mulsign(mi.Float(scale), dr.dot(si.n, direction))
 
 
-def _offset_ray(si: mi.SurfaceInteraction3f, direction: mi.Vector3f) -> mi.Ray3f:
-    return mi.Ray3f(_offset_origin(si, direction), direction)
-
-
-def connection_segment(si: mi.SurfaceInteraction3f, direction: mi.Vector3f, distance: mi.Float) -> mi.Ray3f:
-    """Ray from the surface to a point at ``distance``, ending just before it."""
-    return mi.Ray3f(_offset_origin(si, direction), direction, distance - 2 * RAY_OFFSET * (1 + distance), mi.Float(0), [])
+def connection_segment(si: mi.SurfaceInteraction3f, direction: mi.Vector3f, point: mi.Point3f) -> mi.Ray3f:
+    """Ray from the surface to ``point``, which lies in ``direction``, ending just before it."""
+    origin = _offset_origin(si, direction)
+    # aimed from the offset origin: a parallel ray would pass beside the point, behind the wall at oblique incidence
+    distance = dr.norm(point - origin)
+    return mi.Ray3f(origin, (point - origin) / distance, distance - 2 * RAY_OFFSET * (1 + distance), mi.Float(0), [])
 
 
 @functools.cache
@@ -396,7 +402,7 @@ def _plugin_class(variant: str) -> type:
     """Return the plugin's class for an active variant: Mitsuba's base classes differ between variants."""
 
     class NlosPathIntegrator(mi.SamplingIntegrator):
-        """``nlos_path``: keys ``max_bounces`` (-1: no limit), ``split_bounces``, ``hidden_fraction``, ``laser_sampling``,
+        """``nlos_path``: keys ``max_bounces`` (-1: no limit), ``first_bounce``, ``split_bounces``, ``hidden_fraction``, ``laser_sampling``,
         ``russian_roulette``, ``spot_radius`` [engine units], ``has_transmission``."""
 
         def __init__(self, properties: mi.Properties):
@@ -404,6 +410,7 @@ def _plugin_class(variant: str) -> type:
             max_bounces = int(properties.get("max_bounces", -1))
             self.settings = PathSettings(
                 bounces=BounceAxis(None if max_bounces < 0 else max_bounces, bool(properties.get("split_bounces", True))),
+                first_bounce=int(properties.get("first_bounce", FIRST_BOUNCE + 1)),
                 hidden_fraction=float(properties.get("hidden_fraction", 1.0)),
                 laser_sampling=bool(properties.get("laser_sampling", True)),
                 russian_roulette=bool(properties.get("russian_roulette", True)),
@@ -435,6 +442,7 @@ def load_path_integrator(settings: PathSettings) -> mi.Integrator:
         {
             "type": PLUGIN_NAME,
             "max_bounces": -1 if bounces.max_bounces is None else bounces.max_bounces,
+            "first_bounce": settings.first_bounce,
             "split_bounces": bounces.split,
             "hidden_fraction": settings.hidden_fraction,
             "laser_sampling": settings.laser_sampling,

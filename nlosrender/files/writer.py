@@ -289,10 +289,12 @@ class CaptureWriter:
         return self._file
 
     def _discard(self) -> None:
-        if self._file is not None:
+        # a second Ctrl-C waits until everything is removed
+        with uninterrupted():
             # the error on its way out is the one to report
-            with suppress(OSError, RuntimeError), uninterrupted():
-                self._file.close()
-        self._close_stream()
-        with suppress(OSError):
-            self._partial.unlink(missing_ok=True)
+            with suppress(OSError, RuntimeError):
+                if self._file is not None:
+                    self._file.close()
+            self._close_stream()
+            with suppress(OSError):
+                self._partial.unlink(missing_ok=True)

@@ -92,7 +92,7 @@ MISTAKES = [
     ),
     ("type: rectangle\n", "type: §mesh\n", "scene.relay_wall.type", r"got 'mesh' \(text\), need one of rectangle"),
     ("    type: rectangle\n", "", "scene.relay_wall.type", r"missing, need one of rectangle, sphere, cylinder"),
-    ("spp: 16", "engine: §virtual_lights", "render.engine", r"this version has only the path engine"),
+    ("spp: 16", "engine: §virtual_light", "render.engine", r"one of auto, path, virtual_lights.*virtual_lights"),
     ("spp: 16", "engine: §paht", "render.engine", r"one of auto, path.*mean path\?"),
     ("spp: 16", "backend: §gpu", "render.backend", r"got 'gpu' \(text\), need one of auto, llvm, cuda"),
     ("spp: 16", "color: §red", "render.color", r"need one of auto, grey, rgb"),

@@ -1,0 +1,71 @@
+"""Which engine renders a scene, and why: the cheapest one that is right."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import mitsuba as mi
+
+from nlosrender.capture.bounces import THIRD_BOUNCE
+from nlosrender.capture.grids import Capture
+from nlosrender.config.render import RenderConfig
+from nlosrender.engine.virtual_lights.engine import is_lambertian
+from nlosrender.engine.virtual_lights.patches import MAX_PATCHES, can_tessellate
+from nlosrender.scene.build import BuiltScene
+
+EngineName = Literal["path", "virtual_lights"]
+# Nearer to the wall than this share of its extent, the light a patch sends to the closest sensor points is too peaked
+# for one value per patch.
+NEAREST = 0.05
+
+
+@dataclass(frozen=True)
+class EngineChoice:
+    """The engine that renders, and the reason in plain words."""
+
+    name: EngineName
+    reason: str
+
+
+def choose_engine(render: RenderConfig, capture: Capture, built: BuiltScene) -> EngineChoice:
+    """Choose the engine for a scene (backend started).
+
+    ``auto`` takes the virtual lights where they are known to be right; asked for by name, they also take rough
+    non-Lambertian surfaces. What they cannot do goes to the path engine.
+    """
+    if render.engine in ("path", "auto"):
+        return EngineChoice("path", "asked for")
+    obstacle = _obstacle(render, capture, built)
+    if obstacle is not None:
+        return EngineChoice("path", obstacle)
+    if render.engine == "virtual_lights":
+        return EngineChoice("virtual_lights", "asked for")
+    if not all(is_lambertian(shape.bsdf()) for shape in built.hidden_shapes):
+        return EngineChoice("path", "some hidden surfaces are not Lambertian")
+    nearest = float(built.hidden_bounds[0][2]) if built.hidden_bounds is not None else 0.0
+    if nearest < NEAREST * max(built.wall.width, built.wall.height):
+        return EngineChoice("path", "hidden geometry comes close to the wall")
+    return EngineChoice("virtual_lights", "Lambertian surfaces at a distance from a planar wall")
+
+
+def _obstacle(render: RenderConfig, capture: Capture, built: BuiltScene) -> str | None:
+    """Return why the virtual lights cannot render a scene; None when they can."""
+    if render.spp is not None:
+        return "spp counts paths"
+    if render.max_bounces is not None and render.max_bounces < THIRD_BOUNCE:
+        return "there is no third bounce to compute"
+    if not (render.laser_sampling and render.hidden_geometry_sampling):
+        return "a technique of the path engine is switched off"
+    if capture.laser_spot_radius > 0:
+        return "the laser has a spot"
+    if built.hidden_bounds is None:
+        return "there is no hidden geometry"
+    if not can_tessellate(built):
+        return "the wall is curved, or a hidden shape is neither a mesh nor a sphere"
+    hard = mi.BSDFFlags.Delta | mi.BSDFFlags.Transmission | mi.BSDFFlags.Null
+    if any(bool(shape.bsdf().flags() & hard) for shape in built.hidden_shapes):
+        return "some hidden surfaces are mirrors or let light through"
+    if built.n_triangles > MAX_PATCHES // 8:
+        return f"{built.n_triangles} triangles are more than the gather takes"
+    return None

@@ -1,0 +1,35 @@
+"""Scenes in which nothing can lie between the wall and a lit patch: no visibility rays are needed there."""
+
+from __future__ import annotations
+
+import mitsuba as mi
+import numpy as np
+
+from nlosrender.scene.build import BuiltScene
+
+MOST_FACES = 4000  # beyond it the test itself, faces times vertices, costs more than the rays it saves
+PLANARITY = 1e-6  # engine units: float32 vertices of a plane of size 1 are good to 1e-7
+
+
+def nothing_occludes(built: BuiltScene) -> bool:
+    """Return whether no surface can hide a front-facing point of the hidden geometry from a planar wall.
+
+    That holds for one object alone in front of a planar wall: a sphere seen from outside, or a mesh whose vertices
+    all lie behind (or in) the plane of each of its faces: a flat sheet, a box, any convex solid.
+    """
+    if not built.wall.is_planar or len(built.hidden_shapes) != 1:
+        return False
+    shape = built.hidden_shapes[0]
+    if not shape.is_mesh():
+        return shape.class_name() == "Sphere" and not shape.has_flipped_normals()
+    if shape.face_count() > MOST_FACES or bool(shape.bsdf().flags() & mi.BSDFFlags.BackSide):
+        return False  # a two-sided sheet may be seen from behind, past its own other faces
+    parameters = mi.traverse(shape)
+    vertices = np.asarray(parameters["vertex_positions"], dtype=np.float64).reshape(-1, 3)
+    corners = vertices[np.asarray(parameters["faces"]).reshape(-1, 3)]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    lengths = np.linalg.norm(normals, axis=1, keepdims=True)
+    real = lengths[:, 0] > 0
+    normals = normals[real] / lengths[real]
+    heights = vertices @ normals.T - np.einsum("ij,ij->i", corners[real, 0], normals)
+    return bool(heights.max(initial=0.0) <= PLANARITY)
