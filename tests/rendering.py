@@ -95,7 +95,7 @@ def flat_wall(
         },
         "capture": {"scan_type": scan, **grids, "account_first_and_last_bounces": False, **capture},
         "time_axis": dict(zip(("start_opl", "bin_width_opl", "n_bins"), bins, strict=True)),
-        "render": {"max_bounces": 3, "spp": 1024, **render},
+        "render": {"engine": "path", "max_bounces": 3, "spp": 1024, **render},
     }
 
 
@@ -131,7 +131,8 @@ def render(
     built = pipeline.load_scene(validated)
     capture, time_axis = pipeline.describe_capture(validated, built.wall, built)
     plan, engine = pipeline.prepare(validated, backend, built, capture, time_axis)
-    engine = PathEngine(built, capture, time_axis, replace(engine.options, **options))
+    if options:
+        engine = PathEngine(built, capture, time_axis, replace(engine.options, **options))
     bounces, channels = engine.options.bounces, engine.options.channels
     if batch_bytes is not None:
         rows = bounces.n_slots * channels

@@ -273,12 +273,16 @@ def _connect_to_lasers(
 ) -> None:
     """Laser sampling: connect the vertex to every laser of the lane and deposit (Royo et al. 2022, Eq. 12)."""
     slot = _slot(settings, bounce)
+    # one place in the spot for all lasers: what a path draws must not depend on how many lasers a batch has
+    in_spot = mi.Vector3f(0)
+    if dr.hint(settings.finds_spot, mode="scalar"):
+        in_spot = _on_disc(generator) * settings.spot_radius
     if dr.hint(transport.lasers_per_lane == 1, mode="scalar"):
-        _connect(settings, transport, histogram, generator, lane, mi.UInt32(0), slot, si, active, opl, throughput)
+        _connect(settings, transport, histogram, in_spot, lane, mi.UInt32(0), slot, si, active, opl, throughput)
     else:
         laser = mi.UInt32(0)
         while dr.hint(laser < transport.n_lasers, exclude=[settings, transport, histogram]):
-            _connect(settings, transport, histogram, generator, lane, laser, slot, si, active, opl, throughput)
+            _connect(settings, transport, histogram, in_spot, lane, laser, slot, si, active, opl, throughput)
             laser += 1
 
 
@@ -286,7 +290,7 @@ def _connect(
     settings: PathSettings,
     transport: Transport,
     histogram: DeviceHistogram,
-    generator: mi.PCG32,
+    in_spot: mi.Vector3f,
     lane: mi.UInt32,
     laser: mi.UInt32,
     slot: mi.UInt32,
@@ -300,7 +304,7 @@ def _connect(
     points = transport.lasers.gather(transport.first_laser + laser)
     lit = points.interaction
     if settings.finds_spot:
-        lit.p = lit.p + lit.to_world(_on_disc(generator) * settings.spot_radius)
+        lit.p = lit.p + lit.to_world(in_spot)
     to_laser = lit.p - si.p
     distance2 = dr.squared_norm(to_laser)
     distance = dr.sqrt(distance2)
@@ -314,7 +318,7 @@ def _connect(
         share = dr.select(si.shape == mi.ShapePtr(built.wall_shape), 1 - settings.hidden_fraction, 1.0)
         cosine = dr.maximum(dr.dot(lit.n, -direction), 0)
         value *= _balance(distance2, share * pdf * cosine * dr.pi * settings.spot_radius**2)
-    active &= dr.any(value > 0)
+    active = active & dr.any(value > 0)  # not in place: the caller's mask serves the other lasers, too
     active &= ~built.scene.ray_test(connection_segment(si, direction, lit.p), coherent=False, active=active)
     bins = delay_bin(transport, points, opl + distance)
     histogram.deposit(lane, laser, slot, bins, value, active)

@@ -34,7 +34,7 @@ def choose_engine(render: RenderConfig, capture: Capture, built: BuiltScene) -> 
     ``auto`` takes the virtual lights where they are known to be right; asked for by name, they also take rough
     non-Lambertian surfaces. What they cannot do goes to the path engine.
     """
-    if render.engine in ("path", "auto"):
+    if render.engine == "path":
         return EngineChoice("path", "asked for")
     obstacle = _obstacle(render, capture, built)
     if obstacle is not None:

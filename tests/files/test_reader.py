@@ -71,6 +71,18 @@ def test_parts_outside(tmp_path: Path, header_of: Callable, write_capture: Calla
         capture.read_block(**parts)
 
 
+def test_variance_of_another_shape(tmp_path: Path, header_of: Callable, write_capture: Callable) -> None:
+    """A variance that does not belong to the samples is refused, not read in part."""
+    write_capture(tmp_path / "a.hdf5", header_of())
+    with h5py.File(tmp_path / "a.hdf5", "r+") as file:
+        file["variance"] = np.zeros((1, 7, 6, 8, 9, 2, 3), "f4")
+    with (
+        open_capture(tmp_path / "a.hdf5") as capture,
+        pytest.raises(FileError, match=r"variance has shape \(1, 7, 6, 8, 9, 2, 3\), data"),
+    ):
+        capture.read_block(dataset="variance")
+
+
 def test_positions(tmp_path: Path, header_of: Callable, write_capture: Callable) -> None:
     """Points and normals come back as (rows, columns, 3) in the file's frame."""
     header = header_of(frame="scene")

@@ -82,9 +82,12 @@ def test_an_interrupted_write_leaves_nothing(
 ) -> None:
     """Ctrl-C in the middle of HDF5's own writing ends the writer as Ctrl-C anywhere else does."""
     true_write = os.pwrite
+    events: list[str] = []
 
     def interrupted(descriptor: int, content: bytes, offset: int) -> int:
+        events.append("begin")
         signal.raise_signal(signal.SIGINT)
+        events.append("end")
         return true_write(descriptor, content, offset)
 
     # no cache: every chunk is written at once
@@ -98,4 +101,5 @@ def test_an_interrupted_write_leaves_nothing(
 
     with pytest.raises(KeyboardInterrupt):
         render()
+    assert events[:2] == ["begin", "end"]  # HDF5's call was not cut off
     assert list(tmp_path.iterdir()) == []
