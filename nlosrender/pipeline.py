@@ -7,23 +7,28 @@ render starts, after the backend has been chosen.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from nlosrender.analysis.forecast import Forecast, forecast_file, forecast_render
 from nlosrender.capture.bounces import BounceAxis
 from nlosrender.capture.grids import Capture, build_capture
+from nlosrender.capture.limits import refuse_impossible_grids, refuse_impossible_samples
 from nlosrender.capture.plan import Plan, plan_capture
 from nlosrender.capture.time_axis import TimeAxis, resolve_time_axis
 from nlosrender.config.document import Config
 from nlosrender.config.load import config_hash, config_to_dict
+from nlosrender.config.warnings import config_warnings
 from nlosrender.engine.backend import Backend, batch_memory, start_backend
 from nlosrender.errors import ConfigError, Problem
 from nlosrender.files.capture_file import CaptureHeader
 from nlosrender.files.provenance import provenance_attributes, result_attributes
 from nlosrender.files.replacement import check_writable
+from nlosrender.files.size import disk_warnings
 from nlosrender.files.writer import CaptureWriter
 from nlosrender.scene.hidden_geometry import Surface, hidden_surfaces
 from nlosrender.scene.relay_wall import RelayWall, relay_wall_from_config
@@ -36,13 +41,16 @@ if TYPE_CHECKING:
     Engine = PathEngine | VirtualLightEngine
 
 Progress = Callable[[float], None]  # told the share of the work that is done, in [0, 1]
+Warn = Callable[[str], None]  # told one warning
 
 
 @dataclass
 class Stopwatch:
     """Seconds spent per stage."""
 
-    seconds: dict[str, float] = field(default_factory=lambda: dict.fromkeys(("scene", "compile", "render", "write"), 0.0))
+    seconds: dict[str, float] = field(
+        default_factory=lambda: dict.fromkeys(("scene", "compile", "render", "write"), 0.0)
+    )
     begun: float = field(default_factory=time.perf_counter)
 
     @contextmanager
@@ -65,6 +73,7 @@ class RenderReport:
 
     output: Path
     engine: str
+    reason: str  # why this engine
     variant: str  # Mitsuba variant
     samples: int  # paths per sensor point, the least of all batches
     error_estimate: float  # relative L2 error of H over the whole capture
@@ -73,9 +82,27 @@ class RenderReport:
     n_bins: int
     n_triangles: int
     seconds: dict[str, float]
+    warnings: tuple[str, ...]
 
 
-def render_capture(config: Config, progress: Progress = lambda fraction: None) -> RenderReport:
+@dataclass(frozen=True)
+class Warnings:
+    """Warnings, each said once."""
+
+    warn: Warn
+    said: dict[str, None] = field(default_factory=dict)  # in the order they were said
+
+    def say(self, texts: Iterable[str]) -> None:
+        """Pass on those that are new."""
+        for text in texts:
+            if text not in self.said:
+                self.said[text] = None
+                self.warn(text)
+
+
+def render_capture(
+    config: Config, progress: Progress = lambda fraction: None, warn: Warn = lambda text: None
+) -> RenderReport:
     """Render one capture and write its file.
 
     Parameters
@@ -84,6 +111,8 @@ def render_capture(config: Config, progress: Progress = lambda fraction: None) -
         A validated configuration.
     progress
         Called now and then with the share of the work done.
+    warn
+        Called with every warning, before the first batch.
 
     Raises
     ------
@@ -96,14 +125,16 @@ def render_capture(config: Config, progress: Progress = lambda fraction: None) -
     RenderError
         The capture does not fit the memory limit, or the result is not finite.
     """
-    stopwatch = Stopwatch()
+    stopwatch, warnings = Stopwatch(), Warnings(warn)
+    warnings.say(config_warnings(config))
     with stopwatch.stage("scene"):
         check_writable(config.output.path)
         backend = start_backend(config.render.backend, colored=config.is_colored)
         built = load_scene(config)
         capture, time_axis = describe_capture(config, built.wall, built)
         plan, engine = prepare(config, backend, built, capture, time_axis)
-    header = describe_file(config, built, capture, time_axis)
+        header = describe_file(config, built, capture, time_axis)
+        warnings.say(late_warnings(config, backend, plan, engine, header))
     provenance = provenance_attributes(
         config_to_dict(config), config_hash(config), engine=engine.name, seed=config.render.seed
     )
@@ -128,6 +159,7 @@ def render_capture(config: Config, progress: Progress = lambda fraction: None) -
     return RenderReport(
         output=Path(config.output.path),
         engine=engine.name,
+        reason=engine_reason(config, capture, built),
         variant=backend.variant,
         samples=totals.samples or 0,
         error_estimate=totals.error_estimate,
@@ -136,7 +168,47 @@ def render_capture(config: Config, progress: Progress = lambda fraction: None) -
         n_bins=time_axis.n_bins,
         n_triangles=built.n_triangles,
         seconds=stopwatch.report(),
+        warnings=tuple(warnings.said),
     )
+
+
+def forecast_capture(config: Config) -> Forecast:
+    """Say what ``render_capture`` will do and cost; a pilot renders a part of it, and no file is written.
+
+    Raises
+    ------
+    ConfigError, BackendError, RenderError
+        As ``render_capture``.
+    """
+    warnings = Warnings(lambda text: None)
+    warnings.say(config_warnings(config))
+    backend = start_backend(config.render.backend, colored=config.is_colored)
+    begun = time.perf_counter()
+    built = load_scene(config)
+    capture, time_axis = describe_capture(config, built.wall, built)
+    plan, engine = prepare(config, backend, built, capture, time_axis)
+    header = describe_file(config, built, capture, time_axis)
+    warnings.say(late_warnings(config, backend, plan, engine, header))
+    spent = time.perf_counter() - begun
+    reason = engine_reason(config, capture, built)
+    return forecast_render(config, backend, plan, engine, reason, header, tuple(warnings.said), spent)
+
+
+def late_warnings(config: Config, backend: Backend, plan: Plan, engine: Engine, header: CaptureHeader) -> Iterator[str]:
+    """Yield the warnings that take a scene, a plan and an engine; ``config_warnings`` needs none of them."""
+    from nlosrender.engine.memory import memory_warnings
+    from nlosrender.engine.scene_warnings import scene_warnings
+
+    yield from scene_warnings(engine)
+    yield from memory_warnings(engine, plan, config.render.memory_limit_bytes, backend.lanes)
+    yield from disk_warnings(Path(config.output.path), forecast_file(config, header, engine))
+
+
+def engine_reason(config: Config, capture: Capture, built: BuiltScene) -> str:
+    """Return why the capture is rendered by the engine it is."""
+    from nlosrender.engine.planner import choose_engine
+
+    return choose_engine(config.render, capture, built).reason
 
 
 def load_scene(config: Config) -> BuiltScene:
@@ -165,6 +237,7 @@ def place_scene(config: Config) -> tuple[RelayWall, tuple[Surface, ...]]:
 
 def describe_capture(config: Config, wall: RelayWall, built: BuiltScene) -> tuple[Capture, TimeAxis]:
     """Stage 3: laser and sensor points, legs and bins."""
+    refuse_impossible_grids(config.capture, batch_memory(config.render.memory_limit_bytes))
     capture = build_capture(config.capture, wall)
     time_axis = resolve_time_axis(config.time_axis, capture, wall, built.hidden_bounds, config.render.max_bounces)
     return capture, time_axis
@@ -181,13 +254,9 @@ def prepare(
     render = config.render
     bounces = BounceAxis(render.max_bounces, render.split_bounces)
     channels = 3 if config.is_colored else 1
-    plan = plan_capture(
-        capture,
-        rows_per_pair=bounces.n_slots * channels,
-        n_bins=time_axis.n_bins,
-        lanes=backend.lanes,
-        memory_limit=batch_memory(render.memory_limit_bytes),
-    )
+    memory, rows = batch_memory(render.memory_limit_bytes), bounces.n_slots * channels
+    refuse_impossible_samples(config.capture, rows_per_pair=rows, n_bins=time_axis.n_bins, memory_limit=memory)
+    plan = plan_capture(capture, rows_per_pair=rows, n_bins=time_axis.n_bins, lanes=backend.lanes, memory_limit=memory)
     options = PathOptions(
         bounces=bounces,
         laser_sampling=render.laser_sampling,
@@ -241,8 +310,7 @@ def render_batches(
         budget = Budget(render.spp, render.target_error, limit)
         compiled = engine.compile_seconds
         with stopwatch.stage("render"):
-            done = number / len(plan.batches)
-            histogram = engine.render(batch, budget, lambda share, done=done: progress(done + share / len(plan.batches)))
+            histogram = engine.render(batch, budget, partial(_progress_within, progress, number, len(plan.batches)))
         compiled = engine.compile_seconds - compiled
         stopwatch.seconds["compile"] += compiled
         stopwatch.seconds["render"] -= compiled
@@ -264,6 +332,10 @@ def render_batches(
             )
         progress((number + 1) / len(plan.batches))
     return totals
+
+
+def _progress_within(progress: Progress, number: int, n_batches: int, share: float) -> None:
+    progress((number + share) / n_batches)
 
 
 def describe_file(config: Config, built: BuiltScene, capture: Capture, time_axis: TimeAxis) -> CaptureHeader:

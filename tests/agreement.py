@@ -23,9 +23,7 @@ def t_limit(n_tests: int, degrees_of_freedom: int, false_alarm: float = FALSE_AL
     return float(stats.t.isf(single / 2, degrees_of_freedom))
 
 
-def worst_t(
-    mean: ArrayLike, variance: ArrayLike, reference: ArrayLike, floor: ArrayLike = 0.0
-) -> tuple[float, int]:
+def worst_t(mean: ArrayLike, variance: ArrayLike, reference: ArrayLike, floor: ArrayLike = 0.0) -> tuple[float, int]:
     """Largest |mean - reference| in standard deviations after taking off ``floor``, and the number of statements.
 
     Bins in which both are exactly the same, such as empty ones, state nothing and do not count.
@@ -40,7 +38,7 @@ def worst_t(
 
 
 def grouped(reference: Array, share: float) -> Array:
-    """Number the bins of a histogram (bin,) so that consecutive ones form groups of at least ``share`` of its energy."""
+    """Number the bins of a histogram (bin,): consecutive ones form groups of at least ``share`` of its energy."""
     group, energy, labels = 0, 0.0, np.zeros(len(reference), dtype=np.int64)
     least = share * reference.sum()
     for i, value in enumerate(reference):

@@ -172,7 +172,9 @@ def binned(value: Array, opl: Array, edges: Array) -> Array:
 
 def third_bounces(setup: Setup, lasers: Array, sensors: Array) -> Array:
     """Histograms (ly, lx, sy, sx, bins) of every pair of two grids (y, x, 3)."""
-    rows = [[third_bounce(setup, laser, sensor) for sensor in sensors.reshape(-1, 3)] for laser in lasers.reshape(-1, 3)]
+    rows = [
+        [third_bounce(setup, laser, sensor) for sensor in sensors.reshape(-1, 3)] for laser in lasers.reshape(-1, 3)
+    ]
     return np.array(rows).reshape(*lasers.shape[:2], *sensors.shape[:2], -1)
 
 

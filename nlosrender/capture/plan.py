@@ -100,7 +100,9 @@ def plan_capture(capture: Capture, *, rows_per_pair: int, n_bins: int, lanes: in
         if capture.scan_type == "confocal":
             batches.append(Batch(sensors, sensors))
             continue
-        batches += [Batch(sensors, lasers) for lasers in tiles(capture.laser_grid.ny, capture.laser_grid.nx, lasers_at_once)]
+        batches += [
+            Batch(sensors, lasers) for lasers in tiles(capture.laser_grid.ny, capture.laser_grid.nx, lasers_at_once)
+        ]
     largest = max(b.sensors.size * (1 if capture.scan_type == "confocal" else b.lasers.size) for b in batches)
     return Plan(tuple(batches), replicas, largest * pair)
 

@@ -42,7 +42,9 @@ def doctor(as_json: Annotated[bool, typer.Option("--json", help="Print one JSON 
         typer.echo("versions: " + ", ".join(f"{name} {version}" for name, version in package_versions().items()))
         typer.echo("LLVM libraries:" if libraries else "LLVM libraries: none found")
         for library in libraries:
-            typer.echo(f"  {'usable ' if library.usable else 'not used'} {library.path} ({library.origin}): {library.verdict}")
+            typer.echo(
+                f"  {'usable ' if library.usable else 'not used'} {library.path} ({library.origin}): {library.verdict}"
+            )
         typer.echo(f"NVIDIA GPU: {'found' if has_gpu else 'none found'}")
         if backend:
             typer.echo(f"used: {backend.name} ({backend.library})")

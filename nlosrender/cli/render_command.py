@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -20,7 +21,9 @@ def register(app: typer.Typer) -> None:
 
 def render(
     config: Annotated[Path, typer.Argument(help="The YAML file that describes the capture.")],
-    output: Annotated[Path | None, typer.Option("--output", "-o", help="File to write, instead of output.path.")] = None,
+    output: Annotated[
+        Path | None, typer.Option("--output", "-o", help="File to write, instead of output.path.")
+    ] = None,
     overrides: Annotated[
         list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Override one key; may be repeated.")
     ] = None,
@@ -34,7 +37,6 @@ def render(
     """
     from nlosrender.config.load import load_config
     from nlosrender.config.places import with_places
-    from nlosrender.config.warnings import config_warnings
     from nlosrender.errors import ConfigError
     from nlosrender.pipeline import render_capture
 
@@ -42,12 +44,9 @@ def render(
     if output is not None:
         changes.append(f"output.path={_quoted(output)}")
     loaded = load_config(config, changes)
-    if not quiet:
-        for warning in config_warnings(loaded):
-            typer.echo(f"warning: {warning}", err=True)
     try:
         with _progress_bar(hidden=quiet) as progress:
-            report = render_capture(loaded, progress)
+            report = render_capture(loaded, progress, _ignore if quiet else _print_warning)
     except ConfigError as error:
         raise with_places(error, config, changes) from error
     if as_json:
@@ -60,6 +59,16 @@ def _quoted(path: Path) -> str:
     import json
 
     return json.dumps(str(path))  # a JSON string is a YAML string: names such as "1e3" or "yes" stay text
+
+
+def _ignore(text: str) -> None:
+    pass
+
+
+def _print_warning(text: str) -> None:
+    from tqdm import tqdm
+
+    tqdm.write(f"warning: {text}", file=sys.stderr)  # above the progress bar, not into it
 
 
 @contextmanager
@@ -89,6 +98,7 @@ def _print_json(report: RenderReport) -> None:
 def _print_report(report: RenderReport) -> None:
     seconds = report.seconds
     typer.echo(f"wrote {report.output}")
+    typer.echo(f"  engine          {report.engine}: {report.reason}")
     typer.echo(f"  error estimate  {report.error_estimate:.2%} (relative L2), {report.samples} paths per sensor point")
     energies = ", ".join(f"{name}: {energy:.4g}" for name, energy in report.energy.items())
     typer.echo(f"  energy          bounce {energies}; outside the time window: {report.out_of_window:.4g}")

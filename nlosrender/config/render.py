@@ -51,7 +51,7 @@ class RenderConfig(Section):
     """What is computed, how well, and on what."""
 
     engine: Engine = "auto"
-    """auto: the cheapest engine that is right for the scene; path: the path tracer; virtual_lights: third bounce without noise"""
+    """auto: the cheapest engine right for the scene; path: path tracer; virtual_lights: third bounce without noise"""
     max_bounces: BounceCount | None = 7
     """highest bounce, counting both points on the wall: 3 is the third bounce; null: no limit"""
     split_bounces: Flag = True

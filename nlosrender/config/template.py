@@ -76,7 +76,7 @@ time_axis:
   n_bins: auto                   # auto | integer >= 1; default auto: up to the latest possible arrival
 
 render:
-  engine: auto                   # auto | path; default auto
+  engine: auto                   # auto | path | virtual_lights; default auto
   max_bounces: 7                 # integer >= 2, or null for no limit; 3 = third bounce only; default 7
   split_bounces: true            # each bounce on its own index of the file; default true
   target_error: 0.05             # relative L2 error of H to stop at, 0..1; default 0.05; or:

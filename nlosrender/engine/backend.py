@@ -61,7 +61,9 @@ def start_backend(wanted: BackendName = "auto", *, colored: bool = False) -> Bac
         There is no GPU although ``cuda`` is wanted, or no LLVM that works. The message says what to install.
     """
     if wanted == "cuda" and not cuda_available():
-        raise BackendError("render.backend: cuda: no NVIDIA driver with a device was found. Use backend: llvm, or install the driver.")
+        raise BackendError(
+            "render.backend: cuda: no NVIDIA driver with a device was found. Use backend: llvm, or install the driver."
+        )
     name: Literal["llvm", "cuda"] = "cuda" if wanted == "cuda" or (wanted == "auto" and cuda_available()) else "llvm"
     library = "CUDA driver" if name == "cuda" else _load_llvm()
     variant = f"{name}_ad_{'rgb' if colored else 'mono'}"
@@ -75,8 +77,8 @@ def start_backend(wanted: BackendName = "auto", *, colored: bool = False) -> Bac
 
 
 def _load_llvm() -> str:
-    if "drjit" in sys.modules:  # loaded already: Dr.Jit keeps the library it has
-        return os.environ.get(llvm.ENVIRONMENT_VARIABLE, "chosen by Dr.Jit")
+    if "drjit" in sys.modules:
+        return _loaded_library()
     library = llvm.choose_library()
     if library is None:
         found = "; ".join(f"{candidate.path}: {candidate.verdict}" for candidate in llvm.find_libraries())
@@ -85,7 +87,26 @@ def _load_llvm() -> str:
     return str(library.path)
 
 
+def _loaded_library() -> str:
+    """Return the library of a Dr.Jit that was imported earlier: it keeps what it found then."""
+    import drjit
+
+    named = os.environ.get(llvm.ENVIRONMENT_VARIABLE)
+    major = drjit.detail.llvm_version()[0]
+    if named is None and major not in llvm.PROVEN_MAJORS:
+        raise BackendError(
+            f"Dr.Jit was imported before its LLVM could be chosen and took version {major}, which may abort the "
+            "process. Call nlosrender.engine.backend.start_backend before anything imports drjit or mitsuba."
+        )
+    return named or f"LLVM {major}, found by Dr.Jit"
+
+
 PROCESS_BYTES = 400e6  # Python, Mitsuba, LLVM and a scene, before any histogram
+
+
+def physical_memory() -> int:
+    """Return the machine's memory [bytes]; 8 GiB where the system does not tell."""
+    return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") if hasattr(os, "sysconf") else 8 << 30
 
 
 def batch_memory(limit: int | None) -> int:
@@ -97,8 +118,7 @@ def batch_memory(limit: int | None) -> int:
         The limit is below what the program itself needs.
     """
     if limit is None:
-        physical = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") if hasattr(os, "sysconf") else 8 << 30
-        limit = physical // 4
+        limit = physical_memory() // 4
     if limit <= PROCESS_BYTES:
         raise RenderError(
             f"render.memory_limit: got {limit / 1e6:.0f} MB, need more than {PROCESS_BYTES / 1e6:.0f} MB, "

@@ -39,9 +39,7 @@ class WallPoints:
         )
 
 
-def sensor_points(
-    built: BuiltScene, capture: Capture, time_axis: TimeAxis, index: NDArray[np.intp] | slice
-) -> WallPoints:
+def sensor_points(built: BuiltScene, capture: Capture, time_axis: TimeAxis, index: NDArray[np.integer]) -> WallPoints:
     """Return the sensor points with flat indices ``index``, legs and the window's start as their delay."""
     grid = capture.sensor_grid
     delay = (capture.sensor_legs.reshape(-1)[index] - time_axis.start_opl) / time_axis.bin_width_opl
@@ -49,9 +47,7 @@ def sensor_points(
     return _wall_points(built, positions, normals, capture.sensor_position, delay)
 
 
-def laser_points(
-    built: BuiltScene, capture: Capture, time_axis: TimeAxis, index: NDArray[np.intp] | slice
-) -> WallPoints:
+def laser_points(built: BuiltScene, capture: Capture, time_axis: TimeAxis, index: NDArray[np.integer]) -> WallPoints:
     """Return the laser points with flat indices ``index``, their legs as delay."""
     grid = capture.laser_grid
     delay = capture.laser_legs.reshape(-1)[index] / time_axis.bin_width_opl
@@ -71,6 +67,10 @@ def _wall_points(
     to_device /= np.maximum(np.linalg.norm(to_device, axis=-1, keepdims=True), 1e-300)
     interaction.wi = interaction.to_local(mi.Vector3f(to_device.T.astype(np.float32)))
     whole = np.floor(delay)
-    points = WallPoints(interaction, mi.Int32(np.clip(whole, -(2**30), 2**30).astype(np.int32)), mi.Float((delay - whole).astype(np.float32)))
+    points = WallPoints(
+        interaction,
+        mi.Int32(np.clip(whole, -(2**30), 2**30).astype(np.int32)),
+        mi.Float((delay - whole).astype(np.float32)),
+    )
     dr.eval(points.interaction, points.delay_bins, points.delay_fraction)
     return points

@@ -1,10 +1,9 @@
 """Find an LLVM shared library that Dr.Jit can use, without ever loading one that would end the process.
 
-Dr.Jit compiles its kernels with LLVM, loaded as a shared library when the first array is made. Left alone it
-takes whatever the system has. Some versions are refused, and some abort the whole process inside a
-compilation (LLVM 15 on machines with AVX-512: "Cannot select: fminimum"). So the library is chosen here, by
-the version in its file name, before Dr.Jit is imported; one of an unproven version is first tried in a
-process of its own.
+Dr.Jit compiles its kernels with LLVM, a shared library that it looks for when it is imported. Left alone it takes
+whatever the system has. Some versions are refused, and some abort the whole process inside a compilation: LLVM 15 on
+machines with AVX-512 ("Cannot select: fminimum"). So the library is chosen here, by the version in its file name,
+before Dr.Jit is imported; one of an unproven version first has to render a small scene in a process of its own.
 """
 
 from __future__ import annotations
@@ -16,10 +15,11 @@ import os
 import re
 import subprocess
 import sys
+import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 
-PROVEN_MAJORS = (19, 23)  # rendered the test suite; any other version is probed first
+PROVEN_MAJORS = (19, 23)  # ran the whole test suite; any other version is probed first
 OLDEST_MAJOR = 16  # 15 aborts on AVX-512 machines, 14 is refused by Dr.Jit
 WHEEL = "karellen-llvm-core"
 WHEEL_RUNTIME = ("libunwind.so.1", "libc++abi.so.1", "libc++.so.1")  # in the order they need one another
@@ -30,19 +30,30 @@ ADVICE = (
     f"(Debian, Ubuntu: 'apt-get install libllvm19'); or name a library in {ENVIRONMENT_VARIABLE}."
 )
 
-# What a kernel of this program needs: float minimum and maximum, a loop, a scatter; run in a process of its own.
+# A small render with every engine, in a process of its own: simple kernels do not bring out the aborts.
 _PROBE = """
-import sys
+import pathlib, sys
 from nlosrender.engine.llvm import load_library
 load_library(sys.argv[1])
 import drjit
-from drjit.llvm import Float, Float64, UInt32
-x = drjit.arange(Float, 64)
-total = drjit.zeros(Float64, 64)
-y = drjit.minimum(x, 5) + drjit.maximum(x, 3) * drjit.sqrt(x)
-drjit.scatter_add(total, Float64(y), drjit.arange(UInt32, 64))
-drjit.eval(total)
-print("works", drjit.sum(total)[0])
+from nlosrender import pipeline
+from nlosrender.config.load import parse_config
+from nlosrender.engine.backend import start_backend
+for engine in ("virtual_lights", "path"):
+    config = parse_config(
+        "{scene: {relay_wall: {type: rectangle, width: 2.0, height: 1.6}, hidden_geometry: [{type: rectangle,"
+        " width: 0.8, height: 0.6, center: [0.15, -0.1, 0.6], normal: [0.2, -0.1, -1.0]}]},"
+        " capture: {scan_type: single, sensor_grid: {nx: 5, ny: 3}},"
+        " time_axis: {bin_width_opl: 0.02, n_bins: 160},"
+        " render: {max_bounces: 5, target_error: 0.2, engine: " + engine + "}}",
+        "probe.yaml", pathlib.Path("."))
+    backend = start_backend("llvm")
+    built = pipeline.load_scene(config)
+    capture, time_axis = pipeline.describe_capture(config, built.wall, built)
+    plan, renderer = pipeline.prepare(config, backend, built, capture, time_axis)
+    from nlosrender.engine.path_engine import Budget
+    energy = renderer.render(plan.batches[0], Budget(target_error=0.2)).mean.sum()
+    print("works" if energy > 0 else "no light")
 """
 
 
@@ -55,6 +66,11 @@ class LlvmLibrary:
     major: int | None  # None: the version is not in the file's name
     usable: bool
     verdict: str  # why, in words
+
+    @property
+    def is_proven(self) -> bool:
+        """Whether this is a version known to work."""
+        return self.usable and self.major in PROVEN_MAJORS
 
 
 def find_libraries() -> list[LlvmLibrary]:
@@ -132,15 +148,20 @@ def _judge(path: Path, origin: str) -> LlvmLibrary:
 
 
 def _probe(path: Path) -> tuple[bool, str]:
-    """Compile and run a small kernel with the library, in a process of its own: a crash there harms nobody."""
+    """Render a small scene with the library in a process of its own: a crash there harms nobody."""
     command = [sys.executable, "-c", _PROBE, str(path)]
     try:
-        run = subprocess.run(command, capture_output=True, text=True, timeout=PROBE_SECONDS, check=False)
+        with tempfile.TemporaryDirectory() as home:
+            # Dr.Jit keeps compiled kernels below the home folder: from an empty one, everything is compiled anew
+            environment = os.environ | {"HOME": home}
+            run = subprocess.run(
+                command, capture_output=True, text=True, timeout=PROBE_SECONDS, check=False, env=environment
+            )
     except (OSError, subprocess.TimeoutExpired) as error:
-        return False, f"a trial kernel could not be run: {error}"
-    if run.returncode == 0 and "works" in run.stdout:
-        return True, "a trial kernel compiled and ran"
-    return False, f"a trial kernel failed (exit code {run.returncode})"
+        return False, f"a trial render could not be run: {error}"
+    if run.returncode == 0 and run.stdout.count("works") == 2:
+        return True, "not a version known to work, but a trial render succeeded"
+    return False, f"a trial render failed (exit code {run.returncode})"
 
 
 def _wheel_library() -> Path | None:
@@ -156,7 +177,13 @@ def _wheel_library() -> Path | None:
 
 def _system_libraries() -> list[Path]:
     """Return system LLVM libraries, newest first, one per real file."""
-    patterns = ("/usr/lib/*/libLLVM*.so*", "/usr/lib64/libLLVM*.so*", "/usr/lib/libLLVM*.so*", "/usr/lib/llvm-*/lib/libLLVM*.so*")
-    patterns += ("/usr/local/lib/libLLVM*.so*", "/opt/homebrew/opt/llvm*/lib/libLLVM*.dylib")
+    patterns = (
+        "/usr/lib/*/libLLVM*.so*",
+        "/usr/lib64/libLLVM*.so*",
+        "/usr/lib/libLLVM*.so*",
+        "/usr/lib/llvm-*/lib/libLLVM*.so*",
+        "/usr/local/lib/libLLVM*.so*",
+        "/opt/homebrew/opt/llvm*/lib/libLLVM*.dylib",
+    )
     found = {path.resolve() for pattern in patterns for path in Path("/").glob(pattern.lstrip("/")) if path.is_file()}
     return sorted(found, key=lambda path: major_version(path) or 0, reverse=True)

@@ -11,7 +11,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from nlosrender.capture.bounces import FIRST_BOUNCE, THIRD_BOUNCE, BounceAxis
+from nlosrender.capture.bounces import THIRD_BOUNCE, BounceAxis
 from nlosrender.capture.grids import Capture
 from nlosrender.capture.plan import Batch
 from nlosrender.capture.time_axis import TimeAxis
@@ -124,7 +124,9 @@ class PathEngine:
         bounces = self.options.bounces
         shape = self.shape(batch, max(1, bounces.n_slots - 1) if bounces.split else 1)
         if shape.size > MAX_ELEMENTS:
-            raise RenderError(f"a batch of {shape.size:.2e} sums is more than 32-bit indices reach; lower render.memory_limit")
+            raise RenderError(
+                f"a batch of {shape.size:.2e} sums is more than 32-bit indices reach; lower render.memory_limit"
+            )
         transport = self.transport(batch, shape)
         if bounces.max_bounces is not None and bounces.max_bounces < self.settings.first_bounce:
             mean, variance = np.zeros(shape.axes), np.zeros(shape.axes)
@@ -204,7 +206,9 @@ class PathEngine:
         shape = replace(self.shape(batch, 1), replicas=1)
         lanes = dr.arange(mi.UInt32, shape.lanes)
         single = replace(
-            transport, sensors=transport.sensors.gather(lanes), first_laser=dr.gather(mi.UInt32, transport.first_laser, lanes)
+            transport,
+            sensors=transport.sensors.gather(lanes),
+            first_laser=dr.gather(mi.UInt32, transport.first_laser, lanes),
         )
         histogram = DeviceHistogram(shape)
         deposit_second_bounce(single, histogram)
@@ -218,7 +222,7 @@ class PathEngine:
         return np.array(batch.lasers.flat_indices(self.capture.laser_grid.nx), dtype=np.uint32)
 
     def _choose_hidden_fraction(self) -> float:
-        """Pick the mixture on the relay wall; one technique alone where it suffices, as it is cheaper and less noisy."""
+        """Pick the mixture on the relay wall; one technique alone where it suffices: cheaper and less noisy."""
         options, built = self.options, self.built
         if options.hidden_fraction is not None:
             return options.hidden_fraction
@@ -280,7 +284,7 @@ class _Schedule:
         return self.budget.target_error is not None and done >= self._next_look
 
     def record_error(self, done: int, error: float) -> None:
-        """Note the relative error after ``done`` samples and when to look next: it falls at least as 1 / sqrt(samples)."""
+        """Note the error after ``done`` samples and when to look next: it falls at least as 1 / sqrt(samples)."""
         self.errors.append((done, error))
         target = self.budget.target_error or error
         needed = done * (error / target) ** 2 if target > 0 else done

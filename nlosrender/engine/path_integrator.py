@@ -147,14 +147,30 @@ def trace_paths(
         on_wall = si.shape == wall
         density = mi.Float(bsdf_density)
         if dr.hint(q > 0, mode="scalar"):
-            cosine = dr.abs(dr.dot(si.n, ray.d))
+            # not along the ray: its offset origin matters where hidden geometry comes close to the wall
+            cosine = dr.abs(dr.dot(si.n, si.p - origin)) / distance
             jacobian = dr.select(sampler.covers(si, wall), distance2 / dr.maximum(cosine, 1e-9), 0)
             density += hidden_density * jacobian
         opl += medium * distance
 
         # ---- Laser spot found by chance --------------------------------------------------------------------------
         if dr.hint(settings.finds_spot, mode="scalar"):
-            _deposit_spot(settings, transport, histogram, lane, si, ray, hit & on_wall, is_delta, bounce, opl, throughput, value, density, distance2)
+            _deposit_spot(
+                settings,
+                transport,
+                histogram,
+                lane,
+                si,
+                ray,
+                hit & on_wall,
+                is_delta,
+                bounce,
+                opl,
+                throughput,
+                value,
+                density,
+                distance2,
+            )
 
         throughput = dr.select(hit, throughput * value / density, 0)
         bounce += 1
@@ -195,9 +211,10 @@ def trace_paths(
         seq_t = dr.select(start, seq_t + steps[2], seq_t)
         bits_u, bits_v, bits_t = mi.UInt32(seq_u), mi.UInt32(seq_v), mi.UInt32(seq_t)
         if dr.hint(settings.goes_on, mode="scalar"):
-            bits_u = dr.select(start, seq_u, generator.next_uint32())
-            bits_v = dr.select(start, seq_v, generator.next_uint32())
-            bits_t = dr.select(start, seq_t, generator.next_uint32())
+            # A lane draws only what its path uses: numbers drawn while it idles would depend on how launches are cut.
+            bits_u = dr.select(start, seq_u, generator.next_uint32(go_on))
+            bits_v = dr.select(start, seq_v, generator.next_uint32(go_on))
+            bits_t = dr.select(start, seq_t, generator.next_uint32(go_on))
         u, v, t = _unit_interval(bits_u), _unit_interval(bits_v), _unit_interval(bits_t)
         has_target = alive & on_wall & (t < q)
         by_bsdf = alive & ~has_target
@@ -208,7 +225,7 @@ def trace_paths(
         survival = mi.Float(1)
         if dr.hint(q < 1 or settings.goes_on, mode="scalar"):
             bsdf = vertex.bsdf()
-            lobe = generator.next_float32()
+            lobe = generator.next_float32(by_bsdf)
             bs, weight = bsdf.sample(context, vertex, lobe, mi.Point2f(u, v), by_bsdf)
             wo = bs.wo
             is_delta = by_bsdf & mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
@@ -244,7 +261,7 @@ def trace_paths(
         if dr.hint(settings.goes_on and settings.russian_roulette, mode="scalar"):
             # after the connections of this vertex, by the albedo just met; never before it could deposit
             survival = dr.select(start | (bounce < settings.first_bounce), 1, survival)
-            alive &= generator.next_float32() < survival
+            alive &= generator.next_float32(alive & ~start) < survival
             value /= dr.maximum(survival, 1e-9)
         alive &= dr.any(value != 0)
         world = vertex.to_world(wo)
@@ -276,7 +293,7 @@ def _connect_to_lasers(
     # one place in the spot for all lasers: what a path draws must not depend on how many lasers a batch has
     in_spot = mi.Vector3f(0)
     if dr.hint(settings.finds_spot, mode="scalar"):
-        in_spot = _on_disc(generator) * settings.spot_radius
+        in_spot = _on_disc(generator, active) * settings.spot_radius
     if dr.hint(transport.lasers_per_lane == 1, mode="scalar"):
         _connect(settings, transport, histogram, in_spot, lane, mi.UInt32(0), slot, si, active, opl, throughput)
     else:
@@ -305,6 +322,8 @@ def _connect(
     lit = points.interaction
     if settings.finds_spot:
         lit.p = lit.p + lit.to_world(in_spot)
+        # what a spot loses over the wall's edge lights nothing
+        active = active & built.wall_shape.ray_test(mi.Ray3f(lit.p + 1e-2 * lit.n, -lit.n), active=active)
     to_laser = lit.p - si.p
     distance2 = dr.squared_norm(to_laser)
     distance = dr.sqrt(distance2)
@@ -379,8 +398,9 @@ def _balance(own: mi.Float, other: mi.Float) -> mi.Float:
     return own / dr.maximum(own + other, 1e-30)
 
 
-def _on_disc(generator: mi.PCG32) -> mi.Vector3f:
-    point = mi.warp.square_to_uniform_disk_concentric(mi.Point2f(generator.next_float32(), generator.next_float32()))
+def _on_disc(generator: mi.PCG32, active: mi.Bool) -> mi.Vector3f:
+    square = mi.Point2f(generator.next_float32(active), generator.next_float32(active))
+    point = mi.warp.square_to_uniform_disk_concentric(square)
     return mi.Vector3f(point.x, point.y, 0)
 
 
@@ -406,14 +426,18 @@ def _plugin_class(variant: str) -> type:
     """Return the plugin's class for an active variant: Mitsuba's base classes differ between variants."""
 
     class NlosPathIntegrator(mi.SamplingIntegrator):
-        """``nlos_path``: keys ``max_bounces`` (-1: no limit), ``first_bounce``, ``split_bounces``, ``hidden_fraction``, ``laser_sampling``,
-        ``russian_roulette``, ``spot_radius`` [engine units], ``has_transmission``."""
+        """``nlos_path``: the fields of ``PathSettings`` as plugin parameters.
+
+        ``max_bounces`` is -1 for no limit; lengths are in engine units.
+        """
 
         def __init__(self, properties: mi.Properties):
             super().__init__(properties)
             max_bounces = int(properties.get("max_bounces", -1))
             self.settings = PathSettings(
-                bounces=BounceAxis(None if max_bounces < 0 else max_bounces, bool(properties.get("split_bounces", True))),
+                bounces=BounceAxis(
+                    None if max_bounces < 0 else max_bounces, bool(properties.get("split_bounces", True))
+                ),
                 first_bounce=int(properties.get("first_bounce", FIRST_BOUNCE + 1)),
                 hidden_fraction=float(properties.get("hidden_fraction", 1.0)),
                 laser_sampling=bool(properties.get("laser_sampling", True)),
@@ -426,9 +450,7 @@ def _plugin_class(variant: str) -> type:
             self, transport: Transport, histogram: DeviceHistogram, randomness: LaneRandomness, n_samples: int
         ) -> LaneRandomness:
             """Trace ``n_samples`` more paths per lane into ``histogram``; return the advanced random state."""
-            advanced = trace_paths(
-                self.settings, transport, histogram, randomness, dr.opaque(mi.UInt32, n_samples)
-            )
+            advanced = trace_paths(self.settings, transport, histogram, randomness, dr.opaque(mi.UInt32, n_samples))
             dr.eval(histogram.sums, advanced.generator, advanced.sequence)
             return advanced
 

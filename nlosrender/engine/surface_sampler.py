@@ -58,7 +58,9 @@ class SurfaceSampler:
             self.dark_behind &= _is_one_sided(shape) and not (shape.is_mesh() and shape.has_vertex_normals())
             if shape.is_mesh():
                 triangles = _triangles(shape)
-                kept = np.flatnonzero(_visible_from(wall_corners, triangles, _is_one_sided(shape), built.wall.is_planar))
+                kept = np.flatnonzero(
+                    _visible_from(wall_corners, triangles, _is_one_sided(shape), built.wall.is_planar)
+                )
                 corners.append(triangles[kept])
                 owners.append(np.full(len(kept), index, np.uint32))
                 primitives.append(kept.astype(np.uint32))
@@ -67,9 +69,12 @@ class SurfaceSampler:
             else:
                 self.covers_everything = False
         triangles = np.concatenate(corners) if corners else np.zeros((0, 3, 3))
-        areas = np.linalg.norm(np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]), axis=-1) / 2
+        areas = (
+            np.linalg.norm(np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]), axis=-1) / 2
+        )
         self.n_triangles = len(triangles)
         self.has_analytic = bool(analytic)
+        self._analytic = [shapes[index] for index, _ in analytic]
         owner = np.concatenate([*owners, np.array([index for index, _ in analytic], np.uint32)]).astype(np.uint32)
         areas = np.concatenate([areas, [area for _, area in analytic]])
         self.area = float(areas.sum())  # engine units squared
@@ -104,7 +109,9 @@ class SurfaceSampler:
         )
         low = dr.gather(mi.UInt32, self._edges, entry, active)
         high = dr.gather(mi.UInt32, self._edges, entry + 1, active)
-        u = dr.minimum((mi.Float(bits - low) + 0.5) / dr.maximum(mi.Float(high - low), 1.0), dr.one_minus_epsilon(mi.Float))
+        u = dr.minimum(
+            (mi.Float(bits - low) + 0.5) / dr.maximum(mi.Float(high - low), 1.0), dr.one_minus_epsilon(mi.Float)
+        )
         shape = dr.gather(mi.ShapePtr, self._shapes, dr.gather(mi.UInt32, self._owner, entry, active), active)
         is_triangle = entry < self.n_triangles
         point, normal, primitive = mi.Point3f(0), mi.Normal3f(0), mi.UInt32(ANALYTIC)
@@ -117,9 +124,8 @@ class SurfaceSampler:
             primitive = dr.select(on_triangle, dr.gather(mi.UInt32, self._primitive, entry, on_triangle), ANALYTIC)
         if self.has_analytic:
             on_analytic = active & ~is_triangle
-            analytic = shape.sample_position(mi.Float(0), mi.Point2f(u, v), on_analytic)
-            point = dr.select(on_analytic, analytic.p, point)
-            normal = dr.select(on_analytic, analytic.n, normal)
+            at, facing = self._on_analytic(shape, entry, mi.Point2f(u, v), on_analytic)
+            point, normal = dr.select(on_analytic, at, point), dr.select(on_analytic, facing, normal)
         return SurfaceSample(point, shape, normal, primitive)
 
     def reached(
@@ -144,6 +150,22 @@ class SurfaceSampler:
         for name in ("Mesh", *SAMPLEABLE_PLUGINS):
             sampled |= si.shape.shape_type() == int(getattr(mi.ShapeType, name))
         return hidden & sampled
+
+    def _on_analytic(
+        self, shape: mi.ShapePtr, entry: mi.UInt32, uv: mi.Point2f, active: mi.Bool
+    ) -> tuple[mi.Point3f, mi.Normal3f]:
+        """Return points uniform by area on analytic shapes, and the normals there."""
+        if self.covers_everything:
+            sample = shape.sample_position(mi.Float(0), uv, active)
+            return sample.p, sample.n
+        # One by one: a call through the pointer is compiled for every shape of the scene, and kinds that cannot be
+        # sampled have no sample_position.
+        point, normal = mi.Point3f(0), mi.Normal3f(0)
+        for index, own in enumerate(self._analytic):
+            chosen = active & (entry == self.n_triangles + index)
+            sample = own.sample_position(mi.Float(0), uv, chosen)
+            point, normal = dr.select(chosen, sample.p, point), dr.select(chosen, sample.n, normal)
+        return point, normal
 
     def _corner(self, k: int, entry: mi.UInt32, active: mi.Bool) -> mi.Point3f:
         return mi.Point3f(*(dr.gather(mi.Float, self._corners[3 * k + j], entry, active) for j in range(3)))
@@ -173,3 +195,13 @@ def _visible_from(
     # A plane has the whole box behind it when it has every corner of the box behind it.
     height = np.einsum("ckj,kj->ck", wall_corners[:, None, :] - triangles[None, :, 0, :], normals)
     return visible & (height.max(axis=0) > 0)
+
+
+def visible_triangles(built: BuiltScene, mesh: mi.Mesh) -> Float64:
+    """Return the corners (n, 3, 3) of a mesh's triangles that the wall may see from a reflecting side [engine units].
+
+    Occlusion by other surfaces is not looked at.
+    """
+    triangles = _triangles(mesh)
+    corners = wall_box(built.wall) / built.unit
+    return triangles[_visible_from(corners, triangles, _is_one_sided(mesh), built.wall.is_planar)]

@@ -18,9 +18,11 @@ from nlosrender.errors import ConfigError, Problem
 from nlosrender.scene.hidden_geometry import Bounds, MeshFile, ShapeDescription, Surface, box_corners, joined_bounds
 from nlosrender.scene.pose import Float64
 from nlosrender.scene.relay_wall import RelayWall
+from nlosrender.scene.transforms import transform_matrix
 from nlosrender.scene.triangle_mesh import TriangleMesh
 
 WALL_ID = "relay_wall"
+TRANSFORMS = ("to_world", "to_uv")  # keys of a plugin that hold a matrix or a list of steps
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,7 +87,10 @@ def mitsuba_value(value: object) -> object:
     if isinstance(value, Mapping):
         if value.get("type") == "rgb":
             return {"type": "rgb", "value": [float(channel) for channel in value["value"]]}
-        return {key: mitsuba_value(item) for key, item in value.items()}
+        return {
+            key: mi.ScalarTransform4f(transform_matrix(item)) if key in TRANSFORMS else mitsuba_value(item)
+            for key, item in value.items()
+        }
     if isinstance(value, (tuple, list)):
         if len(value) == 3 and all(isinstance(item, (int, float)) for item in value):
             return {"type": "rgb", "value": [float(item) for item in value]}
@@ -175,7 +180,9 @@ def _shape_bounds(shape: mi.Shape, unit: float) -> Bounds | None:
     box = shape.bbox()
     if not box.valid():
         return None
-    return np.ravel(np.asarray(box.min, dtype=np.float64)) * unit, np.ravel(np.asarray(box.max, dtype=np.float64)) * unit
+    return np.ravel(np.asarray(box.min, dtype=np.float64)) * unit, np.ravel(
+        np.asarray(box.max, dtype=np.float64)
+    ) * unit
 
 
 def _unit_length(wall: RelayWall, hidden: Bounds | None) -> float:

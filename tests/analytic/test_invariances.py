@@ -7,6 +7,7 @@ one sign, each sum off by at most 1e4 * 1.1e-16 = 1e-12.
 from __future__ import annotations
 
 import copy
+import sys
 
 import numpy as np
 import pytest
@@ -63,6 +64,21 @@ def test_cutting_a_capture_into_batches_changes_no_bit(scan: str, spot: float) -
         assert_same(whole, cut)
 
 
+@pytest.mark.parametrize("spot", [0.0, 0.05])
+@pytest.mark.parametrize(("max_bounces", "hidden_fraction"), [(3, 1.0), (4, 0.0), (4, 0.5), (4, 1.0)])
+def test_cutting_a_render_into_launches_changes_no_bit(
+    max_bounces: int, hidden_fraction: float, spot: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The random state is carried on: how fast a machine is, and so how long its launches are, does not matter."""
+    config = interreflections(max_bounces=max_bounces, capture={"laser_spot_radius": spot})
+    usual = render(config, hidden_fraction=hidden_fraction)
+    # loaded by the render above, once the backend had been started
+    path_engine = sys.modules["nlosrender.engine.path_engine"]
+    monkeypatch.setattr(path_engine, "FIRST_SAMPLES", 3)
+    monkeypatch.setattr(path_engine, "LAUNCH_SECONDS", 1e-9)  # one sample per lane and launch
+    assert_same(usual, render(config, hidden_fraction=hidden_fraction))
+
+
 def test_bounces_sum_to_the_unsplit_total() -> None:
     """Splitting by bounce only sorts the same deposits."""
     split, unsplit = (render(interreflections(split_bounces=flag)) for flag in (True, False))
@@ -76,7 +92,7 @@ def test_max_bounces_leaves_the_lower_bounces_alone() -> None:
     third, fifth = (render(interreflections(max_bounces=k, spp=32768), replicas=16) for k in (3, 5))
     energies = [r.bounce(3).sum() for r in (third, fifth)]
     sigma = np.sqrt(sum(r.bounce_variance(3).sum() for r in (third, fifth)))
-    assert abs(energies[0] - energies[1]) < 5 * sigma < 0.02 * energies[0]
+    assert abs(energies[0] - energies[1]) < 5 * sigma < 0.03 * energies[0]
 
 
 def test_pairs_of_bins_sum_to_bins_of_twice_the_width() -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+
 import numpy as np
 import pytest
 from agreement import assert_agrees
@@ -38,6 +40,15 @@ LASER = np.array([[[0.3, -0.2, 0.0]]])
 SENSORS = grid_points(5, 3, 2.0, 1.6)
 
 
+@functools.cache
+def white_plate(scan: str) -> np.ndarray:
+    """Quadrature of the plate with all albedos 1 and 1 J; exhaustive: 2 x 1 lasers."""
+    setup = Setup(CELLS, EDGES)
+    if scan == "confocal":
+        return confocal_third_bounces(setup, SENSORS)
+    return third_bounces(setup, LASER if scan == "single" else grid_points(2, 1, 1.5, 1.2), SENSORS)
+
+
 @pytest.mark.parametrize("hidden_geometry_sampling", [True, False])
 @pytest.mark.parametrize("scan", ["single", "confocal", "exhaustive"])
 def test_every_bin_is_that_of_quadrature(scan: str, hidden_geometry_sampling: bool) -> None:
@@ -45,6 +56,7 @@ def test_every_bin_is_that_of_quadrature(scan: str, hidden_geometry_sampling: bo
     config = flat_wall(
         PLATE,
         scan=scan,
+        lasers=(2, 1),
         wall={"bsdf": {"type": "diffuse", "reflectance": 0.9}},
         capture={"laser_energy": 3.0},
         bins=BINS,
@@ -52,11 +64,7 @@ def test_every_bin_is_that_of_quadrature(scan: str, hidden_geometry_sampling: bo
         hidden_geometry_sampling=hidden_geometry_sampling,
     )
     result = render(config, replicas=REPLICAS)
-    setup = Setup(CELLS, EDGES, rho=0.7, rho_wall=0.9, energy=3.0)
-    if scan == "confocal":
-        reference = confocal_third_bounces(setup, SENSORS)
-    else:
-        reference = third_bounces(setup, LASER if scan == "single" else grid_points(2, 3, 1.5, 1.2), SENSORS)
+    reference = 3.0 * 0.9**2 * 0.7 * white_plate(scan)
     assert_agrees(result.total, result.total_variance, reference, replicas=REPLICAS, floor=QUADRATURE)
 
 
@@ -79,7 +87,9 @@ def test_fractional_legs_shift_by_their_exact_length() -> None:
     rows = []
     for sensor in SENSORS.reshape(-1, 3):
         leg = float(np.linalg.norm(sensor - sensor_position))
-        rows.append(third_bounce(Setup(CELLS, edges, rho=0.7, laser_leg=laser_leg, sensor_leg=leg), LASER[0, 0], sensor))
+        rows.append(
+            third_bounce(Setup(CELLS, edges, rho=0.7, laser_leg=laser_leg, sensor_leg=leg), LASER[0, 0], sensor)
+        )
     reference = np.array(rows).reshape(result.total.shape)
     assert_agrees(result.total, result.total_variance, reference, replicas=REPLICAS, floor=QUADRATURE)
 
@@ -124,13 +134,11 @@ def test_an_occluder_removes_what_visibility_says(hidden_geometry_sampling: bool
     """A black rectangle before the plate hides it from laser and sensor as computed by intersecting segments."""
     occluder = {"center": [0.1, -0.05, 0.35], "normal": [0.1, 0.2, -1.0], "width": 0.25, "height": 0.2}
     black = {"type": "rectangle", **occluder, "bsdf": {"type": "diffuse", "reflectance": 0.0}}
-    config = flat_wall(
-        black, PLATE, bins=BINS, spp=65536, hidden_geometry_sampling=hidden_geometry_sampling
-    )
+    config = flat_wall(black, PLATE, bins=BINS, spp=65536, hidden_geometry_sampling=hidden_geometry_sampling)
     result = render(config, replicas=REPLICAS)
     hidden = clear_of_rectangle(**occluder)
     with_occluder = third_bounces(Setup(CELLS, EDGES, rho=0.7, visible=hidden), LASER, SENSORS)
-    without = third_bounces(Setup(CELLS, EDGES, rho=0.7), LASER, SENSORS)
+    without = 0.7 * white_plate("single")
     assert with_occluder.sum() < 0.85 * without.sum()  # the occluder matters
     assert_agrees(result.total, result.total_variance, with_occluder, replicas=REPLICAS, floor=QUADRATURE)
 
@@ -158,3 +166,36 @@ def test_a_laser_spot_is_the_average_over_its_disc(laser_sampling: bool) -> None
     reference = third_bounces(setup, spot, sensors).mean(axis=(0, 1), keepdims=True)
     # 192 discs points, shifted against the cells, average the cells' binning error away
     assert_agrees(result.total, result.total_variance, reference, replicas=REPLICAS, floor=QUADRATURE)
+
+
+def test_a_plate_close_to_the_wall_is_that_of_quadrature() -> None:
+    """1 cm from a 2 m wall: rays that start 1e-5 above the surface must not change the cosines of grazing paths."""
+    near = {"width": 0.5, "height": 0.5, "center": [0.0, 0.0, 0.01], "normal": [0.0, 0.0, -1.0]}
+    config = flat_wall({"type": "rectangle", **near}, sensors=(3, 2), bins=(0.0, 10.0, 1), spp=2**20)
+    result = render(config, replicas=REPLICAS, hidden_fraction=1.0)
+    cells = rectangle_cells(0.5, 0.5, near["center"], near["normal"], n=1000)  # 0.5 mm: (0.05)^2 / 24 of the integrand
+    reference = third_bounces(Setup(cells, np.array([0.0, 10.0])), LASER, grid_points(3, 2, 2.0, 1.6))
+    assert_agrees(result.total, result.total_variance, reference, replicas=REPLICAS, floor=1e-4)
+    assert np.sqrt(result.variance.sum()) < 3e-3 * reference.sum()
+
+
+@pytest.mark.parametrize("laser_sampling", [True, False])
+def test_what_a_spot_loses_over_the_wall_s_edge_is_lost(laser_sampling: bool) -> None:
+    """A spot half on the wall lights it with half its energy, whichever way it is found."""
+    plate = PLATE | {"center": [0.7, 0.0, 0.5], "normal": [0.0, 0.0, -1.0]}
+    radius, laser = 0.1, np.array([1.0, 0.1, 0.0])
+    config = flat_wall(
+        plate,
+        sensors=(3, 2),
+        bins=(0.0, 10.0, 1),
+        capture={"laser_spot_radius": radius, "laser_point": laser[:2].tolist()},
+        laser_sampling=laser_sampling,
+        spp=262144,
+    )
+    result = render(config, replicas=REPLICAS)
+    cells = rectangle_cells(0.8, 0.6, plate["center"], plate["normal"], n=100)
+    r, angle = np.meshgrid(radius * np.sqrt(midpoints(12)), np.pi * (0.5 + midpoints(16)))  # the half with x < 1
+    spot = laser + np.stack([r * np.cos(angle), r * np.sin(angle), 0 * r], axis=-1)
+    setup = Setup(cells, np.array([0.0, 10.0]), rho=0.7, energy=0.5)
+    reference = third_bounces(setup, spot, grid_points(3, 2, 2.0, 1.6)).mean(axis=(0, 1), keepdims=True)
+    assert_agrees(result.total, result.total_variance, reference, replicas=REPLICAS, floor=1e-3)

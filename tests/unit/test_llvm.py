@@ -37,7 +37,9 @@ def test_the_version_of_a_link_is_that_of_its_target(tmp_path):
     assert llvm.major_version(link) == 19
 
 
-@pytest.mark.parametrize(("name", "reason"), [("libLLVM-15.so.1", "LLVM 15"), ("missing/libLLVM-19.so", "no such file")])
+@pytest.mark.parametrize(
+    ("name", "reason"), [("libLLVM-15.so.1", "LLVM 15"), ("missing/libLLVM-19.so", "no such file")]
+)
 def test_a_named_library_that_cannot_be_used_is_the_only_candidate(name, reason, tmp_path, monkeypatch):
     """The user's choice is not silently replaced by another library."""
     (tmp_path / "libLLVM-15.so.1").write_bytes(b"")
@@ -55,7 +57,7 @@ def test_a_library_of_unknown_version_is_tried_in_a_process_of_its_own(tmp_path,
     monkeypatch.setenv(llvm.ENVIRONMENT_VARIABLE, str(broken))
     (candidate,) = llvm.find_libraries()
     assert not candidate.usable
-    assert "trial kernel failed" in candidate.verdict
+    assert "trial render failed" in candidate.verdict
 
 
 @pytest.mark.parametrize("command", [["doctor"], ["render", "configs/smoke.yaml", "-o", "never.hdf5"]])
@@ -78,3 +80,15 @@ def test_a_memory_limit_below_the_program_itself_is_an_error():
     with pytest.raises(RenderError, match="memory_limit"):
         batch_memory(int(PROCESS_BYTES) - 1)
     assert batch_memory(int(PROCESS_BYTES) + 1000) == 1000
+
+
+def test_a_dr_jit_imported_too_early_is_an_error_not_a_crash():
+    """Once imported, Dr.Jit keeps the library it found by itself; an unproven one is not used."""
+    code = (
+        "import drjit\n"
+        "drjit.detail.llvm_version = lambda: (15, 0, 6)\n"  # as on a machine whose system library is LLVM 15
+        "from nlosrender.engine.backend import start_backend\n"
+        "start_backend('llvm')\n"
+    )
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert "BackendError: Dr.Jit was imported before its LLVM could be chosen" in run.stderr

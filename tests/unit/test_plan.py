@@ -16,9 +16,9 @@ WALL = RectangleWall(Pose.identity(), 2.0, 1.0)
 
 def capture(scan_type: str) -> Capture:
     sensors = point_grid(WALL, 5, 3)
-    lasers = {"single": single_point(WALL, (0, 0)), "confocal": sensors, "exhaustive": point_grid(WALL, 7, 2)}[scan_type]
+    lasers = {"single": single_point(WALL, (0, 0)), "confocal": sensors, "exhaustive": point_grid(WALL, 7, 2)}
     position = np.array([0.0, 0, 1])
-    return Capture(scan_type, sensors, lasers, position, position, True, 1.0, 0.0)
+    return Capture(scan_type, sensors, lasers[scan_type], position, position, True, 1.0, 0.0)
 
 
 @pytest.mark.parametrize(("ny", "nx", "most"), [(3, 5, 1), (3, 5, 4), (3, 5, 5), (3, 5, 11), (3, 5, 100), (1, 1, 1)])

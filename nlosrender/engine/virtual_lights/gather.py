@@ -47,6 +47,7 @@ class DevicePatches:
     corners: list[mi.Point3f]  # three, one lane per patch
     interaction: mi.SurfaceInteraction3f  # at the centres
     area: mi.Float
+    lift: mi.Vector3f  # from the plane of the corners to the surface
     reflectance: mi.Spectrum  # of Lambertian patches
     count: mi.UInt32  # opaque
 
@@ -78,8 +79,9 @@ def upload_patches(built: BuiltScene, patches: Patches) -> DevicePatches:
     reflectance = interaction.bsdf().eval(mi.BSDFContext(), interaction, up) * dr.pi
     corners = [_points(patches.corners[:, k]) for k in range(3)]
     area = mi.Float(patches.areas.astype(np.float32))
-    dr.eval(interaction, reflectance, corners, area)
-    return DevicePatches(corners, interaction, area, reflectance, dr.opaque(mi.UInt32, len(patches)))
+    lift = mi.Vector3f(_points(patches.normals * patches.lifts[:, None]))
+    dr.eval(interaction, reflectance, corners, area, lift)
+    return DevicePatches(corners, interaction, area, lift, reflectance, dr.opaque(mi.UInt32, len(patches)))
 
 
 def illuminate(transport: Transport, patches: DevicePatches, n_lasers: int) -> Illumination:
@@ -97,13 +99,16 @@ def illuminate(transport: Transport, patches: DevicePatches, n_lasers: int) -> I
     direction = to_patch * dr.rsqrt(distance2)
     arriving = built.wall_bsdf.eval(mi.BSDFContext(), lit, lit.to_local(direction)) / distance2
     shading = dr.gather(mi.Normal3f, patches.interaction.sh_frame.n, patch)
-    two_sided = mi.has_flag(dr.gather(mi.SurfaceInteraction3f, patches.interaction, patch).bsdf().flags(), mi.BSDFFlags.BackSide)
+    two_sided = mi.has_flag(
+        dr.gather(mi.SurfaceInteraction3f, patches.interaction, patch).bsdf().flags(), mi.BSDFFlags.BackSide
+    )
     active = dr.any(arriving > 0) & ((dr.dot(shading, direction) < 0) | two_sided)
+    lift = dr.gather(mi.Vector3f, patches.lift, patch)
     seen = mi.Float(0)
     steps = recurrence_steps(2)
     for k in range(LASER_RAYS):
         u, v = _fraction(index * 7 + k, steps[0]), _fraction(index * 7 + k, steps[1])
-        seen += dr.select(_is_visible(built, lit, _inside(corners, u, v), active), 1.0 / LASER_RAYS, 0)
+        seen += dr.select(_is_visible(built, lit, _inside(corners, u, v) + lift, active), 1.0 / LASER_RAYS, 0)
     arriving = dr.select(active, arriving * seen, 0)
     delays = [dr.norm(corner - lit.p) * transport.bins_per_unit for corner in corners]
     dr.eval(arriving, delays)
@@ -147,7 +152,7 @@ def gather_third_bounce(
         patch < count,
         exclude=[settings, transport, patches, illumination, histogram, built, sensors, sensor, wall_bsdf, own_laser],
     ):
-        # ---- The patch as the sensor point sees it ------------------------------------------------------------------
+        # ---- The patch as the sensor point sees it -----------------------------------------------------------------
         si = dr.gather(mi.SurfaceInteraction3f, patches.interaction, patch)
         a, b, c = (dr.gather(mi.Point3f, patches.corners[k], patch) for k in range(3))
         to_patch = si.p - sensor.p
@@ -161,26 +166,37 @@ def gather_third_bounce(
             active &= dr.dot(si.sh_frame.n, direction) < 0
             weight *= dr.gather(mi.Spectrum, patches.reflectance, patch) * dr.inv_pi
 
-        # ---- Visibility ---------------------------------------------------------------------------------------------
+        # ---- Visibility --------------------------------------------------------------------------------------------
         if dr.hint(settings.needs_visibility, mode="scalar"):
             seq_u += steps[0]
             seq_v += steps[1]
             point = _inside([a, b, c], mi.Float(seq_u >> 8) * 2.0**-24, mi.Float(seq_v >> 8) * 2.0**-24)
+            point += dr.gather(mi.Vector3f, patches.lift, patch)
             active = _is_visible(built, sensor, point, active)
 
-        # ---- Delays at the corners ------------------------------------------------------------------------------------
+        # ---- Delays at the corners ---------------------------------------------------------------------------------
         scale = transport.bins_per_unit
         t0, t1, t2 = (dr.norm(corner - sensor.p) * scale + sensors.delay_fraction for corner in (a, b, c))
         wi = si.to_local(-direction)
 
-        # ---- Reflect towards the lasers and deposit ---------------------------------------------------------------------
+        # ---- Reflect towards the lasers and deposit ----------------------------------------------------------------
         if dr.hint(settings.is_confocal, mode="scalar"):
             fraction = own_laser.delay_fraction - sensors.delay_fraction
             lit = own_laser.interaction
             value = weight * wall_bsdf.eval(context, lit, lit.to_local(direction)) / distance2
             value *= _reflected(settings, si, wi, wi, active)
             whole = own_laser.delay_bins + sensors.delay_bins
-            _spread(histogram, lane, mi.UInt32(0), 2 * t0 + fraction, 2 * t1 + fraction, 2 * t2 + fraction, whole, value, active)
+            _spread(
+                histogram,
+                lane,
+                mi.UInt32(0),
+                2 * t0 + fraction,
+                2 * t1 + fraction,
+                2 * t2 + fraction,
+                whole,
+                value,
+                active,
+            )
         else:
             laser = mi.UInt32(0)
             while dr.hint(
@@ -193,7 +209,9 @@ def gather_third_bounce(
                 value = weight * dr.gather(mi.Spectrum, illumination.arriving, entry)
                 lit_here = active & dr.any(value > 0)
                 value *= _reflected(settings, si, wi, si.to_local(to_laser), lit_here)
-                d0, d1, d2 = (dr.gather(mi.Float, illumination.delays[k], entry) + points.delay_fraction for k in range(3))
+                d0, d1, d2 = (
+                    dr.gather(mi.Float, illumination.delays[k], entry) + points.delay_fraction for k in range(3)
+                )
                 whole = points.delay_bins + sensors.delay_bins
                 _spread(histogram, lane, laser, t0 + d0, t1 + d1, t2 + d2, whole, value, lit_here & dr.any(value > 0))
                 laser += 1
@@ -246,9 +264,7 @@ def _reflected(
     return si.bsdf().eval(mi.BSDFContext(), si, wo, active)
 
 
-def _is_visible(
-    built: BuiltScene, wall_point: mi.SurfaceInteraction3f, target: mi.Point3f, active: mi.Bool
-) -> mi.Bool:
+def _is_visible(built: BuiltScene, wall_point: mi.SurfaceInteraction3f, target: mi.Point3f, active: mi.Bool) -> mi.Bool:
     """Return whether nothing lies between a point of the wall and a point of a patch."""
     origin = wall_point.p + wall_point.n * RAY_OFFSET
     direction = target - origin

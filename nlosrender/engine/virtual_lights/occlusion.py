@@ -5,7 +5,7 @@ from __future__ import annotations
 import mitsuba as mi
 import numpy as np
 
-from nlosrender.scene.build import BuiltScene
+from nlosrender.scene.build import BuiltScene, wall_box
 
 MOST_FACES = 4000  # beyond it the test itself, faces times vertices, costs more than the rays it saves
 PLANARITY = 1e-6  # engine units: float32 vertices of a plane of size 1 are good to 1e-7
@@ -14,8 +14,9 @@ PLANARITY = 1e-6  # engine units: float32 vertices of a plane of size 1 are good
 def nothing_occludes(built: BuiltScene) -> bool:
     """Return whether no surface can hide a front-facing point of the hidden geometry from a planar wall.
 
-    That holds for one object alone in front of a planar wall: a sphere seen from outside, or a mesh whose vertices
-    all lie behind (or in) the plane of each of its faces: a flat sheet, a box, any convex solid.
+    That holds for one object alone in front of a planar wall: a sphere seen from outside; a mesh whose vertices all
+    lie behind (or in) the plane of each of its faces: a flat sheet, a box, any convex solid; and a mesh whose vertices
+    and whose wall all lie in front of each face: a convex room around the wall.
     """
     if not built.wall.is_planar or len(built.hidden_shapes) != 1:
         return False
@@ -31,5 +32,9 @@ def nothing_occludes(built: BuiltScene) -> bool:
     lengths = np.linalg.norm(normals, axis=1, keepdims=True)
     real = lengths[:, 0] > 0
     normals = normals[real] / lengths[real]
-    heights = vertices @ normals.T - np.einsum("ij,ij->i", corners[real, 0], normals)
-    return bool(heights.max(initial=0.0) <= PLANARITY)
+    offsets = np.einsum("ij,ij->i", corners[real, 0], normals)
+    heights = vertices @ normals.T - offsets
+    of_wall = wall_box(built.wall) / built.unit @ normals.T - offsets
+    is_convex = heights.max(initial=0.0) <= PLANARITY
+    is_room = min(heights.min(initial=0.0), of_wall.min(initial=0.0)) >= -PLANARITY
+    return bool(is_convex or is_room)

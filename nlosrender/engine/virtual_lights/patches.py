@@ -33,6 +33,7 @@ class Patches:
     shapes: NDArray[np.uint32]  # (n,) index into the scene's shapes
     primitives: NDArray[np.uint32]  # (n,) triangle of a mesh, 0 on analytic shapes
     barycentric: Float64  # (n, 2) the centre within that triangle
+    lifts: Float64  # (n,) height of the surface over the plane of the corners: where shadow rays may end
 
     def __len__(self) -> int:
         return len(self.areas)
@@ -40,7 +41,7 @@ class Patches:
     @classmethod
     def joined(cls, parts: list[Patches]) -> Patches:
         """Return the patches of all parts."""
-        names = ("corners", "areas", "centres", "normals", "shapes", "primitives", "barycentric")
+        names = ("corners", "areas", "centres", "normals", "shapes", "primitives", "barycentric", "lifts")
         return cls(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
 
 
@@ -115,6 +116,7 @@ class Tessellator:
                     np.full(len(repeated), index, np.uint32),
                     repeated.astype(np.uint32),
                     centre[:, 1:],
+                    np.zeros(len(repeated)),
                 )
             )
         return Patches.joined(parts) if parts else _no_patches()
@@ -146,6 +148,8 @@ class Tessellator:
             np.full(count, index, np.uint32),
             np.zeros(count, np.uint32),
             np.zeros((count, 2)),
+            # seen from within, a plane through points of the sphere lies in front of it already
+            np.maximum(np.sign(sphere[3]), 0) * radius * (1 - np.linalg.norm(unit.mean(axis=1), axis=1)),
         )
 
 
@@ -159,7 +163,7 @@ def can_tessellate(built: BuiltScene) -> bool:
 def _no_patches() -> Patches:
     none = np.zeros((0, 3))
     index = np.zeros(0, np.uint32)
-    return Patches(np.zeros((0, 3, 3)), np.zeros(0), none, none, index, index, np.zeros((0, 2)))
+    return Patches(np.zeros((0, 3, 3)), np.zeros(0), none, none, index, index, np.zeros((0, 2)), np.zeros(0))
 
 
 def _sphere_of(shape: mi.Shape) -> Float64:
@@ -185,9 +189,7 @@ def _split_weights(n: int) -> Float64:
 def _icosahedron() -> Float64:
     """Return the 20 faces (20, 3, 3) of the icosahedron in the unit sphere, counter-clockwise from outside."""
     golden = (1 + 5**0.5) / 2
-    vertices = np.array(
-        [(s * a, t * golden * b, 0) for a, b in ((1, 1),) for s in (-1, 1) for t in (-1, 1)]
-    )
+    vertices = np.array([(s * a, t * golden * b, 0) for a, b in ((1, 1),) for s in (-1, 1) for t in (-1, 1)])
     vertices = np.concatenate([vertices, np.roll(vertices, 1, axis=1), np.roll(vertices, 2, axis=1)])
     vertices /= np.linalg.norm(vertices, axis=1, keepdims=True)
     edge = 2 / np.sqrt(1 + golden**2)

@@ -1,0 +1,73 @@
+"""Captures that no machine could hold, refused by arithmetic alone: before anything is allocated for them."""
+
+from __future__ import annotations
+
+from nlosrender.capture.plan import BYTES_OF_STATISTICS, BYTES_PER_SUM
+from nlosrender.config.capture import CaptureConfig
+from nlosrender.errors import RenderError
+
+POINT_BYTES = 640  # per grid point: positions, normals, coordinates, distances to the corners of a box, copies
+MAX_SAMPLES = 2**40  # 4 TiB of float32 per bounce
+MAX_BATCHES = 1_000_000
+INT32_MAX = 2**31 - 1  # the file holds the number of bins as a 32-bit integer
+
+
+def refuse_impossible_grids(capture_config: CaptureConfig, memory_limit: int) -> None:
+    """Refuse grids whose points alone do not fit the memory.
+
+    Parameters
+    ----------
+    capture_config
+        ``capture``.
+    memory_limit
+        Bytes the render may take.
+
+    Raises
+    ------
+    RenderError
+        They do not fit.
+    """
+    grids = {"sensor_grid": capture_config.sensor_grid, "laser_grid": capture_config.laser_grid}
+    for key, grid in grids.items():
+        if grid is not None and grid.n_points * POINT_BYTES > memory_limit:
+            raise RenderError(
+                f"capture.{key}: {grid.nx} x {grid.ny} points take {grid.n_points * POINT_BYTES / 1e9:.3g} GB for "
+                f"their positions alone, but render.memory_limit leaves {memory_limit / 1e9:.3g} GB. Use fewer points."
+            )
+
+
+def refuse_impossible_samples(
+    capture_config: CaptureConfig, *, rows_per_pair: int, n_bins: int, memory_limit: int
+) -> None:
+    """Refuse a capture with more samples or batches than can be dealt with; ``n_bins: auto`` is resolved by now.
+
+    Parameters
+    ----------
+    capture_config
+        ``capture``.
+    rows_per_pair
+        Histogram rows per (sensor, laser): bounce slots times channels.
+    n_bins
+        Bins per row.
+    memory_limit
+        Bytes a batch may take.
+
+    Raises
+    ------
+    RenderError
+        The capture is too large; the message says what to change.
+    """
+    pairs = capture_config.sensor_grid.n_points * capture_config.n_lasers
+    if n_bins > INT32_MAX:
+        raise RenderError(f"time_axis.n_bins: got {n_bins}, need at most {INT32_MAX}. Use wider bins or a later start.")
+    if pairs * n_bins > MAX_SAMPLES:
+        raise RenderError(
+            f"{pairs:_} pairs of laser and sensor points with {n_bins:_} bins each are more than 2**40 samples. "
+            "Use fewer points or bins."
+        )
+    smallest = pairs * rows_per_pair * (n_bins + 1) * (2 * BYTES_PER_SUM + BYTES_OF_STATISTICS)
+    if smallest > MAX_BATCHES * memory_limit:
+        raise RenderError(
+            f"the capture takes {smallest / 1e12:.3g} TB in all, more than {MAX_BATCHES:_} batches of the "
+            f"{memory_limit / 1e6:.0f} MB that render.memory_limit leaves. Raise it, or use fewer points or bins."
+        )

@@ -1,0 +1,88 @@
+"""``nlosrender plan``: what a render would do, skip, cost and write, without doing it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+if TYPE_CHECKING:
+    from nlosrender.analysis.forecast import Forecast
+
+
+def register(app: typer.Typer) -> None:
+    """Add ``plan`` to ``app``."""
+    app.command(
+        "plan",
+        epilog="Example: nlosrender plan configs/z-letter.yaml --set render.target_error=0.001   "
+        "(writes nothing; prints the engine and why, what is skipped, memory, file size and an estimate of the time)",
+    )(plan)
+
+
+def plan(
+    config: Annotated[Path, typer.Argument(help="The YAML file that describes the capture.")],
+    overrides: Annotated[
+        list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Override one key; may be repeated.")
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the plan as one JSON object.")] = False,
+) -> None:
+    """Say what a render will do, what it skips and why, and what it costs; a short pilot measures the speed."""
+    from nlosrender.config.load import load_config
+    from nlosrender.config.places import with_places
+    from nlosrender.errors import ConfigError
+    from nlosrender.pipeline import forecast_capture
+
+    changes = list(overrides or [])
+    loaded = load_config(config, changes)
+    try:
+        forecast = forecast_capture(loaded)
+    except ConfigError as error:
+        raise with_places(error, config, changes) from error
+    if as_json:
+        import json
+
+        typer.echo(json.dumps(forecast.as_json(), allow_nan=False))
+        return
+    for line in _lines(forecast):
+        typer.echo(line)
+    for warning in forecast.warnings:
+        typer.echo(f"warning: {warning}", err=True)
+
+
+def _lines(forecast: Forecast) -> Iterator[str]:
+    yield f"engine   {forecast.engine}: {forecast.reason} ({forecast.variant})"
+    for item in forecast.skipped:
+        yield f"skipped  {item.what}: {item.why}"
+    yield f"scan     {_scan(forecast)}, {forecast.n_triangles} hidden triangles"
+    start, end = forecast.window_opl
+    yield f"time     {forecast.n_bins} bins of {forecast.bin_width_opl:g} m, from {start:.4g} to {end:.4g} m"
+    plural = "" if forecast.batches == 1 else "es"
+    yield f"memory   {forecast.batches} batch{plural} of up to {readable_size(forecast.bytes_per_batch)}"
+    size = forecast.file
+    yield (
+        f"file     {forecast.output}: {readable_size(size.logical_bytes)} for a reader, about "
+        f"{readable_size(size.disk_bytes_estimate)} on disk ({size.assumption})"
+    )
+    if forecast.seconds_estimate is None:
+        yield f"seconds  cannot be told ({forecast.estimate_basis})"
+    else:
+        yield f"seconds  about {forecast.seconds_estimate:.2g} ({forecast.estimate_basis})"
+
+
+def _scan(forecast: Forecast) -> str:
+    sensors = "{} x {} sensor points".format(*forecast.sensor_grid)
+    if forecast.scan_type != "exhaustive":
+        return f"{forecast.scan_type}, {sensors}"
+    return "exhaustive, {}, {} x {} laser points".format(sensors, *forecast.laser_grid)
+
+
+def readable_size(n_bytes: int) -> str:
+    """Return a number of bytes with three digits and a unit: "1.25 GB"."""
+    size = float(n_bytes)
+    for unit in ("B", "kB", "MB", "GB"):
+        if size < 999.5:
+            return f"{size:.3g} {unit}"
+        size /= 1000
+    return f"{size:.3g} TB"

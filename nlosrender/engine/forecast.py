@@ -1,0 +1,163 @@
+"""How long a render will take: a pilot of the engine on part of the capture, extrapolated.
+
+The path engine's error falls as 1 / sqrt(paths), the gather's as 1 / patches; cost is linear in both.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from dataclasses import dataclass, replace
+
+from nlosrender.capture.bounces import THIRD_BOUNCE, BounceAxis
+from nlosrender.capture.grids import Capture
+from nlosrender.capture.plan import Batch, Plan, Tile
+from nlosrender.engine.histogram import Histogram, relative_l2_error
+from nlosrender.engine.memory import n_pairs
+from nlosrender.engine.path_engine import FIRST_SAMPLES, Budget, PathEngine
+from nlosrender.engine.skipped import traces_paths
+from nlosrender.engine.virtual_lights.engine import DEFAULT_TARGET, VirtualLightEngine
+
+PILOT_SECONDS = 0.5
+PILOT_BYTES = 128e6  # of histograms: a forecast must not take the memory of the render
+LAUNCH_OVERHEAD = 0.05  # s per batch at most that does not grow with the batch
+SECOND_LOOK = 1.1  # the engines look at the error now and then only, and overshoot by so much
+
+
+@dataclass(frozen=True)
+class TimeEstimate:
+    """Seconds a render will take."""
+
+    seconds: float | None  # None: the pilot saw too little light to tell
+    basis: str  # what was measured and how it was extrapolated
+    lit_shares: tuple[float | None, ...] | None = None  # per bounce slot: bins with light in the pilot; None: no pilot
+
+
+def estimate_render_time(
+    engine: PathEngine | VirtualLightEngine, plan: Plan, budget: Budget, lanes: int
+) -> TimeEstimate:
+    """Run a pilot of about ``PILOT_SECONDS`` per technique and extrapolate it to the whole capture.
+
+    Parameters
+    ----------
+    engine
+        As set up for the capture.
+    plan
+        Its batches.
+    budget
+        When the render will stop.
+    lanes
+        Lanes that keep the backend busy.
+
+    Returns
+    -------
+    TimeEstimate
+        Rendering alone: no start, no compilation, no writing.
+    """
+    limit = budget.time_limit_s
+    if limit is not None and budget.spp is None and budget.target_error is None:
+        return TimeEstimate(limit, "render.time_limit_s")
+    pilot = pilot_batch(engine, plan)
+    seconds, known_squares, lit_shares = 0.0, 0.0, None
+    parts = []
+    paths = engine.paths if isinstance(engine, VirtualLightEngine) else engine
+    if isinstance(engine, VirtualLightEngine):
+        gather, third = _gather_seconds(engine, plan, pilot, budget)
+        known_squares = float((third.mean**2).sum()) / paths.scale**2
+        seconds += gather
+        parts.append("error ~ 1 / patches")
+    if traces_paths(engine):
+        traced, rays = _path_seconds(paths, plan, pilot, budget, lanes, known_squares)
+        lit_shares = _lit_shares(rays, engine.options.bounces)
+        parts.append("error ~ 1 / sqrt(paths)" if budget.spp is None else "time ~ paths")
+        seconds = math.inf if traced is None else seconds + traced
+    basis = f"pilot of {pilot.sensors.size} of {engine.capture.n_sensors} sensor points, {' and '.join(parts)}"
+    if limit is not None and seconds >= limit:
+        return TimeEstimate(limit, f"render.time_limit_s; {basis}", lit_shares)
+    if math.isinf(seconds):
+        return TimeEstimate(None, f"{basis}: nothing but noise so far", lit_shares)
+    return TimeEstimate(seconds, basis if parts else "nothing to compute", lit_shares)
+
+
+def pilot_batch(engine: PathEngine | VirtualLightEngine, plan: Plan) -> Batch:
+    """Return the middle of the plan's middle batch: as many sensor points as ``PILOT_BYTES`` hold, all its lasers."""
+    batch = plan.batches[len(plan.batches) // 2]
+    bytes_per_sensor = plan.bytes_per_batch / max(b.sensors.size for b in plan.batches)
+    sensors = _middle(batch.sensors, max(1, int(PILOT_BYTES / bytes_per_sensor)))
+    return Batch(sensors, sensors if engine.capture.scan_type == "confocal" else batch.lasers)
+
+
+def _middle(tile: Tile, most: int) -> Tile:
+    """Return a part of ``tile`` with at most ``most`` points, about its centre."""
+    rows, columns = tile.shape
+    columns = min(columns, max(1, most // rows, math.isqrt(most)))
+    rows = min(rows, max(1, most // columns))
+    y0, x0 = tile.y0 + (tile.shape[0] - rows) // 2, tile.x0 + (tile.shape[1] - columns) // 2
+    return Tile(y0, y0 + rows, x0, x0 + columns)
+
+
+def _path_seconds(
+    paths: PathEngine, plan: Plan, pilot: Batch, budget: Budget, lanes: int, known_squares: float
+) -> tuple[float | None, Histogram]:
+    """Return the seconds of path tracing, None when the pilot is nothing but noise, and what the pilot saw."""
+    paths.render(pilot, Budget(spp=1))  # compiles
+    first, overhead = _timed(paths, pilot, Budget(spp=1))
+    second, seconds = _timed(paths, pilot, Budget(time_limit_s=PILOT_SECONDS))
+    per_path = max(seconds - overhead, 1e-6) / max(second.samples - first.samples, 1) / pilot.sensors.size
+    if budget.spp is not None:
+        needed = float(math.ceil(budget.spp / plan.replicas) * plan.replicas)
+    else:
+        error = _error(second, known_squares * paths.scale**2)
+        if math.isinf(error):
+            return None, second
+        needed = second.samples * (error / (budget.target_error or DEFAULT_TARGET)) ** 2 * SECOND_LOOK
+        needed = max(needed, FIRST_SAMPLES * plan.replicas)
+    largest = max(batch.sensors.size for batch in plan.batches)
+    # a pilot of a few sensor points leaves processors idle that the render will use
+    idle = min(1.0, pilot.sensors.size / min(largest, lanes / plan.replicas))
+    points = sum(batch.sensors.size for batch in plan.batches)  # once more for every cut between lasers
+    growing = max(overhead - LAUNCH_OVERHEAD, 0.0) * _all_pairs(paths.capture, plan) / n_pairs(paths.capture, pilot)
+    fixed = min(overhead, LAUNCH_OVERHEAD) * len(plan.batches)
+    return needed * points * per_path * idle + growing + fixed, second
+
+
+def _lit_shares(pilot: Histogram, bounces: BounceAxis) -> tuple[float | None, ...] | None:
+    """Return the share of bins with light per bounce slot; the third bounce's is known better from geometry."""
+    if not bounces.split:
+        return None
+    shares = [float((pilot.mean[:, slot] > 0).mean()) for slot in range(bounces.n_slots)]
+    third = bounces.slot(THIRD_BOUNCE)
+    return tuple(None if slot == third else share for slot, share in enumerate(shares))
+
+
+def _gather_seconds(engine: VirtualLightEngine, plan: Plan, pilot: Batch, budget: Budget) -> tuple[float, Histogram]:
+    """Return the seconds of the gather, and the third bounce of the pilot's sensor points."""
+    third_only = replace(engine.options, bounces=BounceAxis(THIRD_BOUNCE, split=False))
+    gather = VirtualLightEngine(engine.built, engine.capture, engine.time_axis, third_only, engine.lanes)
+    goal = Budget(target_error=budget.target_error or DEFAULT_TARGET, time_limit_s=PILOT_SECONDS)
+    gather.render(pilot, goal)  # compiles, and finds how fine the patches have to be
+    part = _middle(pilot.sensors, max(1, pilot.sensors.size // 4))
+    quarter = Batch(part, part if engine.capture.scan_type == "confocal" else pilot.lasers)
+    _, quarter_seconds = _timed(gather, quarter, goal)
+    third, seconds = _timed(gather, pilot, goal)
+    # what every batch pays for its patches, and what every sensor point adds
+    more = pilot.sensors.size - part.size
+    per_point = max(seconds - quarter_seconds, 0.0) / more if more else seconds / pilot.sensors.size
+    per_batch = max(seconds - per_point * pilot.sensors.size, 0.0)
+    points = sum(batch.sensors.size for batch in plan.batches)
+    finer = max(1.0, _error(third) / (goal.target_error or DEFAULT_TARGET))
+    return (per_batch * len(plan.batches) + per_point * points) * finer, third
+
+
+def _timed(engine: PathEngine | VirtualLightEngine, batch: Batch, budget: Budget) -> tuple[Histogram, float]:
+    begun = time.perf_counter()
+    histogram = engine.render(batch, budget)
+    return histogram, time.perf_counter() - begun
+
+
+def _error(histogram: Histogram, known_squares: float = 0.0) -> float:
+    return relative_l2_error(float(histogram.variance.sum()), float((histogram.mean**2).sum()) + known_squares)
+
+
+def _all_pairs(capture: Capture, plan: Plan) -> int:
+    return sum(n_pairs(capture, batch) for batch in plan.batches)

@@ -1,0 +1,89 @@
+"""What the batches of a plan take in memory, and whether the limit for it makes sense."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import replace
+
+from nlosrender.capture.grids import Capture
+from nlosrender.capture.plan import Batch, Plan
+from nlosrender.engine.backend import batch_memory, physical_memory
+from nlosrender.engine.histogram import BYTES_PER_BIN, MAX_ELEMENTS
+from nlosrender.engine.path_engine import PathEngine
+from nlosrender.engine.skipped import traces_paths
+from nlosrender.engine.virtual_lights.engine import VirtualLightEngine
+from nlosrender.errors import RenderError
+
+
+def batch_bytes(engine: PathEngine | VirtualLightEngine, plan: Plan) -> int:
+    """Return the memory of the largest batch [bytes]: histograms, their statistics and copies.
+
+    Raises
+    ------
+    RenderError
+        A batch has more sums than 32-bit indices reach.
+    """
+    largest = max(plan.batches, key=lambda batch: n_pairs(engine.capture, batch))
+    paths = engine.paths if isinstance(engine, VirtualLightEngine) else engine
+    bounces = engine.options.bounces
+    entries = paths.shape(largest, max(1, bounces.n_slots - 1) if bounces.split else 1).size
+    gathered = 0
+    if isinstance(engine, VirtualLightEngine):
+        fewest = min(plan.batches, key=lambda batch: batch.sensors.size)
+        gathered = max(_gather_entries(engine, batch) for batch in (largest, fewest))
+    if max(entries, gathered) > MAX_ELEMENTS:
+        raise RenderError(
+            f"a batch of {max(entries, gathered):.2e} sums is more than 32-bit indices reach; lower render.memory_limit"
+        )
+    return max(plan.bytes_per_batch, gathered * BYTES_PER_BIN)
+
+
+def memory_warnings(
+    engine: PathEngine | VirtualLightEngine, plan: Plan, memory_limit: int | None, lanes: int
+) -> Iterator[str]:
+    """Yield what is surprising about the memory of a render.
+
+    Parameters
+    ----------
+    engine, plan
+        As set up for the capture.
+    memory_limit
+        The user's limit for the process [bytes]; None: none given.
+    lanes
+        Lanes that keep the backend busy.
+
+    Raises
+    ------
+    RenderError
+        As ``batch_bytes``.
+    """
+    taken, physical = batch_bytes(engine, plan), physical_memory()
+    if memory_limit is not None and memory_limit > physical:
+        yield f"render.memory_limit: {_size(memory_limit)} is more than the machine's {_size(physical)}."
+    if taken > batch_memory(memory_limit):
+        yield (
+            f"render.memory_limit: a batch takes {_size(taken)}, more than is left for it: the gather needs rows for "
+            "every processor. Use fewer bins or lasers, or render.engine: path."
+        )
+    largest = max(batch.sensors.size for batch in plan.batches)
+    if len(plan.batches) > 1 and traces_paths(engine) and largest * plan.replicas < lanes:
+        yield (
+            f"render.memory_limit leaves batches of {largest} sensor points, too few to keep the machine busy; "
+            "a higher limit is faster."
+        )
+
+
+def n_pairs(capture: Capture, batch: Batch) -> int:
+    """Return the pairs of laser and sensor points in a batch."""
+    return batch.sensors.size * (batch.lasers.size if capture.scan_type == "exhaustive" else 1)
+
+
+def _gather_entries(engine: VirtualLightEngine, batch: Batch) -> int:
+    """Return the sums of the gather: lanes that share a sensor point's patches have rows of their own."""
+    slices = max(1, math.ceil(engine.lanes / batch.sensors.size))
+    return replace(engine.paths.shape(batch, 1), replicas=slices).size
+
+
+def _size(n_bytes: float) -> str:
+    return f"{n_bytes / 1e9:.3g} GB"

@@ -1,0 +1,75 @@
+"""What a render leaves out because the scene does not need it, and why (backend started)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+from nlosrender.capture.bounces import THIRD_BOUNCE
+from nlosrender.engine.path_engine import PathEngine
+from nlosrender.engine.virtual_lights.engine import VirtualLightEngine
+
+
+@dataclass(frozen=True)
+class Skipped:
+    """One kind of work that is not done."""
+
+    what: str
+    why: str
+
+
+def skipped_work(engine: PathEngine | VirtualLightEngine, *, scene_is_colored: bool) -> tuple[Skipped, ...]:
+    """Return what ``engine`` skips.
+
+    Parameters
+    ----------
+    engine
+        As set up for the capture.
+    scene_is_colored
+        Whether something in the scene has a colour.
+    """
+    paths = engine.paths if isinstance(engine, VirtualLightEngine) else engine
+    built, options = engine.built, engine.options
+    skipped = []
+    if built.wall.is_planar:
+        skipped.append(Skipped("second bounce", "no light goes straight from a point of a planar wall to another"))
+    if options.bounces.max_bounces is not None:
+        highest = options.bounces.max_bounces
+        skipped.append(Skipped(f"bounces above {highest}", f"render.max_bounces is {highest}"))
+    if isinstance(engine, VirtualLightEngine) and not engine.settings.needs_visibility:
+        skipped.append(
+            Skipped("visibility rays", "one convex object stands alone before a planar wall: nothing lies between")
+        )
+    if isinstance(engine, VirtualLightEngine) or paths.hidden_fraction > 0:
+        dark = built.n_triangles - paths.sampler.n_triangles
+        if dark:
+            why = "they face away from the whole wall or lie behind it: no ray is sent to them"
+            skipped.append(Skipped(f"{dark} of {built.n_triangles} triangles", why))
+    if options.channels == 1:
+        why = "render.color is grey" if scene_is_colored else "everything in the scene is grey"
+        skipped.append(Skipped("colour", why))
+    return (*skipped, *_techniques(paths))
+
+
+def _techniques(paths: PathEngine) -> Iterator[Skipped]:
+    """Yield the sampling technique that is left out where one covers everything."""
+    highest = paths.options.bounces.max_bounces
+    if highest is not None and highest < paths.settings.first_bounce:
+        return  # no path is traced
+    if paths.hidden_fraction == 1:
+        yield Skipped("BSDF sampling at the wall (MIS)", "hidden geometry sampling alone finds all light there")
+    elif paths.hidden_fraction == 0:
+        if not paths.options.hidden_geometry_sampling:
+            why = "render.hidden_geometry_sampling is false"
+        elif paths.built.hidden_bounds is None or paths.sampler.is_empty:
+            why = "there is no hidden surface to sample"
+        else:
+            why = "hidden geometry surrounds the wall: BSDF sampling alone does better"
+        yield Skipped("hidden geometry sampling (MIS)", why)
+
+
+def traces_paths(engine: PathEngine | VirtualLightEngine) -> bool:
+    """Return whether any path is traced: not when the gather does the third bounce and no other is asked for."""
+    highest = engine.options.bounces.max_bounces
+    lowest = THIRD_BOUNCE + 1 if isinstance(engine, VirtualLightEngine) else THIRD_BOUNCE
+    return highest is None or highest >= lowest

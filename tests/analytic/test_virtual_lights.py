@@ -1,0 +1,299 @@
+"""The virtual-light engine against quadrature, against the path engine, and piece by piece."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from agreement import assert_agrees, relative_l2
+from quadrature import (
+    Setup,
+    clear_of_rectangle,
+    confocal_third_bounces,
+    grid_points,
+    joined,
+    rectangle_cells,
+    sphere_cells,
+    third_bounces,
+)
+from rendering import Rendering, configured, flat_wall, render
+
+from nlosrender import pipeline
+from nlosrender.engine.backend import start_backend
+
+PLATE = {
+    "type": "rectangle",
+    "width": 0.8,
+    "height": 0.6,
+    "center": [0.15, -0.1, 0.6],
+    "normal": [0.2, -0.1, -1.0],
+    "bsdf": {"type": "diffuse", "reflectance": 0.7},
+}
+SCREEN = {
+    "type": "rectangle",
+    "width": 0.25,
+    "height": 0.3,
+    "center": [0.3, 0.0, 0.35],
+    "bsdf": {"type": "diffuse", "reflectance": 0.0},
+}
+BALL = {"type": "sphere", "center": [0.1, -0.1, 0.8], "radius": 0.3, "bsdf": {"type": "diffuse", "reflectance": 0.7}}
+BINS = (0.6, 0.02, 160)
+EDGES = 0.6 + 0.02 * np.arange(161)
+LASERS = {"single": np.array([[[0.3, -0.2, 0.0]]]), "exhaustive": grid_points(2, 3, 1.5, 1.2)}
+SENSORS = grid_points(5, 3, 2.0, 1.6)
+
+
+@pytest.fixture(autouse=True)
+def backend() -> None:
+    """Choose LLVM before anything imports Mitsuba."""
+    start_backend("llvm")
+
+
+def start(config: dict):
+    """Return the built scene, the capture, the time axis, the plan and the engine that a configuration leads to."""
+    validated = configured(config)
+    backend = start_backend("llvm", colored=validated.is_colored)
+    built = pipeline.load_scene(validated)
+    capture, time_axis = pipeline.describe_capture(validated, built.wall, built)
+    return built, capture, time_axis, *pipeline.prepare(validated, backend, built, capture, time_axis)
+
+
+def gathered(*hidden: dict, scan: str = "single", error: float = 0.01, **more) -> tuple[np.ndarray, float, object]:
+    """Return H (ly, lx, sy, sx, bin) of all bounces, the estimated relative error, and the engine that rendered."""
+    from nlosrender.engine.path_engine import Budget
+
+    config = flat_wall(*hidden, scan=scan, bins=BINS, spp=None, target_error=error, engine="virtual_lights", **more)
+    _, capture, _, plan, engine = start(config)
+    assert engine.name == "virtual_lights"
+    (batch,) = plan.batches
+    histogram = engine.render(batch, Budget(target_error=error))
+    lasers = (1, 1) if scan == "confocal" else (capture.laser_grid.ny, capture.laser_grid.nx)
+    shape = (*lasers, capture.sensor_grid.ny, capture.sensor_grid.nx, -1)
+    estimate = np.sqrt(histogram.variance.sum() / (histogram.mean**2).sum())
+    return histogram.mean.sum(axis=(0, 1)).reshape(shape), float(estimate), engine
+
+
+def reference(setup: Setup, scan: str) -> np.ndarray:
+    """Return the quadrature of a scan."""
+    return confocal_third_bounces(setup, SENSORS) if scan == "confocal" else third_bounces(setup, LASERS[scan], SENSORS)
+
+
+def assert_honest(result: np.ndarray, estimate: float, truth: np.ndarray, *, target: float, floor: float) -> None:
+    """The estimate meets the target, and the true error is within twice the estimate, beyond the truth's own error."""
+    error = relative_l2(result - truth, truth)
+    assert estimate <= target
+    assert error <= 2 * estimate + floor, f"true error {error:.4f}, estimated {estimate:.4f}"
+
+
+# 700 x 700 cells: an iso-delay strip of a 2 cm bin is about 9 cells wide and 700 long; its two edges misplace
+# sqrt(2 * 700 / 12) = 11 of 6000 cells, 0.2 %.
+QUADRATURE = {"single": 2e-3, "confocal": 2e-3, "exhaustive": 5e-3}  # exhaustive: 350 x 350 cells, for time
+CELLS = {"single": 700, "confocal": 700, "exhaustive": 350}
+
+
+@pytest.mark.parametrize("scan", ["single", "confocal", "exhaustive"])
+def test_a_plate_meets_the_target_error_and_says_so(scan: str) -> None:
+    """H per bin of a tilted plate, for every scan type, at 1 %."""
+    truth = reference(
+        Setup(rectangle_cells(0.8, 0.6, PLATE["center"], PLATE["normal"], n=CELLS[scan]), EDGES, rho=0.7), scan
+    )
+    result, estimate, engine = gathered(PLATE, scan=scan)
+    assert_honest(result, estimate, truth, target=0.01, floor=QUADRATURE[scan])
+    assert not engine.settings.needs_visibility
+
+
+@pytest.mark.parametrize("scan", ["single", "confocal"])
+def test_a_sphere_is_round(scan: str) -> None:
+    """H per bin of a sphere: its patches have the true area and the true normals."""
+    truth = reference(Setup(sphere_cells(BALL["center"], 0.3, n=CELLS[scan]), EDGES, rho=0.7), scan)
+    result, estimate, _ = gathered(BALL, scan=scan)
+    # front-facing quadrature hides the back of a sphere: a convex body needs no visibility test
+    assert_honest(result, estimate, truth, target=0.01, floor=2 * QUADRATURE[scan])
+
+
+@pytest.mark.parametrize("scan", ["single", "confocal", "exhaustive"])
+def test_shadow_edges_converge(scan: str) -> None:
+    """A black screen hides parts of the plate from laser and sensor points; partly hidden patches count in part."""
+    cells = rectangle_cells(0.8, 0.6, PLATE["center"], PLATE["normal"], n=CELLS[scan])
+    hidden = clear_of_rectangle(SCREEN["center"], (0, 0, -1), 0.25, 0.3)
+    truth = reference(Setup(cells, EDGES, rho=0.7, visible=hidden), scan)
+    result, estimate, engine = gathered(PLATE, SCREEN, scan=scan, error=0.02)
+    assert engine.settings.needs_visibility
+    assert_honest(result, estimate, truth, target=0.02, floor=2 * QUADRATURE[scan])
+    assert result.sum() == pytest.approx(truth.sum(), rel=5e-3)
+
+
+def test_two_surfaces_add_up() -> None:
+    """Light of separate surfaces that do not hide each other is the sum of theirs."""
+    ball = BALL | {"center": [-0.5, 0.3, 0.6], "radius": 0.15}
+    cells = joined(
+        rectangle_cells(0.8, 0.6, PLATE["center"], PLATE["normal"], n=700), sphere_cells(ball["center"], 0.15, n=300)
+    )
+    behind = [0.15, -0.1, 0.6]
+    truth = reference(Setup(cells, EDGES, rho=0.7), "single")
+    result, estimate, _ = gathered(PLATE | {"center": behind}, ball)
+    # the ball hides a little of the plate from the outermost sensor points; the energies differ by less than that
+    assert result.sum() == pytest.approx(truth.sum(), rel=0.02)
+    assert estimate <= 0.01
+
+
+def test_legs_and_start_shift_the_gather_as_they_shift_paths() -> None:
+    """Legs that are no whole number of bins and a window that does not start at 0: both engines agree per bin."""
+    capture = {
+        "account_first_and_last_bounces": True,
+        "laser_position": [-0.5, 0, 0.25],
+        "sensor_position": [0.4, 0.3, 1.1],
+    }
+    config = flat_wall(PLATE, capture=capture, bins=(1.5, 0.04, 100), spp=16384)
+    paths = render(config, replicas=32)
+    from nlosrender.engine.path_engine import Budget
+
+    _, _, _, plan, engine = start(config | {"render": {"max_bounces": 3, "engine": "virtual_lights"}})
+    histogram = engine.render(plan.batches[0], Budget(target_error=0.002))
+    lights = histogram.mean.sum(axis=(0, 1)).reshape(paths.total.shape)
+    assert_agrees(paths.total, paths.total_variance, lights, replicas=32, floor=0.01)
+
+
+@pytest.mark.parametrize("max_bounces", [5, None])
+def test_further_bounces_come_on_top(max_bounces: int | None) -> None:
+    """With interreflections both engines agree bounce by bounce."""
+    scene = (PLATE, BALL | {"center": [-0.45, 0.2, 0.7], "radius": 0.25})
+    config = flat_wall(*scene, bins=(0.6, 0.08, 80), spp=60000, max_bounces=max_bounces)
+    paths: Rendering = render(config, replicas=32)
+    from nlosrender.engine.path_engine import Budget
+
+    _, _, _, plan, engine = start(config | {"render": {"max_bounces": max_bounces, "engine": "virtual_lights"}})
+    histogram = engine.render(plan.batches[0], Budget(target_error=0.005))
+    for bounce in range(3, paths.bounces.n_slots + 2):
+        slot = paths.bounces.slot(bounce)
+        ours = histogram.mean[0, slot].reshape(paths.bounce(bounce).shape)
+        theirs, noise = paths.bounce(bounce), paths.bounce_variance(bounce)
+        own_noise = 0.0 if bounce == 3 else histogram.variance[0, slot].reshape(noise.shape)
+        assert_agrees(
+            theirs,
+            noise,
+            ours,
+            replicas=32,
+            reference_variance=own_noise,
+            floor=0.01 if bounce == 3 else 0.0,
+            share=0.2,
+        )
+
+
+def test_leaving_out_visibility_rays_changes_nothing() -> None:
+    """Before a planar wall nothing hides a convex object from it: with and without rays H is the same."""
+    from dataclasses import replace
+
+    from nlosrender.engine.path_engine import Budget
+
+    config = flat_wall(BALL, bins=BINS, spp=None, target_error=0.02, engine="virtual_lights")
+    results = []
+    for rays in (False, True):
+        _, _, _, plan, engine = start(config)
+        engine.settings = replace(engine.settings, needs_visibility=rays)
+        results.append(engine.render(plan.batches[0], Budget(target_error=0.02)).mean)
+    # grazing rays may be cut by their own surface: 1e-4 of the way is cut off each ray, and weights vanish there
+    assert relative_l2(results[1] - results[0], results[0]) < 1e-3
+
+
+@pytest.mark.parametrize(
+    ("hidden", "free"),
+    [
+        ([PLATE], True),
+        ([BALL], True),
+        ([{"type": "box", "center": [0, 0, 1], "size": [0.3, 0.2, 0.1], "rotate_deg": [10, 20, 30]}], True),
+        ([BALL | {"inside": True}], False),
+        ([{"type": "letters", "text": "Z", "height": 0.8, "center": [0, 0, 1]}], True),
+        ([{"type": "letters", "text": "Z", "height": 0.8, "thickness": 0.1, "center": [0, 0, 1]}], False),
+        ([PLATE, SCREEN], False),
+        ([{"type": "room", "size": [2, 2, 2]}], True),
+        ([PLATE | {"bsdf": {"type": "twosided", "bsdf": {"type": "diffuse"}}}], False),
+    ],
+)
+def test_rays_are_left_out_exactly_where_nothing_can_hide(hidden: list[dict], free: bool) -> None:
+    """One convex object alone: a flat letter is in one plane, a thick one hides parts of itself, a room is seen whole."""
+    from nlosrender.engine.virtual_lights.occlusion import nothing_occludes
+
+    built, *_ = start(flat_wall(*hidden))
+    assert nothing_occludes(built) == free
+
+
+@pytest.mark.parametrize("coarseness", [1.0, 0.3])
+def test_patches_cover_every_surface_once(coarseness: float) -> None:
+    """However fine, the areas of the patches add up to those of the surfaces, and their sizes stay below the limit."""
+    from nlosrender.engine.virtual_lights.patches import Tessellator
+
+    built, *_ = start(flat_wall(PLATE, BALL))
+    tessellator = Tessellator(built, 0.02 / built.unit)
+    patches = tessellator.patches(coarseness)
+    assert patches.areas.sum() * built.unit**2 == pytest.approx(0.8 * 0.6 + 4 * np.pi * 0.3**2, rel=1e-6)
+    assert len(patches) == tessellator.count(coarseness)
+    edges = np.linalg.norm(patches.corners - np.roll(patches.corners, 1, axis=1), axis=-1).max(axis=1)
+    assert (edges <= 1.1 * coarseness * patches.centres[:, 2]).all()  # 1.1: a sphere's parts are not all alike
+    on_ball = patches.primitives == 0
+    assert np.linalg.norm(patches.normals, axis=1) == pytest.approx(1.0)
+    assert on_ball.any()
+
+
+@pytest.mark.parametrize(
+    "delays", [(3.2, 3.4, 3.9), (2.0, 2.0, 6.5), (0.7, 5.1, 5.1), (4.25, 4.25, 4.25), (0.1, 2.9, 7.3)]
+)
+def test_a_triangle_is_spread_over_its_bins_by_area(delays: tuple[float, float, float]) -> None:
+    """The share of each bin is the part of the triangle whose (linear) delay falls into it."""
+    start_backend("llvm")
+    import drjit as dr
+    import mitsuba as mi
+
+    from nlosrender.engine.histogram import DeviceHistogram, HistogramShape
+    from nlosrender.engine.virtual_lights.gather import _spread
+
+    histogram = DeviceHistogram(HistogramShape(1, 1, 1, 1, 1, 8))
+    corners = [mi.Float(delay) for delay in (delays[1], delays[0], delays[2])]
+    zero = mi.UInt32(0)
+    _spread(histogram, zero, zero, *corners, mi.Int32(0), mi.Spectrum(2.0), mi.Bool(True))
+    dr.eval(histogram.sums)
+    shares = histogram.sums.numpy()
+    # midpoints of n^2 equal parts: strips along an edge misplace at most 1 / n of the area
+    n = 2000
+    i, j = np.meshgrid(np.arange(n), np.arange(n))
+    keep = i + j < n
+    u, v = (i[keep] + 1 / 3) / n, (j[keep] + 1 / 3) / n
+    delay = delays[0] + u * (delays[1] - delays[0]) + v * (delays[2] - delays[0])
+    expected = np.histogram(delay, bins=np.arange(9.0))[0] / keep.sum()
+    assert shares[:8] == pytest.approx(2 * expected, abs=4 / n)
+    assert shares.sum() == pytest.approx(2.0, rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("hidden", "render_keys", "engine"),
+    [
+        ([PLATE], {}, "virtual_lights"),
+        ([PLATE], {"engine": "path"}, "path"),
+        ([PLATE], {"spp": 64}, "path"),
+        ([PLATE], {"hidden_geometry_sampling": False}, "path"),
+        ([PLATE], {"max_bounces": 2}, "path"),
+        ([], {}, "path"),
+        ([PLATE | {"bsdf": {"type": "conductor"}}], {"engine": "virtual_lights"}, "path"),
+        ([PLATE | {"bsdf": {"type": "roughconductor", "alpha": 0.4}}], {}, "path"),
+        ([PLATE | {"bsdf": {"type": "roughconductor", "alpha": 0.4}}], {"engine": "virtual_lights"}, "virtual_lights"),
+        ([{"type": "room", "size": [2, 2, 2]}], {}, "path"),
+        ([{"type": "cylinder", "center": [0, 0, 1], "radius": 0.1, "height": 0.5}], {}, "path"),
+    ],
+)
+def test_auto_takes_the_cheapest_engine_that_is_right(hidden: list[dict], render_keys: dict, engine: str) -> None:
+    """What the gather cannot do goes to the path engine, also when the gather was asked for."""
+    config = flat_wall(*hidden)
+    config["render"] = {"max_bounces": 3, **render_keys}
+    assert start(config)[-1].name == engine
+
+
+def test_rough_surfaces_agree_with_the_path_engine() -> None:
+    """Any smooth BSDF: a rough conductor's lobe, evaluated at the patches."""
+    plate = PLATE | {"bsdf": {"type": "roughconductor", "alpha": 0.5}}
+    paths = render(flat_wall(plate, bins=(0.6, 0.08, 80), spp=16384), replicas=32)
+    from nlosrender.engine.path_engine import Budget
+
+    config = flat_wall(plate, bins=(0.6, 0.08, 80)) | {"render": {"max_bounces": 3, "engine": "virtual_lights"}}
+    _, _, _, plan, engine = start(config)
+    histogram = engine.render(plan.batches[0], Budget(target_error=0.003))
+    lights = histogram.mean.sum(axis=(0, 1)).reshape(paths.total.shape)
+    assert_agrees(paths.total, paths.total_variance, lights, replicas=32, floor=0.01)
