@@ -6,7 +6,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
 # Exact versions that passed the test suite; pyproject.toml holds the ranges that are allowed.
 PINS := -c .constraints.txt
 
-.PHONY: help install render test test-slow lint format peers clean
+.PHONY: help install render test test-slow lint format peers bench bench-peers clean
 .DEFAULT_GOAL := help
 
 help: ## Show this list.
@@ -56,5 +56,18 @@ format: $(VENV)/.dev ## Format the code.
 peers: $(VENV)/.dev .venv-peers/.installed ## Check our files with other projects' readers.
 	$(BIN)/python -m pytest -m peers
 
+# MESH=bunny.ply, a mesh about 0.8 m high, adds scenes with it; SECONDS is the time for all measurements together.
+bench: install ## Measure run time against error in 5 minutes: out/bench.json and out/bench.png. MESH=, SECONDS=
+	$(BIN)/nlosrender bench --seconds $(or $(SECONDS),300) $(if $(MESH),--mesh $(MESH)) -o out/bench
+
+.venv-peers-mitransient/.installed: .requirements-peers-mitransient.txt
+	$(PYTHON) -m venv .venv-peers-mitransient
+	.venv-peers-mitransient/bin/python -m pip --disable-pip-version-check --quiet install --no-deps -r $<
+	@touch $@
+
+bench-peers: install .venv-peers-mitransient/.installed ## The same, in turns with mitransient: out/bench-peers.json and .png. MESH=, SECONDS=
+	$(BIN)/nlosrender bench --part curves --seconds $(or $(SECONDS),600) $(if $(MESH),--mesh $(MESH)) -o out/bench-peers \
+		--peer '.venv-peers-mitransient/bin/python tests/peers/render_with_mitransient.py'
+
 clean: ## Remove what make made, but not out/.
-	rm -rf $(VENV) .venv-peers build *.egg-info .pytest_cache .mypy_cache .ruff_cache
+	rm -rf $(VENV) .venv-peers .venv-peers-mitransient build *.egg-info .pytest_cache .mypy_cache .ruff_cache

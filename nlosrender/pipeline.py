@@ -181,9 +181,9 @@ def forecast_capture(config: Config) -> Forecast:
         As ``render_capture``.
     """
     warnings = Warnings(lambda text: None)
+    begun = time.perf_counter()
     warnings.say(config_warnings(config))
     backend = start_backend(config.render.backend, colored=config.is_colored)
-    begun = time.perf_counter()
     built = load_scene(config)
     capture, time_axis = describe_capture(config, built.wall, built)
     plan, engine = prepare(config, backend, built, capture, time_axis)

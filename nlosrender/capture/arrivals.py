@@ -76,21 +76,21 @@ def window_warnings(
     first = earliest_arrival(capture, wall, hidden_bounds)
     if time_axis.end_opl <= first:
         yield (
-            f"time_axis: the window ends at {time_axis.end_opl:.4g} m, before the first light can arrive at "
-            f"{first:.4g} m: H is zero. Use n_bins: auto, or more or wider bins."
+            f"time_axis: the window ends at {time_axis.end_opl:.6g} m, before the first light can arrive at "
+            f"{first:.6g} m: H is zero. Use n_bins: auto, or more or wider bins."
         )
         return
     last = latest_of_bounce(capture, wall, hidden_bounds, max_bounces)
     third = latest_arrival(capture, wall, hidden_bounds, THIRD_BOUNCE)
     if time_axis.start_opl > last:
         yield (
-            f"time_axis: the window starts at {time_axis.start_opl:.4g} m, after the last light can arrive at "
-            f"{last:.4g} m: H is zero. Use an earlier start_opl."
+            f"time_axis: the window starts at {time_axis.start_opl:.6g} m, after the last light can arrive at "
+            f"{last:.6g} m: H is zero. Use an earlier start_opl."
         )
     elif time_axis.start_opl > third:
         yield (
-            f"time_axis: the window starts at {time_axis.start_opl:.4g} m, after the last of the third bounce at "
-            f"{third:.4g} m: only later bounces can be in it."
+            f"time_axis: the window starts at {time_axis.start_opl:.6g} m, after the last of the third bounce at "
+            f"{third:.6g} m: only later bounces can be in it."
         )
 
 

@@ -11,7 +11,7 @@ from typing import Annotated
 import typer
 
 from nlosrender import __version__
-from nlosrender.cli import config_commands, file_commands, machine_commands, plan_command, render_command
+from nlosrender.cli import bench_command, config_commands, file_commands, machine_commands, plan_command, render_command
 from nlosrender.errors import EXIT_INTERRUPTED, NlosError
 
 app = typer.Typer(
@@ -27,6 +27,7 @@ plan_command.register(app)
 config_commands.register(app)
 file_commands.register(app)
 machine_commands.register(app)
+bench_command.register(app)
 
 
 def _print_version(wanted: bool) -> None:

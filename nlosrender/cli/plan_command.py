@@ -57,7 +57,7 @@ def _lines(forecast: Forecast) -> Iterator[str]:
         yield f"skipped  {item.what}: {item.why}"
     yield f"scan     {_scan(forecast)}, {forecast.n_triangles} hidden triangles"
     start, end = forecast.window_opl
-    yield f"time     {forecast.n_bins} bins of {forecast.bin_width_opl:g} m, from {start:.4g} to {end:.4g} m"
+    yield f"time     {forecast.n_bins} bins of {forecast.bin_width_opl:g} m, from {start:.6g} to {end:.6g} m"
     plural = "" if forecast.batches == 1 else "es"
     yield f"memory   {forecast.batches} batch{plural} of up to {readable_size(forecast.bytes_per_batch)}"
     size = forecast.file

@@ -16,10 +16,17 @@ from nlosrender.engine.histogram import Histogram, relative_l2_error
 from nlosrender.engine.memory import n_pairs
 from nlosrender.engine.path_engine import FIRST_SAMPLES, Budget, PathEngine
 from nlosrender.engine.skipped import traces_paths
-from nlosrender.engine.virtual_lights.engine import DEFAULT_TARGET, VirtualLightEngine
+from nlosrender.engine.virtual_lights.engine import (
+    DEFAULT_TARGET,
+    FIRST_COARSENESS,
+    REFINEMENT,
+    VirtualLightEngine,
+)
 
 PILOT_SECONDS = 0.5
 PILOT_BYTES = 128e6  # of histograms: a forecast must not take the memory of the render
+PILOT_DEPOSITS = 5e8  # of the gather, patches times bins they cover: a fraction of a second
+MOST_PILOTS = 20.0  # pilots' worth of deposits for one sensor point above which no pilot is run
 LAUNCH_OVERHEAD = 0.05  # s per batch at most that does not grow with the batch
 SECOND_LOOK = 1.1  # the engines look at the error now and then only, and overshoot by so much
 
@@ -55,9 +62,11 @@ def estimate_render_time(
         Rendering alone: no start, no compilation, no writing.
     """
     limit = budget.time_limit_s
-    if limit is not None and budget.spp is None and budget.target_error is None:
+    if limit is not None and budget.spp is None and budget.target_error is None and traces_paths(engine):
         return TimeEstimate(limit, "render.time_limit_s")
     pilot = pilot_batch(engine, plan)
+    if isinstance(engine, VirtualLightEngine) and _deposits_per_sensor(engine, pilot) > MOST_PILOTS * PILOT_DEPOSITS:
+        return TimeEstimate(limit, "no pilot: the bins are so fine that the gather of one sensor point takes too long")
     seconds, known_squares, lit_shares = 0.0, 0.0, None
     parts = []
     paths = engine.paths if isinstance(engine, VirtualLightEngine) else engine
@@ -80,11 +89,25 @@ def estimate_render_time(
 
 
 def pilot_batch(engine: PathEngine | VirtualLightEngine, plan: Plan) -> Batch:
-    """Return the middle of the plan's middle batch: as many sensor points as ``PILOT_BYTES`` hold, all its lasers."""
+    """Return the middle of the plan's middle batch: as many sensor points as a pilot can take, all its lasers."""
     batch = plan.batches[len(plan.batches) // 2]
-    bytes_per_sensor = plan.bytes_per_batch / max(b.sensors.size for b in plan.batches)
-    sensors = _middle(batch.sensors, max(1, int(PILOT_BYTES / bytes_per_sensor)))
+    most = PILOT_BYTES / (plan.bytes_per_batch / max(b.sensors.size for b in plan.batches))
+    if isinstance(engine, VirtualLightEngine):
+        most = min(most, PILOT_DEPOSITS / _deposits_per_sensor(engine, batch))
+    sensors = _middle(batch.sensors, max(1, int(most)))
     return Batch(sensors, sensors if engine.capture.scan_type == "confocal" else batch.lasers)
+
+
+def _deposits_per_sensor(engine: VirtualLightEngine, batch: Batch) -> float:
+    """Return a bound on the deposits for one sensor point at the first two resolutions.
+
+    The size of a patch at distance d is 2 sqrt(d w) with w the bin width, so that it covers 2 sqrt(d / w) bins.
+    """
+    patches = engine.tessellator.count(FIRST_COARSENESS) * (1 + REFINEMENT)
+    farthest = float(engine.built.hidden_bounds[1][2]) if engine.built.hidden_bounds is not None else 0.0
+    bins = 1 + 2 * math.sqrt(max(farthest, 0.0) / engine.time_axis.bin_width_opl)
+    lasers = batch.lasers.size if engine.capture.scan_type == "exhaustive" else 1
+    return max(1.0, patches * bins * lasers)
 
 
 def _middle(tile: Tile, most: int) -> Tile:
@@ -113,8 +136,9 @@ def _path_seconds(
         needed = second.samples * (error / (budget.target_error or DEFAULT_TARGET)) ** 2 * SECOND_LOOK
         needed = max(needed, FIRST_SAMPLES * plan.replicas)
     largest = max(batch.sensors.size for batch in plan.batches)
-    # a pilot of a few sensor points leaves processors idle that the render will use
-    idle = min(1.0, pilot.sensors.size / min(largest, lanes / plan.replicas))
+    # A pilot of a few sensor points leaves processors idle that the render will use; a quarter of the lanes fills
+    # their vector units, the rest only evens out the load.
+    idle = min(1.0, pilot.sensors.size / min(largest, max(1.0, lanes / 4 / plan.replicas)))
     points = sum(batch.sensors.size for batch in plan.batches)  # once more for every cut between lasers
     growing = max(overhead - LAUNCH_OVERHEAD, 0.0) * _all_pairs(paths.capture, plan) / n_pairs(paths.capture, pilot)
     fixed = min(overhead, LAUNCH_OVERHEAD) * len(plan.batches)

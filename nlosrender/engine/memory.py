@@ -12,8 +12,10 @@ from nlosrender.engine.backend import batch_memory, physical_memory
 from nlosrender.engine.histogram import BYTES_PER_BIN, MAX_ELEMENTS
 from nlosrender.engine.path_engine import PathEngine
 from nlosrender.engine.skipped import traces_paths
-from nlosrender.engine.virtual_lights.engine import VirtualLightEngine
+from nlosrender.engine.virtual_lights.engine import FIRST_COARSENESS, REFINEMENT, VirtualLightEngine
 from nlosrender.errors import RenderError
+
+PATCH_BYTES = 400  # float64 on the host, while they are cut and joined, and float32 on the device
 
 
 def batch_bytes(engine: PathEngine | VirtualLightEngine, plan: Plan) -> int:
@@ -56,9 +58,11 @@ def memory_warnings(
     Raises
     ------
     RenderError
-        As ``batch_bytes``.
+        As ``batch_bytes``, or the gather's patches do not fit the memory.
     """
     taken, physical = batch_bytes(engine, plan), physical_memory()
+    if isinstance(engine, VirtualLightEngine):
+        _refuse_patches(engine, batch_memory(memory_limit))
     if memory_limit is not None and memory_limit > physical:
         yield f"render.memory_limit: {_size(memory_limit)} is more than the machine's {_size(physical)}."
     if taken > batch_memory(memory_limit):
@@ -71,6 +75,16 @@ def memory_warnings(
         yield (
             f"render.memory_limit leaves batches of {largest} sensor points, too few to keep the machine busy; "
             "a higher limit is faster."
+        )
+
+
+def _refuse_patches(engine: VirtualLightEngine, memory_limit: int) -> None:
+    needed = engine.tessellator.count(FIRST_COARSENESS) * REFINEMENT
+    if needed * PATCH_BYTES > memory_limit:
+        raise RenderError(
+            f"time_axis.bin_width_opl: bins of {engine.time_axis.bin_width_opl:.3g} m need {needed:.1e} patches of the "
+            f"hidden geometry, {_size(needed * PATCH_BYTES)}, but render.memory_limit leaves {_size(memory_limit)}. "
+            "Use wider bins, or render.engine: path."
         )
 
 

@@ -65,6 +65,22 @@ def test_the_second_bounce_in_a_sphere_is_one_exact_bin() -> None:
     assert result.variance.sum() == 0
 
 
+def test_a_ball_blocks_exactly_the_chords_that_meet_it() -> None:
+    """The second bounce is there or not: by the distance of the chord from the ball's centre."""
+    ball = {"type": "sphere", "center": [1.1, -2.0, 3.1], "radius": 0.3}
+    config = sphere_room(scan="exhaustive", sensors=(5, 4), bins=(0.0, 2.0, 1), max_bounces=2)
+    config["scene"]["hidden_geometry"] = [ball]
+    config["capture"]["laser_grid"] = {"nx": 2, "ny": 3}
+    second = render(config).bounce(2)[..., 0]
+    lasers, sensors = sphere_points(2, 3)[:, :, None, None], sphere_points(5, 4)[None, None]
+    chord = sensors - lasers
+    to_ball = np.array([0.1, 0.0, 0.1]) - lasers
+    along = (to_ball * chord).sum(axis=-1, keepdims=True) / (chord**2).sum(axis=-1, keepdims=True)
+    clear = np.linalg.norm(to_ball - along * chord, axis=-1) > 0.3
+    assert 0.1 < clear.mean() < 0.9
+    np.testing.assert_allclose(second, np.where(clear, bounce_energy(2), 0), rtol=1e-5)
+
+
 def test_a_confocal_pair_has_no_second_bounce_and_every_other_one() -> None:
     """A point sees itself along no chord; its third bounce has the energy of any other pair."""
     result = render(sphere_room(scan="confocal", bins=(0.0, 0.1, 60), spp=8192, max_bounces=3), replicas=REPLICAS)

@@ -210,7 +210,7 @@ def test_leaving_out_visibility_rays_changes_nothing() -> None:
     ],
 )
 def test_rays_are_left_out_exactly_where_nothing_can_hide(hidden: list[dict], free: bool) -> None:
-    """One convex object alone: a flat letter is in one plane, a thick one hides parts of itself, a room is seen whole."""
+    """One convex object alone: a flat letter is one plane, a thick one hides parts of itself, a room is seen whole."""
     from nlosrender.engine.virtual_lights.occlusion import nothing_occludes
 
     built, *_ = start(flat_wall(*hidden))

@@ -82,6 +82,52 @@ def test_the_mixture_does_not_change_the_result(scan: str, hidden_fraction: floa
         )
 
 
+CURVED = {
+    "sphere": {"type": "sphere", "radius": 0.8, "inside": True},
+    "cylinder": {"type": "cylinder", "radius": 0.6, "height": 1.4, "inside": True},
+    "ball": {"type": "sphere", "radius": 0.5, "inside": False},
+}
+
+
+@pytest.mark.parametrize("shape", CURVED)
+def test_hidden_geometry_before_a_curved_wall_is_found_either_way(shape: str) -> None:
+    """Walls that light themselves, and a ball that lights nothing of itself: mixture against BSDF sampling alone."""
+    hidden = [BALL | {"center": [0.2, 0.1, -0.1]}, PLATE | {"width": 0.3, "height": 0.2, "center": [-0.1, 0.3, 0.3]}]
+    if shape == "ball":
+        hidden = [BALL | {"center": [0.2, 0.1, 0.9]}, PLATE | {"center": [-0.3, 0.3, 1.0]}]
+    mixed, by_chance = (
+        render(
+            flat_wall(*hidden, bins=(0.0, 0.2, 30), max_bounces=5, spp=131072, seed=seed)
+            | {
+                "scene": {
+                    "relay_wall": CURVED[shape] | {"bsdf": {"type": "diffuse", "reflectance": 0.6}},
+                    "hidden_geometry": hidden,
+                },
+                "capture": {
+                    "scan_type": "single",
+                    "sensor_grid": {"nx": 3, "ny": 2, "width": 0.9, "height": 0.7},
+                    "laser_point": [0.2, -0.1],
+                    "account_first_and_last_bounces": False,
+                },
+            },
+            replicas=REPLICAS,
+            hidden_fraction=hidden_fraction,
+        )
+        for seed, hidden_fraction in enumerate((0.5, 0.0))
+    )
+    assert (mixed.bounce(2).sum() > 0) == (shape != "ball")
+    np.testing.assert_array_equal(mixed.bounce(2), by_chance.bounce(2))
+    for bounce in (3, 4, 5):
+        assert_agrees(
+            mixed.bounce(bounce),
+            mixed.bounce_variance(bounce),
+            by_chance.bounce(bounce),
+            reference_variance=by_chance.bounce_variance(bounce),
+            replicas=REPLICAS,
+            share=0.05 if bounce == 3 else 0.2,
+        )
+
+
 @pytest.mark.parametrize("max_bounces", [5, None])
 def test_russian_roulette_does_not_change_the_result(max_bounces: int | None) -> None:
     """Paths ended by chance are made up for by those that go on."""

@@ -1,0 +1,104 @@
+"""Error against seconds: points, slope, and the time to a given error."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from itertools import pairwise
+from typing import Literal
+
+HowKnown = Literal["measured", "interpolated", "extrapolated", "not reached"]
+
+
+@dataclass(frozen=True)
+class Point:
+    """What one setting reached.
+
+    Parameters
+    ----------
+    seconds, cpu_seconds
+        Wall-clock time, and CPU time of all threads: medians over ``repeats``.
+    error
+        Relative L2 distance to the reference.
+    estimate
+        The engine's own estimate of it.
+    samples
+        Paths per sensor point; 0 for a deterministic engine.
+    systematic
+        The part of the error that independent runs share; None when their noise hides it.
+    energy
+        Sum of H, in the contender's own unit.
+    """
+
+    seconds: float
+    cpu_seconds: float
+    error: float
+    repeats: int = 1
+    estimate: float | None = None
+    samples: int = 0
+    systematic: float | None = None
+    energy: float = 0.0
+
+
+@dataclass
+class Curve:
+    """Points of one contender on one scene, from the cheapest setting up."""
+
+    name: str
+    counts_paths: bool
+    points: list[Point] = field(default_factory=list)
+    first_seconds: float = 0.0  # the first render of the process, with compilation or loading of cached kernels
+    engine: str = ""
+
+    def add(self, point: Point) -> None:
+        """Append the point of the next level."""
+        self.points.append(point)
+
+    def slope(self, floor: float = 0.0) -> float | None:
+        """Return d log(error) / d log(seconds), least squares over the last four points above ``floor``.
+
+        None with fewer than two such points.
+        """
+        usable = [(point.seconds, point.error) for point in self.points if point.error > floor][-4:]
+        return power_law([x for x, _ in usable], [y for _, y in usable])
+
+    @property
+    def bias(self) -> float | None:
+        """Return the systematic error, from the last point that shows one."""
+        known = [point.systematic for point in self.points if point.systematic is not None]
+        return known[-1] if known else None
+
+    def time_to(self, target: float, *, cpu: bool = False) -> tuple[float, HowKnown]:
+        """Return the seconds (or CPU seconds) to a relative L2 error of ``target``, and how they are known.
+
+        Interpolated along straight lines of the log-log plot. Beyond the last point, the error of independent paths
+        falls as 1 / sqrt(seconds), so the time is extrapolated, unless a bias above the target stands in the way;
+        for others the time is unknown. The time of a first point below the target is an upper bound and counts as
+        measured.
+        """
+        steps = [(point.cpu_seconds if cpu else point.seconds, point.error) for point in self.points]
+        if steps[0][1] <= target:
+            return steps[0][0], "measured"
+        for (t0, e0), (t1, e1) in pairwise(steps):
+            if e1 <= target:
+                return t0 * (t1 / t0) ** (math.log(e0 / target) / math.log(e0 / e1)), "interpolated"
+        if not self.counts_paths or (self.bias is not None and self.bias > target):
+            return math.inf, "not reached"
+        seconds, error = steps[-1]
+        return seconds * (error / target) ** 2, "extrapolated"
+
+    def paths_per_second(self, n_pairs: int) -> float | None:
+        """Return paths per second of the longest run; ``n_pairs`` sensor points each take ``samples`` paths."""
+        last = self.points[-1]
+        return last.samples * n_pairs / last.seconds if last.samples else None
+
+
+def power_law(sizes: Sequence[float], values: Sequence[float]) -> float | None:
+    """Return the exponent p of the least-squares fit of values ~ sizes^p; None with fewer than two sizes."""
+    if len(sizes) < 2 or len(set(sizes)) < 2 or min(values) <= 0:
+        return None
+    x, y = [math.log(size) for size in sizes], [math.log(value) for value in values]
+    mean_x, mean_y = sum(x) / len(x), sum(y) / len(y)
+    covariance = sum((a - mean_x) * (b - mean_y) for a, b in zip(x, y, strict=True))
+    return covariance / sum((a - mean_x) ** 2 for a in x)

@@ -1,0 +1,141 @@
+"""Rates behind the curves: the gather against Embree's any-hit queries, and a whole ``nlosrender render`` process."""
+
+from __future__ import annotations
+
+import json
+import statistics
+import subprocess
+import sys
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from nlosrender.bench.any_hit import trace_any_hit
+from nlosrender.bench.runs import LoadedScene, Timer
+from nlosrender.bench.scenes import BenchScene
+from nlosrender.errors import RenderError
+
+REPEATS = 3
+GATHER_TARGET = 0.01
+
+
+@dataclass(frozen=True)
+class GatherRate:
+    """How the third bounce's gather compares with tracing its shadow rays and doing nothing else.
+
+    A pair is a sensor point and a patch. The gather's time is all of the engine's: patches, lighting, histogram. The
+    any-hit queries go from the same sensor points to the same patches, in the same order, eight or sixteen
+    neighbouring sensor points to one patch at a time; pairs that face away from each other are traced by neither.
+    """
+
+    scene: str
+    patches: int  # of all resolutions the gather went through
+    pairs: int
+    facing_pairs: int
+    gather_seconds: float
+    any_hit_seconds: float
+    traces_rays: bool  # the gather leaves out visibility where nothing can occlude
+
+    def report(self) -> dict[str, Any]:
+        """Return counts, and rates in pairs and rays per second."""
+        return {
+            **vars(self),
+            "gather_pairs_per_second": self.pairs / self.gather_seconds,
+            "gather_rays_per_second": self.facing_pairs / self.gather_seconds,
+            "any_hit_rays_per_second": self.facing_pairs / self.any_hit_seconds,
+            "gather_share_of_any_hit": self.any_hit_seconds / self.gather_seconds,
+        }
+
+
+def gather_rate(loaded: LoadedScene) -> GatherRate:
+    """Measure one third-bounce scene.
+
+    Raises
+    ------
+    RenderError
+        The virtual-light engine does not take the scene.
+    """
+    from nlosrender import pipeline
+    from nlosrender.engine.path_engine import Budget
+    from nlosrender.engine.virtual_lights.engine import VirtualLightEngine
+
+    config = loaded.scene.config(engine="virtual_lights", split_bounces=False)
+    spent, patch_sets, traces_rays = [], [], True
+    for _ in range(REPEATS + 1):  # the first run compiles
+        timer = Timer()
+        plan, engine = pipeline.prepare(config, loaded.backend, loaded.built, loaded.capture, loaded.time_axis)
+        if not isinstance(engine, VirtualLightEngine):
+            raise RenderError(f"{loaded.scene.name}: the virtual-light engine does not take this scene")
+        traces_rays = engine.settings.needs_visibility
+        patch_sets = _recorded(engine.tessellator)
+        for batch in plan.batches:
+            engine.render(batch, Budget(target_error=GATHER_TARGET))
+        spent.append(timer.read()[0])
+    traced = [trace_any_hit(loaded, patches) for patches in patch_sets]
+    n_patches = sum(len(patches) for patches in patch_sets)
+    return GatherRate(
+        loaded.scene.name,
+        n_patches,
+        n_patches * loaded.capture.n_sensors,
+        sum(rays for rays, _ in traced),
+        statistics.median(spent[1:]),
+        sum(seconds for _, seconds in traced),
+        traces_rays,
+    )
+
+
+def _recorded(tessellator: Any) -> list[Any]:
+    """Make a tessellator note the patches it hands out from now on; return the list they go to."""
+    handed_out: list[Any] = []
+    make = tessellator.patches
+
+    def patches(coarseness: float) -> Any:
+        handed_out.append(make(coarseness))
+        return handed_out[-1]
+
+    tessellator.patches = patches
+    return handed_out
+
+
+def whole_process(scene: BenchScene) -> dict[str, Any]:
+    """Time ``nlosrender render`` of a scene as a user runs it, in a process of its own, kernels compiled before.
+
+    Returns
+    -------
+    dict
+        ``process_seconds`` (median of three, from start to exit), the median run's ``seconds`` per stage and its
+        ``write_share`` of the whole, the file's size, and ``first_process_seconds``, which may include compilation.
+
+    Raises
+    ------
+    RenderError
+        The command failed.
+    """
+    with tempfile.TemporaryDirectory(prefix="nlosrender-bench-") as folder:
+        config = Path(folder) / "scene.yaml"
+        output = Path(folder) / "scene.hdf5"
+        document = {**scene.sections, "render": {"max_bounces": scene.max_bounces, "target_error": 0.01}}
+        config.write_text(yaml.safe_dump(document), encoding="utf-8")
+        command = [sys.executable, "-m", "nlosrender", "render", str(config), "-o", str(output), "--quiet", "--json"]
+        runs = []
+        for _ in range(REPEATS + 1):
+            timer = Timer()
+            done = subprocess.run(command, capture_output=True, text=True, check=False)
+            seconds = timer.read()[0]
+            if done.returncode != 0:
+                raise RenderError(f"nlosrender render of the scene {scene.name} failed: {done.stderr.strip()}")
+            runs.append((seconds, json.loads(done.stdout)))
+        size = output.stat().st_size
+    median = sorted(runs[1:], key=lambda run: run[0])[REPEATS // 2]
+    return {
+        "scene": scene.name,
+        "first_process_seconds": runs[0][0],
+        "process_seconds": median[0],
+        "seconds": median[1]["seconds"],
+        "write_share": median[1]["seconds"]["write"] / median[0],
+        "error_estimate": median[1]["error_estimate"],
+        "file_bytes": size,
+    }

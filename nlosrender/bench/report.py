@@ -1,0 +1,152 @@
+"""A benchmark as a table, as JSON and as a log-log plot."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+from nlosrender.errors import FileError
+
+FAR = "never"
+
+
+def write_json(path: Path, report: dict[str, Any]) -> None:
+    """Write ``Benchmark.report()``.
+
+    Raises
+    ------
+    FileError
+        The file cannot be written.
+    """
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(json.dumps(report, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+    except OSError as error:
+        raise FileError(f"{path}: cannot be written: {error.strerror}.") from error
+
+
+def table(report: dict[str, Any]) -> str:
+    """Return ``Benchmark.report()`` as text."""
+    facts = report["facts"]
+    start, end = (" ".join(f"{x:.2f}" for x in facts[f"load_average_at_{when}"]) for when in ("start", "end"))
+    lines = [
+        f"{facts['started']}, {facts['processors']} processors, load average {start} at start and {end} at end",
+        ", ".join(f"{name} {version}" for name, version in facts["versions"].items()),
+    ]
+    if facts.get("peer"):
+        lines.append(
+            f"against {facts['peer']}: same run, in turns; its result is scaled to fit best, once per laser point"
+        )
+    for scene in report["scenes"]:
+        lines += ["", *_scene_table(scene)]
+    if report["scaling"]:
+        lines += ["", "scaling: median seconds to the same target error (auto)"]
+    for scaling in report["scaling"]:
+        steps = ", ".join(f"{n:g}: {s:.3g}" for n, s in zip(scaling["sizes"], scaling["seconds"], strict=True))
+        exponent = "" if scaling["exponent"] is None else f"  ~ size^{scaling['exponent']:.2f} over the last sizes"
+        lines.append(f"  {scaling['quantity']} ({scaling['setting']}): {steps}{exponent}")
+    if report["rates"]:
+        lines += ["", "gather against Embree's any-hit queries on the same pairs of sensor point and patch"]
+    for rate in report["rates"]:
+        lines.append(
+            f"  {rate['scene']}: {rate['patches']} patches, {rate['gather_pairs_per_second'] / 1e6:.1f} M pairs/s; "
+            f"facing pairs {rate['gather_rays_per_second'] / 1e6:.1f} M/s gathered, "
+            f"{rate['any_hit_rays_per_second'] / 1e6:.1f} M/s any-hit: {rate['gather_share_of_any_hit']:.0%}"
+            + ("" if rate["traces_rays"] else " (nothing can occlude here: the gather traces no rays)")
+        )
+    if report["process"]:
+        lines += ["", _process_line(report["process"])]
+    return "\n".join(lines)
+
+
+def _scene_table(scene: dict[str, Any]) -> list[str]:
+    reference = scene["reference"]
+    lines = [
+        f"{scene['scene']}: {scene['title']}",
+        f"  truth: {reference['origin']}, own error about {reference['error']:.2%}, {reference['seconds']:.1f} s",
+        f"  {'contender':<38}{'seconds to ' + format(scene['target'], '.0%'):>34}{'slope':>7}{'first run':>11}"
+        f"{'M paths/s':>11}{'energy':>9}   error in seconds (CPU seconds)",
+    ]
+    for curve in scene["curves"]:
+        seconds = curve["seconds_to_target"]
+        reached = FAR if seconds is None else f"{seconds:.3g}"
+        busy = "" if seconds is None else f", CPU {curve['cpu_seconds_to_target']:.3g}"
+        shown = f"{reached}{busy} ({curve['seconds_to_target_is']})"
+        slope = "" if curve["slope"] is None else f"{curve['slope']:.2f}"
+        rate = curve["paths_per_second"]
+        paths = "" if not rate else f"{rate / 1e6:.1f}"
+        bias = f"{curve['energy_bias']:+.1%}"
+        steps = ", ".join(
+            f"{point['error']:.2%} in {point['seconds']:.2f} ({point['cpu_seconds']:.2f})"
+            for point in curve["points"][-3:]
+        )
+        name = curve["name"] + (f" ({curve['engine']})" if curve["name"] == "auto" else "")
+        lines.append(f"  {name:<38}{shown:>34}{slope:>7}{curve['first_seconds']:>9.2f} s{paths:>11}{bias:>9}   {steps}")
+        if curve["bias"] is not None and not curve["engine"].startswith("virtual"):
+            lines.append(f"  {'':<38}biased: independent runs share an error of {curve['bias']:.2%}")
+    return lines
+
+
+def _process_line(process: dict[str, Any]) -> str:
+    stages = ", ".join(f"{stage} {spent:.2f}" for stage, spent in process["seconds"].items())
+    return (
+        f"nlosrender render of {process['scene']} at 1 %: {process['process_seconds']:.2f} s from start to exit "
+        f"(first time {process['first_process_seconds']:.2f} s); inside: {stages}; writing "
+        f"{process['file_bytes'] / 1e6:.1f} MB is {process['write_share']:.0%} of it"
+    )
+
+
+def write_plot(path: Path, report: dict[str, Any]) -> None:
+    """Draw the error of every contender against seconds, one panel per scene, slopes in the legend.
+
+    Raises
+    ------
+    FileError
+        The file cannot be written.
+    """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    from nlosrender.analysis.theme import GROUND
+
+    scenes = report["scenes"]
+    columns = min(2, max(1, len(scenes)))
+    rows = max(1, -(-len(scenes) // columns))
+    figure = Figure(figsize=(7.2 * columns, 5.2 * rows), facecolor=GROUND, layout="constrained")
+    for axes, scene in zip(figure.subplots(rows, columns, squeeze=False).flat, scenes, strict=False):
+        _draw_scene(axes, scene)
+    for axes in figure.axes[len(scenes) :]:
+        axes.set_axis_off()
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        FigureCanvasAgg(figure).print_figure(path, dpi=130)
+    except OSError as error:
+        raise FileError(f"{path}: cannot be written: {error.strerror}.") from error
+
+
+def _draw_scene(axes: Any, scene: dict[str, Any]) -> None:
+    from matplotlib import colormaps
+
+    from nlosrender.analysis.theme import FAINT, INK, PANEL, style
+
+    palette = colormaps["tab10"]
+    for number, curve in enumerate(scene["curves"]):
+        slope = "" if curve["slope"] is None else f", slope {curve['slope']:.2f}"
+        peer = curve["name"].startswith("mitransient")
+        axes.plot(
+            [point["seconds"] for point in curve["points"]],
+            [point["error"] for point in curve["points"]],
+            marker="s" if peer else "o",
+            linestyle="--" if peer else "-",
+            markersize=4,
+            color=palette(number),
+            label=curve["name"] + slope,
+        )
+    axes.axhline(scene["target"], color=INK, linewidth=0.8, linestyle=":")
+    axes.axhline(scene["reference"]["error"], color=FAINT, linewidth=0.8)
+    axes.set_xscale("log")
+    axes.set_yscale("log")
+    axes.grid(visible=True, which="major", color=FAINT, alpha=0.2)
+    style(axes, scene["title"], "seconds", "relative L2 error of H")
+    axes.legend(facecolor=PANEL, edgecolor=FAINT, labelcolor=INK, fontsize=8)

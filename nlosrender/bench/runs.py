@@ -1,0 +1,130 @@
+"""Load a scene once, render it with one engine and one budget, and time that."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nlosrender import pipeline
+from nlosrender.bench.scenes import BenchScene
+from nlosrender.capture.grids import Capture
+from nlosrender.capture.time_axis import TimeAxis
+from nlosrender.engine.backend import Backend, start_backend
+
+if TYPE_CHECKING:
+    from nlosrender.engine.path_engine import Budget
+    from nlosrender.scene.build import BuiltScene
+
+Float64 = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class LoadedScene:
+    """A benchmark scene on the device, with what is measured of it."""
+
+    scene: BenchScene
+    backend: Backend
+    built: BuiltScene
+    capture: Capture
+    time_axis: TimeAxis
+
+    @property
+    def shape(self) -> tuple[int, int, int, int]:
+        """Shape of a result: (laser, row, column, bin); confocal captures have one laser."""
+        grid = self.capture.sensor_grid
+        lasers = self.capture.n_lasers if self.capture.scan_type == "exhaustive" else 1
+        return lasers, grid.ny, grid.nx, self.time_axis.n_bins
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """One render: what came out and what it cost.
+
+    ``seconds`` and ``cpu_seconds`` (all threads) cover setting up the engine and rendering, not loading the scene.
+    """
+
+    values: Float64  # (laser, row, column, bin) H summed over bounces
+    seconds: float
+    cpu_seconds: float
+    estimate: float | None = None  # the engine's own estimate of its relative L2 error
+    samples: int = 0  # paths per sensor point
+    engine: str = ""
+
+
+@dataclass
+class Timer:
+    """Wall-clock and CPU seconds since it was made."""
+
+    begun: float = field(default_factory=time.perf_counter)
+    cpu_begun: float = field(default_factory=time.process_time)
+
+    def read(self) -> tuple[float, float]:
+        """Return wall-clock seconds and CPU seconds of all threads."""
+        return time.perf_counter() - self.begun, time.process_time() - self.cpu_begun
+
+
+def load(scene: BenchScene) -> LoadedScene:
+    """Start the backend and load a scene.
+
+    Raises
+    ------
+    ConfigError
+        The scene's mesh cannot be read.
+    BackendError
+        Nothing on this machine can render.
+    """
+    config = scene.config()
+    backend = start_backend(config.render.backend)
+    built = pipeline.load_scene(config)
+    capture, time_axis = pipeline.describe_capture(config, built.wall, built)
+    return LoadedScene(scene, backend, built, capture, time_axis)
+
+
+def render(loaded: LoadedScene, budget: Budget, seed: int = 0, options: Mapping[str, Any] | None = None) -> Run:
+    """Render a scene with a fresh engine: nothing learnt in an earlier run is used.
+
+    Parameters
+    ----------
+    loaded, budget, seed
+        What, how well, from which random numbers.
+    options
+        Keys of the configuration's ``render`` section, such as ``engine``.
+
+    Raises
+    ------
+    RenderError
+        The result is not finite, or does not fit the memory.
+    """
+    from nlosrender.engine.histogram import relative_l2_error
+
+    config = loaded.scene.config(split_bounces=False, seed=seed, **(options or {}))
+    values = np.zeros(loaded.shape)
+    noise = squares = 0.0
+    samples: list[int] = []
+    timer = Timer()
+    plan, engine = pipeline.prepare(config, loaded.backend, loaded.built, loaded.capture, loaded.time_axis)
+    for batch in plan.batches:
+        histogram = engine.render(batch, budget)
+        sensors = np.s_[batch.sensors.y0 : batch.sensors.y1, batch.sensors.x0 : batch.sensors.x1]
+        lasers: slice | NDArray[np.int64] = slice(0, 1)
+        if loaded.capture.scan_type == "exhaustive":
+            lasers = np.array(batch.lasers.flat_indices(loaded.capture.laser_grid.nx))
+        values[(lasers, *sensors)] = histogram.mean.sum(axis=(0, 1)).reshape(-1, *batch.sensors.shape, values.shape[-1])
+        noise += float(histogram.variance.sum())
+        squares += float((histogram.mean**2).sum())
+        samples.append(histogram.samples)
+    seconds, cpu_seconds = timer.read()
+    estimate = relative_l2_error(noise, squares)
+    return Run(values, seconds, cpu_seconds, estimate, min(samples), engine.name)
+
+
+def chosen_engine(loaded: LoadedScene) -> str:
+    """Return the name of the engine that ``engine: auto`` takes for a scene."""
+    config = loaded.scene.config(split_bounces=False)
+    _, engine = pipeline.prepare(config, loaded.backend, loaded.built, loaded.capture, loaded.time_axis)
+    return engine.name

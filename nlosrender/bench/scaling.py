@@ -1,0 +1,111 @@
+"""How the time grows with the size of the problem: triangles, sensor points, lasers, bins, bounces."""
+
+from __future__ import annotations
+
+import statistics
+import tempfile
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from nlosrender.bench.curve import power_law
+from nlosrender.bench.peer import write_ply
+from nlosrender.bench.runs import Timer, load, render
+from nlosrender.bench.scenes import BenchScene, closed_room, many_lasers, plate, wavy_sheet
+
+REPEATS = 3
+TARGET = 0.02  # error asked for at every size
+SHORT = 1.5  # seconds
+LONGEST = 20.0  # seconds; a size expected to take longer is left out
+WAVES = 3  # across the sheet
+ALL_BOUNCES = 12  # stands for "no limit" on the axis of bounces
+
+
+@dataclass(frozen=True)
+class Scaling:
+    """Median seconds at a fixed target error for growing sizes, and the exponent of the last steps."""
+
+    quantity: str
+    setting: str
+    sizes: tuple[float, ...]
+    seconds: tuple[float, ...]
+    engines: tuple[str, ...]
+
+    @property
+    def exponent(self) -> float | None:
+        """Exponent p of seconds ~ size^p over the last three sizes; None with fewer than two."""
+        return power_law(self.sizes[-3:], self.seconds[-3:])
+
+    def report(self) -> dict[str, Any]:
+        """Return all as plain values."""
+        return {**vars(self), "exponent": self.exponent}
+
+
+def measure_scaling(seconds: float) -> list[Scaling]:
+    """Measure every quantity in about ``seconds`` together; what does not fit is left out.
+
+    Raises
+    ------
+    RenderError
+        A render failed.
+    """
+    with tempfile.TemporaryDirectory(prefix="nlosrender-bench-") as folder:
+        return [_measure(*axis, seconds / 5) for axis in _axes(Path(folder))]
+
+
+def _axes(folder: Path) -> list[tuple[str, str, Sequence[float], Callable[[int], BenchScene]]]:
+    """Return quantity, what stays fixed, sizes, and the scene of a size."""
+
+    def sheet(n_triangles: int) -> BenchScene:
+        mesh = folder / f"sheet_{n_triangles}.ply"
+        write_wavy_sheet(mesh, n_triangles)
+        return wavy_sheet(mesh)
+
+    return [
+        ("triangles", "32 x 32 sensor points, 700 bins", (200, 1800, 16200, 64800, 259200), sheet),
+        ("sensor points", "plate, 320 bins", (256, 1024, 4096, 16384), lambda n: plate(round(n**0.5))),
+        ("lasers", "plate, 16 x 16 sensor points", (1, 4, 16, 64), lambda n: many_lasers(round(n**0.5))),
+        ("bins", "plate, 64 x 64 sensor points, same window", (160, 320, 640, 1280), lambda n: plate(n_bins=n)),
+        (
+            "bounces",
+            f"closed room, 16 x 16 sensor points; {ALL_BOUNCES} stands for no limit",
+            (3, 4, 5, 7, ALL_BOUNCES),
+            lambda n: closed_room(16, None if n == ALL_BOUNCES else n),
+        ),
+    ]
+
+
+def _measure(
+    quantity: str, setting: str, sizes: Sequence[float], scene_of: Callable[[int], BenchScene], seconds: float
+) -> Scaling:
+    begun = Timer()
+    measured: list[tuple[float, float, str]] = []
+    for size in sizes:
+        if len(measured) >= 2:
+            growth = measured[-1][1] / measured[-2][1]
+            expected = 2 * measured[-1][1] * max(growth, 1.0)
+            if begun.read()[0] + expected > seconds or measured[-1][1] * growth > LONGEST:
+                break
+        loaded = load(scene_of(int(size)))
+        from nlosrender.engine.path_engine import Budget  # the backend has to be started before
+
+        runs = [render(loaded, Budget(target_error=TARGET), seed, {"engine": "auto"}) for seed in range(2)]
+        if runs[1].seconds < SHORT:  # the first run compiles; long runs are not repeated
+            runs += [render(loaded, Budget(target_error=TARGET), 2 + k, {"engine": "auto"}) for k in range(REPEATS - 1)]
+        measured.append((size, statistics.median(run.seconds for run in runs[1:]), runs[0].engine))
+    return Scaling(quantity, setting, *(tuple(column) for column in zip(*measured, strict=True)))
+
+
+def write_wavy_sheet(path: Path, n_triangles: int) -> None:
+    """Write a square sheet of 0.8 m with waves of 5 cm, facing -z, of 2 n^2 triangles, near ``n_triangles``."""
+    n = max(1, round((n_triangles / 2) ** 0.5))
+    along = np.linspace(-0.4, 0.4, n + 1)
+    x, y = (side.ravel() for side in np.meshgrid(along, along))
+    z = 0.05 * np.sin(2 * np.pi * WAVES * x / 0.8) * np.cos(2 * np.pi * WAVES * y / 0.8)
+    corner = (np.arange(n)[:, None] * (n + 1) + np.arange(n)).ravel()
+    lower = np.stack([corner, corner + n + 1, corner + 1], axis=1)
+    upper = np.stack([corner + 1, corner + n + 1, corner + n + 2], axis=1)
+    write_ply(path, np.stack([x, y, z], axis=1), np.concatenate([lower, upper]))

@@ -1,0 +1,75 @@
+"""``nlosrender bench``: run time against error."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+
+def register(app: typer.Typer) -> None:
+    """Add ``bench`` to ``app``."""
+    app.command()(bench)
+
+
+def bench(
+    scene: Annotated[
+        list[str] | None,
+        typer.Option(metavar="NAME", help="Scene to race on; may be repeated.", show_default="all"),
+    ] = None,
+    part: Annotated[
+        list[str] | None,
+        typer.Option(metavar="PART", help="curves, scaling, rates or process; may be repeated.", show_default="all"),
+    ] = None,
+    seconds: Annotated[float, typer.Option(min=1.0, help="Time for all of it, compilation on top.")] = 300.0,
+    mesh: Annotated[
+        Path | None,
+        typer.Option(help="Mesh about 0.8 m high, such as the Stanford bunny: adds the bunny's three scenes."),
+    ] = None,
+    peer: Annotated[
+        str | None,
+        typer.Option(metavar="COMMAND", help="Also race another renderer, see 'make bench-peers'."),
+    ] = None,
+    output: Annotated[Path, typer.Option("-o", "--output", help="OUTPUT.json and OUTPUT.png are written.")] = Path(
+        "out/bench"
+    ),
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object instead of a table.")] = False,
+) -> None:
+    """Measure run time against error on scenes with known truth, scaling, and rates.
+
+    Example: nlosrender bench --scene plate --part curves --seconds 30 -o out/bench
+    prints a table and creates out/bench.json and out/bench.png.
+    """
+    import json
+
+    from nlosrender.bench.benchmark import PARTS, run_benchmark
+    from nlosrender.bench.report import table, write_json, write_plot
+    from nlosrender.bench.scenes import built_in_scenes
+
+    if mesh is not None and not mesh.is_file():
+        raise typer.BadParameter(f"{mesh}: there is no such file", param_hint="--mesh")
+    known = built_in_scenes(mesh)
+    # a real mesh tells more than the letters, which stand in for one
+    names = scene or [name for name in known if mesh is None or name != "letters"]
+    scenes = [known[_one_of(name, known, "--scene")] for name in names]
+    parts = [_one_of(name, PARTS, "--part") for name in part or PARTS]
+    found = run_benchmark(scenes, seconds, parts, peer, lambda what: typer.echo(what, err=True))
+    report = found.report()
+    write_json(output.with_name(output.name + ".json"), report)
+    if report["scenes"]:
+        write_plot(output.with_name(output.name + ".png"), report)
+    typer.echo(json.dumps(report, allow_nan=False) if as_json else table(report))
+
+
+def _one_of(name: str, known: Iterable[str], option: str) -> str:
+    from nlosrender.errors import nearest
+
+    names = list(known)
+    if name not in names:
+        close = nearest(name, names)
+        hint = f" Did you mean {close}?" if close else ""
+        needs_mesh = " The bunny's scenes need --mesh." if name.startswith("bunny") else ""
+        raise typer.BadParameter(f"got {name!r}, need one of {', '.join(names)}.{hint}{needs_mesh}", param_hint=option)
+    return name
