@@ -173,7 +173,7 @@ def _scene_result(loaded: LoadedScene, peer: Peer | None, seconds: float) -> Sce
     contenders: list[Contender] = own_contenders(loaded)
     if peer is not None:
         contenders += peer_contenders(peer, loaded)
-    curves = race(contenders, reference, max(seconds - timer.read()[0], seconds / 2), matched)
+    curves = race(contenders, reference, max(seconds - timer.read()[0], seconds / 2), loaded.scene.target, matched)
     return SceneResult(
         loaded.scene,
         reference.origin,

@@ -46,7 +46,7 @@ class Curve:
     """Points of one contender on one scene, from the cheapest setting up."""
 
     name: str
-    counts_paths: bool
+    is_random: bool
     points: list[Point] = field(default_factory=list)
     first_seconds: float = 0.0  # the first render of the process, with compilation or loading of cached kernels
     engine: str = ""
@@ -72,7 +72,7 @@ class Curve:
     def time_to(self, target: float, *, cpu: bool = False) -> tuple[float, HowKnown]:
         """Return the seconds (or CPU seconds) to a relative L2 error of ``target``, and how they are known.
 
-        Interpolated along straight lines of the log-log plot. Beyond the last point, the error of independent paths
+        Interpolated along straight lines of the log-log plot. Beyond the last point, the error of a random contender
         falls as 1 / sqrt(seconds), so the time is extrapolated, unless a bias above the target stands in the way;
         for others the time is unknown. The time of a first point below the target is an upper bound and counts as
         measured.
@@ -83,7 +83,7 @@ class Curve:
         for (t0, e0), (t1, e1) in pairwise(steps):
             if e1 <= target:
                 return t0 * (t1 / t0) ** (math.log(e0 / target) / math.log(e0 / e1)), "interpolated"
-        if not self.counts_paths or (self.bias is not None and self.bias > target):
+        if not self.is_random or (self.bias is not None and self.bias > target):
             return math.inf, "not reached"
         seconds, error = steps[-1]
         return seconds * (error / target) ** 2, "extrapolated"

@@ -10,7 +10,7 @@ import json
 import shlex
 import subprocess
 import tempfile
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -25,6 +25,7 @@ from nlosrender.errors import BackendError
 from nlosrender.scene.hidden_geometry import MeshFile
 from nlosrender.scene.triangle_mesh import TriangleMesh
 
+CALIBRATION_LEVEL = 2
 # Royo et al. 2022's techniques by their names in mitransient. Hidden geometry sampling is biased under occlusion.
 UNBIASED: dict[str, Any] = {"nlos_laser_sampling": True}
 FASTEST: dict[str, Any] = {"nlos_laser_sampling": True, "nlos_hidden_geometry_sampling": True}
@@ -103,7 +104,8 @@ class PeerContender:
     peer: Peer
     description: dict[str, Any]
     settings: dict[str, Any]
-    counts_paths: bool = True
+    is_random: bool = True
+    agreement: dict[str, Any] = field(default_factory=dict)  # of all runs so far with the reference
 
     def run(self, level: int, seed: int) -> Run:
         """Render once with ``FIRST_SAMPLES * 4^level`` paths per sensor point.
@@ -169,17 +171,26 @@ def scene_is_confocal(loaded: LoadedScene) -> bool:
 def matched(contender: Contender, run: Run, reference: Reference) -> np.ndarray:
     """Bring a peer's result to our unit with one scale for each laser point: its projector's energy depends on it.
 
-    The scale is sum(R^2) / sum(R T) for the result T and the reference R: linear in T, so that noise in T averages
-    out. The scale of least error, sum(R T) / sum(T^2), would shrink a noisy result until no error exceeds 100 %.
-    A fitted scale hides an error of the energy, which is therefore reported by itself.
+    The scale is sum(R^2) / sum(R T) for the reference R and the mean T of all runs so far: linear in T, so that noise
+    averages out. The scale of least error, sum(R T) / sum(T^2), would shrink a noisy result until no error exceeds
+    100 %. A fitted scale hides an error of the energy, which is therefore reported by itself.
     """
     if not isinstance(contender, PeerContender):
         return run.values
     axes = (3,) if contender.description["scan"] == "confocal" else (1, 2, 3)
-    truth = reference.values
-    agreement = (run.values * truth).sum(axis=axes, keepdims=True)
-    scale = (truth**2).sum(axis=axes, keepdims=True) / np.where(agreement > 0, agreement, np.inf)
-    return np.asarray(run.values * scale)
+    known = contender.agreement
+    if not known and len(axes) == 1:  # few bins behind each scale: start from a longer run
+        _note_agreement(known, contender.run(CALIBRATION_LEVEL, seed=98), reference, axes)
+    _note_agreement(known, run, reference, axes)
+    scale = (reference.values**2).sum(axis=axes, keepdims=True) * known["samples"]
+    return np.asarray(run.values * (scale / np.where(known["products"] > 0, known["products"], np.inf)))
+
+
+def _note_agreement(known: dict[str, Any], run: Run, reference: Reference, axes: tuple[int, ...]) -> None:
+    """Add the products of a run with the reference, weighted by its samples."""
+    products = (run.values * reference.values).sum(axis=axes, keepdims=True)
+    known["products"] = known.get("products", 0.0) + products * run.samples
+    known["samples"] = known.get("samples", 0) + run.samples
 
 
 def write_ply(path: Path, vertices: np.ndarray, faces: np.ndarray) -> None:

@@ -17,7 +17,7 @@ from nlosrender.bench.runs import LoadedScene, Run, Timer, chosen_engine, render
 REPEATS = 3
 SHORT_SECONDS = 1.5  # runs up to this long are repeated, and their median reported
 FIRST_SAMPLES = 64  # paths per sensor point at level 0; each level takes four times as many
-FIRST_TARGET = 0.2  # target error at level 0; each level asks for half of it
+FIRST_TARGET = 0.08  # target error at level 0; each level asks for half of it
 SIGNIFICANT = 4.0  # standard deviations
 FIXED_POINT = 1.5  # an error this close to the reference's own says nothing about the contender
 
@@ -31,8 +31,8 @@ class Contender(Protocol):
         ...
 
     @property
-    def counts_paths(self) -> bool:
-        """Whether a level is a number of paths, so that the error falls as 1 / sqrt of it."""
+    def is_random(self) -> bool:
+        """Whether its error is noise, which falls as 1 / sqrt of the time."""
         ...
 
     def run(self, level: int, seed: int) -> Run:
@@ -47,7 +47,16 @@ class OwnContender:
     name: str
     loaded: LoadedScene
     options: Mapping[str, Any]
-    counts_paths: bool
+
+    @property
+    def counts_paths(self) -> bool:
+        """Whether a level is a number of paths, otherwise a target error."""
+        return self.options["engine"] == "path"
+
+    @property
+    def is_random(self) -> bool:
+        """All but the third bounce of the virtual lights."""
+        return self.counts_paths or self.loaded.scene.max_bounces != 3
 
     def run(self, level: int, seed: int) -> Run:
         """Render once: ``FIRST_SAMPLES * 4^level`` paths per sensor point, or to ``FIRST_TARGET / 2^level``.
@@ -69,11 +78,11 @@ class OwnContender:
 def own_contenders(loaded: LoadedScene) -> list[Contender]:
     """Return our engines for a scene: the one that ``auto`` takes, the virtual lights, the path engine both ways."""
     bsdf_only = {"engine": "path", "hidden_geometry_sampling": False}
-    contenders: list[Contender] = [OwnContender("auto", loaded, {"engine": "auto"}, False)]
+    contenders: list[Contender] = [OwnContender("auto", loaded, {"engine": "auto"})]
     if chosen_engine(loaded) != "virtual_lights":
-        contenders.append(OwnContender("virtual lights", loaded, {"engine": "virtual_lights"}, False))
-    contenders.append(OwnContender("path", loaded, {"engine": "path"}, True))
-    contenders.append(OwnContender("path, BSDF sampling", loaded, bsdf_only, True))
+        contenders.append(OwnContender("virtual lights", loaded, {"engine": "virtual_lights"}))
+    contenders.append(OwnContender("path", loaded, {"engine": "path"}))
+    contenders.append(OwnContender("path, BSDF sampling", loaded, bsdf_only))
     return contenders
 
 
@@ -91,6 +100,7 @@ def race(
     contenders: Sequence[Contender],
     reference: Reference,
     seconds: float,
+    target: float,
     match: Callable[[Contender, Run, Reference], np.ndarray] = lambda contender, run, reference: run.values,
 ) -> list[Curve]:
     """Run all contenders, level by level, each for about its share of ``seconds``.
@@ -100,7 +110,9 @@ def race(
     contenders, reference
         Who renders, and the truth.
     seconds
-        For all of them together. A contender goes on while its next level can be expected to fit.
+        For all of them together. A contender goes on while its next level can be expected to fit into its share.
+    target
+        A contender that has not come to this error yet may take twice its share.
     match
         Brings a result to the reference's scale, where a contender's unit is not ours.
 
@@ -114,7 +126,7 @@ def race(
     RenderError
         A render failed.
     """
-    lanes = [_Lane(contender, Curve(contender.name, contender.counts_paths)) for contender in contenders]
+    lanes = [_Lane(contender, Curve(contender.name, contender.is_random)) for contender in contenders]
     for lane in lanes:  # compiles, or loads the kernels compiled before; never part of a point
         lane.curve.first_seconds = lane.contender.run(0, seed=99).seconds
     level, active = 0, list(lanes)
@@ -133,18 +145,18 @@ def race(
             lane.runs = []
         done = sum(lane.spent for lane in lanes if lane not in active)
         share = (seconds - done) / len(active)  # what others left over is shared by those that go on
-        active = [lane for lane in active if _goes_on(lane, share, reference.error)]
+        active = [lane for lane in active if _goes_on(lane, share, target, reference.error)]
         level += 1
     return [lane.curve for lane in lanes]
 
 
-def _goes_on(lane: _Lane, share: float, reference_error: float) -> bool:
+def _goes_on(lane: _Lane, share: float, target: float, reference_error: float) -> bool:
     points = lane.curve.points
     if points[-1].error < FIXED_POINT * reference_error:
         return False
     growth = points[-1].seconds / points[-2].seconds if len(points) > 1 else 2.0
-    expected = points[-1].seconds * min(max(growth, 1.5), 4.0 if lane.contender.counts_paths else 8.0)
-    return lane.spent + expected < share
+    expected = points[-1].seconds * min(max(growth, 1.5), 4.0 if lane.contender.is_random else 8.0)
+    return lane.spent + expected < share * (2 if points[-1].error > target else 1)
 
 
 def _point(runs: list[Run], matched: list[np.ndarray], reference: Reference) -> Point:
@@ -169,12 +181,13 @@ def _shared_error(one: np.ndarray, other: np.ndarray, reference: Reference) -> f
     """Return the relative L2 error that two independent runs share, None when it is lost in their noise.
 
     Independent noise cancels in the product of two runs' errors; what is left is the square of what they have in
-    common, the reference's own error included, which is taken off.
+    common, the reference's own error included. That is taken off; a rest below it says nothing.
     """
     squares = float((reference.values**2).sum())
     products = one * other
     deviation = math.sqrt(float((products**2).sum()))
     shared = float(products.sum())
-    if shared < SIGNIFICANT * deviation:
+    rest = shared / squares - reference.error**2
+    if shared < SIGNIFICANT * deviation or rest < reference.error**2:
         return None
-    return math.sqrt(max(0.0, shared / squares - reference.error**2))
+    return math.sqrt(rest)

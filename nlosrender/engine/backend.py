@@ -71,6 +71,7 @@ def start_backend(wanted: BackendName = "auto", *, colored: bool = False) -> Bac
         import mitsuba
 
         mitsuba.set_variant(variant)
+        mitsuba.set_log_level(mitsuba.LogLevel.Error)  # its warnings go to stdout, into the middle of our JSON
     except ImportError as error:
         raise BackendError(f"Mitsuba cannot start its variant {variant}: {error}. Try 'nlosrender doctor'.") from error
     return Backend(name, variant, library)

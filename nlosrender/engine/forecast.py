@@ -27,7 +27,7 @@ PILOT_SECONDS = 0.5
 PILOT_BYTES = 128e6  # of histograms: a forecast must not take the memory of the render
 PILOT_DEPOSITS = 5e8  # of the gather, patches times bins they cover: a fraction of a second
 MOST_PILOTS = 20.0  # pilots' worth of deposits for one sensor point above which no pilot is run
-LAUNCH_OVERHEAD = 0.05  # s per batch at most that does not grow with the batch
+LAUNCH_OVERHEAD = 0.01  # s per batch at most that does not grow with the batch
 SECOND_LOOK = 1.1  # the engines look at the error now and then only, and overshoot by so much
 
 
@@ -156,14 +156,19 @@ def _lit_shares(pilot: Histogram, bounces: BounceAxis) -> tuple[float | None, ..
 
 def _gather_seconds(engine: VirtualLightEngine, plan: Plan, pilot: Batch, budget: Budget) -> tuple[float, Histogram]:
     """Return the seconds of the gather, and the third bounce of the pilot's sensor points."""
-    third_only = replace(engine.options, bounces=BounceAxis(THIRD_BOUNCE, split=False))
-    gather = VirtualLightEngine(engine.built, engine.capture, engine.time_axis, third_only, engine.lanes)
+    third_only = replace(engine.options, bounces=BounceAxis(THIRD_BOUNCE, engine.options.bounces.split))
+    scene = (engine.built, engine.capture, engine.time_axis, third_only, engine.lanes)
+    gather = VirtualLightEngine(*scene)
     goal = Budget(target_error=budget.target_error or DEFAULT_TARGET, time_limit_s=PILOT_SECONDS)
     gather.render(pilot, goal)  # compiles, and finds how fine the patches have to be
     part = _middle(pilot.sensors, max(1, pilot.sensors.size // 4))
     quarter = Batch(part, part if engine.capture.scan_type == "confocal" else pilot.lasers)
-    _, quarter_seconds = _timed(gather, quarter, goal)
-    third, seconds = _timed(gather, pilot, goal)
+    if len(plan.batches) > 1:
+        again = (gather, gather)
+    else:  # every run starts as coarse as the render does; of many batches only the first one would
+        again = (VirtualLightEngine(*scene), VirtualLightEngine(*scene))
+    _, quarter_seconds = _timed(again[0], quarter, goal)
+    third, seconds = _timed(again[1], pilot, goal)
     # what every batch pays for its patches, and what every sensor point adds
     more = pilot.sensors.size - part.size
     per_point = max(seconds - quarter_seconds, 0.0) / more if more else seconds / pilot.sensors.size

@@ -229,7 +229,9 @@ class PathEngine:
         if not options.hidden_geometry_sampling or self.sampler.is_empty or built.hidden_bounds is None:
             return 0.0
         distance = built.hidden_bounds[0][2] / built.unit
-        only_hidden = built.wall.is_planar and self.sampler.covers_everything  # all light comes from sampled surfaces
+        # All light comes from sampled surfaces, and the wall has no mirror lobe that only its own sampling finds.
+        only_hidden = built.wall.is_planar and self.sampler.covers_everything
+        only_hidden &= not built.wall_bsdf.flags() & mi.BSDFFlags.Delta
         if only_hidden and distance > 0 and self.sampler.area < NEAR_RATIO * math.pi * distance**2:
             return 1.0
         return 0.0 if self._surrounded_share() > SURROUNDED else 0.5

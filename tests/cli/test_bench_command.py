@@ -26,7 +26,7 @@ class Noisy:
     """A contender whose error is known: noise that halves with each level and a bias, both relative L2."""
 
     def __init__(self, name, noise, bias=0.0):
-        self.name, self.noise, self.bias, self.counts_paths = name, noise, bias, True
+        self.name, self.noise, self.bias, self.is_random = name, noise, bias, True
         self.seeds = []
 
     def run(self, level, seed):
@@ -40,7 +40,7 @@ class Noisy:
 
 def test_a_race_finds_error_slope_and_bias_of_a_contender_that_has_them():
     """Noise of s per run gives an error of s; what runs share shows in their product, independent noise does not."""
-    clean, biased = race([Noisy("clean", 1.0), Noisy("biased", 1.0, bias=0.5)], EXACT, seconds=1e-3)
+    clean, biased = race([Noisy("clean", 1.0), Noisy("biased", 1.0, bias=0.5)], EXACT, seconds=1e-3, target=0.9)
     assert len(clean.points) == len(biased.points) >= 1
     first = clean.points[0]
     assert first.repeats == 3
@@ -61,13 +61,13 @@ def test_contenders_take_turns():
             order.append(self.name)
             return super().run(level, seed)
 
-    race([Watched("a", 1.0), Watched("b", 1.0)], EXACT, seconds=1e-9)
+    race([Watched("a", 1.0), Watched("b", 1.0)], EXACT, seconds=1e-9, target=0.9)
     assert order == ["a", "b"] * (len(order) // 2)
     assert len(order) == 8  # one that compiles and three that count, each
 
 
-def curve(*points, counts_paths=True, bias=None):
-    found = Curve("some", counts_paths)
+def curve(*points, is_random=True, bias=None):
+    found = Curve("some", is_random)
     for seconds, error in points:
         found.add(Point(seconds, 2 * seconds, error, systematic=bias))
     return found
@@ -82,7 +82,7 @@ def test_time_to_an_error_is_read_off_or_extrapolated_or_unknown():
     assert measured.time_to(0.01) == (pytest.approx(16.0 * 25), "extrapolated")
     assert measured.time_to(0.01, cpu=True) == (pytest.approx(32.0 * 25), "extrapolated")
     assert measured.slope() == pytest.approx(-0.5)
-    assert curve((1.0, 0.2), counts_paths=False).time_to(0.1) == (math.inf, "not reached")
+    assert curve((1.0, 0.2), is_random=False).time_to(0.1) == (math.inf, "not reached")
     assert curve((1.0, 0.2), bias=0.15).time_to(0.1) == (math.inf, "not reached")
     assert curve((1.0, 0.2), bias=0.05).time_to(0.1) == (pytest.approx(4.0), "extrapolated")
 
@@ -98,8 +98,9 @@ def test_noise_of_a_peer_is_not_scaled_away(scan):
     """A peer's unit, per laser point, does not matter, and its noise of 300 % stays an error of 300 %."""
     unit = 7.0 if scan == "single" else np.random.default_rng(2).uniform(5, 9, (1, 3, 5, 1))
     noise = np.random.default_rng(3).standard_normal(TRUTH.shape) * np.sqrt((TRUTH**2).mean())
-    contender = PeerContender("peer", SimpleNamespace(), {"scan": scan}, {})
-    values = matched(contender, Run(unit * (TRUTH + 3.0 * noise), 0.0, 0.0), EXACT)
+    run = Run(unit * (TRUTH + 3.0 * noise), 0.0, 0.0, samples=64)
+    contender = PeerContender("peer", SimpleNamespace(), {"scan": scan}, {}, agreement={"samples": 0})
+    values = matched(contender, run, EXACT)
     error = np.linalg.norm(values - TRUTH) / np.linalg.norm(TRUTH)
     # a scale is off by 3 / sqrt(bins behind it): 4 % for all 6000, 15 % for the 400 of one laser point
     assert error == pytest.approx(3.0, rel=0.15 if scan == "confocal" else 0.08)

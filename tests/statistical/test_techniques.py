@@ -82,6 +82,32 @@ def test_the_mixture_does_not_change_the_result(scan: str, hidden_fraction: floa
         )
 
 
+def test_a_wall_with_a_mirror_lobe_keeps_it() -> None:
+    """Smooth plastic mirrors a part of the light in one direction, which no point sampled on the plate can meet."""
+    large = PLATE | {"width": 1.6, "height": 1.4, "normal": [0.0, 0.0, -1.0], "center": [0.0, 0.0, 0.6]}
+    config = flat_wall(
+        large,
+        sensors=(3, 2),
+        bins=(0.8, 0.2, 20),
+        wall={"bsdf": {"type": "plastic", "diffuse_reflectance": 0.4}},
+        capture={"sensor_position": [0.3, 0.2, 0.5]},
+        spp=131072,
+    )
+    chosen, mixed, by_chance = (
+        render(config | {"render": config["render"] | {"seed": seed}}, replicas=REPLICAS, hidden_fraction=fraction)
+        for seed, fraction in enumerate((None, 0.5, 0.0))
+    )
+    for result in (chosen, mixed):
+        assert_agrees(
+            result.total,
+            result.total_variance,
+            by_chance.total,
+            reference_variance=by_chance.total_variance,
+            replicas=REPLICAS,
+            share=0.05,
+        )
+
+
 CURVED = {
     "sphere": {"type": "sphere", "radius": 0.8, "inside": True},
     "cylinder": {"type": "cylinder", "radius": 0.6, "height": 1.4, "inside": True},

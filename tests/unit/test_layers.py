@@ -17,7 +17,7 @@ IN_STAGES = [path for path in MODULES if path.relative_to(PACKAGE).parts[0] in S
 MUST_NOT_RENDER = [
     path
     for path in MODULES
-    if path.relative_to(PACKAGE).parts[0] != "engine" and path != PACKAGE / "scene" / "build.py"
+    if path.relative_to(PACKAGE).parts[0] not in ("engine", "bench") and path != PACKAGE / "scene" / "build.py"
 ]
 
 
