@@ -99,7 +99,8 @@ def _print_report(report: RenderReport) -> None:
     seconds = report.seconds
     typer.echo(f"wrote {report.output}")
     typer.echo(f"  engine          {report.engine}: {report.reason}")
-    typer.echo(f"  error estimate  {report.error_estimate:.2%} (relative L2), {report.samples} paths per sensor point")
+    paths = f", {report.samples} paths per sensor point" if report.samples else ""
+    typer.echo(f"  error estimate  {report.error_estimate:.2%} (relative L2){paths}")
     energies = ", ".join(f"{name}: {energy:.4g}" for name, energy in report.energy.items())
     typer.echo(f"  energy          bounce {energies}; outside the time window: {report.out_of_window:.4g}")
     stages = ", ".join(f"{stage} {spent:.2f}" for stage, spent in seconds.items() if stage != "total")
