@@ -23,7 +23,7 @@ from nlosrender.capture.time_axis import TimeAxis, resolve_time_axis
 from nlosrender.config.document import Config
 from nlosrender.config.load import config_hash, config_to_dict
 from nlosrender.config.warnings import config_warnings
-from nlosrender.engine.backend import Backend, batch_memory, start_backend
+from nlosrender.engine.backend import Backend, batch_memory, physical_memory, start_backend
 from nlosrender.errors import ConfigError, Problem
 from nlosrender.files.capture_file import CaptureHeader
 from nlosrender.files.provenance import provenance_attributes, result_attributes
@@ -237,7 +237,7 @@ def place_scene(config: Config) -> tuple[RelayWall, tuple[Surface, ...]]:
 
 def describe_capture(config: Config, wall: RelayWall, built: BuiltScene) -> tuple[Capture, TimeAxis]:
     """Stage 3: laser and sensor points, legs and bins."""
-    refuse_impossible_grids(config.capture, batch_memory(config.render.memory_limit_bytes))
+    refuse_impossible_grids(config.capture, config.render.memory_limit_bytes or physical_memory())
     capture = build_capture(config.capture, wall)
     time_axis = resolve_time_axis(config.time_axis, capture, wall, built.hidden_bounds, config.render.max_bounces)
     return capture, time_axis

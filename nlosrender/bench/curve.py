@@ -65,7 +65,12 @@ class Curve:
 
     @property
     def bias(self) -> float | None:
-        """Return the systematic error, from the last point that shows one."""
+        """Return the systematic error, from the last point that shows one; None when none is known.
+
+        What two runs of the virtual lights share is their resolution's error, which the next level halves: no bias.
+        """
+        if self.engine == "virtual_lights":
+            return None
         known = [point.systematic for point in self.points if point.systematic is not None]
         return known[-1] if known else None
 

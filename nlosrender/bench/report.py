@@ -83,7 +83,7 @@ def _scene_table(scene: dict[str, Any]) -> list[str]:
         )
         name = curve["name"] + (f" ({curve['engine']})" if curve["name"] == "auto" else "")
         lines.append(f"  {name:<38}{shown:>34}{slope:>7}{curve['first_seconds']:>9.2f} s{paths:>11}{bias:>9}   {steps}")
-        if curve["bias"] is not None and not curve["engine"].startswith("virtual"):
+        if curve["bias"] is not None:
             lines.append(f"  {'':<38}biased: independent runs share an error of {curve['bias']:.2%}")
     return lines
 

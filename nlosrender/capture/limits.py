@@ -32,7 +32,7 @@ def refuse_impossible_grids(capture_config: CaptureConfig, memory_limit: int) ->
         if grid is not None and grid.n_points * POINT_BYTES > memory_limit:
             raise RenderError(
                 f"capture.{key}: {grid.nx} x {grid.ny} points take {grid.n_points * POINT_BYTES / 1e9:.3g} GB for "
-                f"their positions alone, but render.memory_limit leaves {memory_limit / 1e9:.3g} GB. Use fewer points."
+                f"their positions alone, but there are {memory_limit / 1e9:.3g} GB. Use fewer points."
             )
 
 

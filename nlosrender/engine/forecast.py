@@ -89,13 +89,17 @@ def estimate_render_time(
 
 
 def pilot_batch(engine: PathEngine | VirtualLightEngine, plan: Plan) -> Batch:
-    """Return the middle of the plan's middle batch: as many sensor points as a pilot can take, all its lasers."""
+    """Return the middle of the plan's middle batch: as many sensor points as a pilot can take, then as many lasers."""
     batch = plan.batches[len(plan.batches) // 2]
     most = PILOT_BYTES / (plan.bytes_per_batch / max(b.sensors.size for b in plan.batches))
     if isinstance(engine, VirtualLightEngine):
         most = min(most, PILOT_DEPOSITS / _deposits_per_sensor(engine, batch))
     sensors = _middle(batch.sensors, max(1, int(most)))
-    return Batch(sensors, sensors if engine.capture.scan_type == "confocal" else batch.lasers)
+    if engine.capture.scan_type == "confocal":
+        return Batch(sensors, sensors)
+    return Batch(
+        sensors, _middle(batch.lasers, max(1, int(most * batch.lasers.size)) if most < 1 else batch.lasers.size)
+    )
 
 
 def _deposits_per_sensor(engine: VirtualLightEngine, batch: Batch) -> float:
@@ -139,10 +143,19 @@ def _path_seconds(
     # A pilot of a few sensor points leaves processors idle that the render will use; a quarter of the lanes fills
     # their vector units, the rest only evens out the load.
     idle = min(1.0, pilot.sensors.size / min(largest, max(1.0, lanes / 4 / plan.replicas)))
-    points = sum(batch.sensors.size for batch in plan.batches)  # once more for every cut between lasers
+    points = _sensor_visits(paths.capture, plan, pilot)
     growing = max(overhead - LAUNCH_OVERHEAD, 0.0) * _all_pairs(paths.capture, plan) / n_pairs(paths.capture, pilot)
     fixed = min(overhead, LAUNCH_OVERHEAD) * len(plan.batches)
     return needed * points * per_path * idle + growing + fixed, second
+
+
+def _sensor_visits(capture: Capture, plan: Plan, pilot: Batch) -> float:
+    """Return the sensor points of all batches, as many times as each has more lasers than the pilot.
+
+    The cost of a path or patch is taken as linear in the lasers it is connected to: with few of them it is less.
+    """
+    lasers = pilot.lasers.size if capture.scan_type == "exhaustive" else 1
+    return _all_pairs(capture, plan) / lasers
 
 
 def _lit_shares(pilot: Histogram, bounces: BounceAxis) -> tuple[float | None, ...] | None:
@@ -163,17 +176,15 @@ def _gather_seconds(engine: VirtualLightEngine, plan: Plan, pilot: Batch, budget
     gather.render(pilot, goal)  # compiles, and finds how fine the patches have to be
     part = _middle(pilot.sensors, max(1, pilot.sensors.size // 4))
     quarter = Batch(part, part if engine.capture.scan_type == "confocal" else pilot.lasers)
-    if len(plan.batches) > 1:
-        again = (gather, gather)
-    else:  # every run starts as coarse as the render does; of many batches only the first one would
-        again = (VirtualLightEngine(*scene), VirtualLightEngine(*scene))
-    _, quarter_seconds = _timed(again[0], quarter, goal)
-    third, seconds = _timed(again[1], pilot, goal)
+    # Every run starts as coarse as the render does; of many batches only the first one would.
+    gathers = [gather if len(plan.batches) > 1 else VirtualLightEngine(*scene) for _ in range(2)]
+    _, quarter_seconds = _timed(gathers[0], quarter, goal)
+    third, seconds = _timed(gathers[1], pilot, goal)
     # what every batch pays for its patches, and what every sensor point adds
     more = pilot.sensors.size - part.size
     per_point = max(seconds - quarter_seconds, 0.0) / more if more else seconds / pilot.sensors.size
     per_batch = max(seconds - per_point * pilot.sensors.size, 0.0)
-    points = sum(batch.sensors.size for batch in plan.batches)
+    points = _sensor_visits(engine.capture, plan, pilot)
     finer = max(1.0, _error(third) / (goal.target_error or DEFAULT_TARGET))
     return (per_batch * len(plan.batches) + per_point * points) * finer, third
 

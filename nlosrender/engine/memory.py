@@ -58,13 +58,18 @@ def memory_warnings(
     Raises
     ------
     RenderError
-        As ``batch_bytes``, or the gather's patches do not fit the memory.
+        As ``batch_bytes``, or a batch or the gather's patches do not fit the memory.
     """
     taken, physical = batch_bytes(engine, plan), physical_memory()
     if isinstance(engine, VirtualLightEngine):
         _refuse_patches(engine, batch_memory(memory_limit))
     if memory_limit is not None and memory_limit > physical:
         yield f"render.memory_limit: {_size(memory_limit)} is more than the machine's {_size(physical)}."
+    if taken > physical:
+        raise RenderError(
+            f"a batch takes {_size(taken)}, more than the machine's {_size(physical)}: the gather needs rows for every "
+            "processor. Use fewer bins or lasers, or render.engine: path."
+        )
     if taken > batch_memory(memory_limit):
         yield (
             f"render.memory_limit: a batch takes {_size(taken)}, more than is left for it: the gather needs rows for "

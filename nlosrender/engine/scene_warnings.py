@@ -23,7 +23,8 @@ from nlosrender.scene.pose import Float64
 
 POINTS_PER_SURFACE = 64
 MOST_RAYS = 1_000_000  # of all surfaces together: a warning must not take longer than a small render
-RAY_MARGIN = 1e-4  # share of a ray's length, and engine units above the wall, that are left out
+RAY_MARGIN = 2e-5  # share of a ray's length, and engine units above the wall, that are left out
+GRAZING = 1e-2  # cosine below which a ray may slip past the limb of a round shape within its margin
 FINEST_BIN = 2e-6  # engine units; float32 path lengths of a scene of size 1 are good to about 5e-7
 
 
@@ -91,7 +92,7 @@ def _occlusion_warnings(
     for surface, is_lit, is_seen in zip(surfaces, lit, seen, strict=True):
         name = f"{surface.key} ({surface.name})"
         if not (is_lit or is_seen):
-            yield f"{name} is hidden from the relay wall by other surfaces; no third bounce comes from it."
+            yield f"{name} is hidden from the relay wall by what lies between; no third bounce comes from it."
         elif only_third and not (is_lit and is_seen):
             whose = "laser" if not is_lit else "sensor"
             yield f"{name} is seen from no {whose} point; no third bounce comes from it, and no other is asked for."
@@ -130,11 +131,12 @@ def _wall_points(built: BuiltScene, grid: PointGrid) -> Float64:
     return positions / built.unit + RAY_MARGIN * normals
 
 
-def _turned_to(surface: _SurfacePoints, wall_points: Float64) -> NDArray[np.bool_]:
+def _turned_to(surface: _SurfacePoints, wall_points: Float64, least_cosine: float = 0.0) -> NDArray[np.bool_]:
     """Return (wall points, surface points) whether they see each other's reflecting side, were nothing between."""
     towards = wall_points[:, None] - surface.points[None]
     two_sided = ~surface.normals.any(axis=-1)
-    return two_sided | (np.einsum("wpk,pk->wp", towards, surface.normals) > 0)
+    lengths = np.linalg.norm(towards, axis=-1) * np.linalg.norm(surface.normals, axis=-1)
+    return two_sided | (np.einsum("wpk,pk->wp", towards, surface.normals) > least_cosine * lengths)
 
 
 def _any_visible(built: BuiltScene, surfaces: list[_SurfacePoints], grid: PointGrid) -> NDArray[np.bool_]:
@@ -143,7 +145,7 @@ def _any_visible(built: BuiltScene, surfaces: list[_SurfacePoints], grid: PointG
     step = max(1, len(surfaces) * len(wall_points) * POINTS_PER_SURFACE // MOST_RAYS)
     origins, targets, owners = [], [], []
     for owner, surface in enumerate(surfaces):
-        wall, point = np.nonzero(_turned_to(surface, wall_points))
+        wall, point = np.nonzero(_turned_to(surface, wall_points, GRAZING))
         wall, point = wall[::step], point[::step]
         origins.append(wall_points[wall])
         targets.append(surface.points[point])

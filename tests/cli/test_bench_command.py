@@ -84,6 +84,9 @@ def test_time_to_an_error_is_read_off_or_extrapolated_or_unknown():
     assert measured.slope() == pytest.approx(-0.5)
     assert curve((1.0, 0.2), is_random=False).time_to(0.1) == (math.inf, "not reached")
     assert curve((1.0, 0.2), bias=0.15).time_to(0.1) == (math.inf, "not reached")
+    refined = curve((1.0, 0.2), bias=0.15)
+    refined.engine = "virtual_lights"  # what its runs share is the error of a resolution, not a bias
+    assert refined.time_to(0.1) == (pytest.approx(4.0), "extrapolated")
     assert curve((1.0, 0.2), bias=0.05).time_to(0.1) == (pytest.approx(4.0), "extrapolated")
 
 

@@ -251,6 +251,7 @@ def test_the_examples_in_the_starter_are_valid(tmp_path: Path) -> None:
         ("time_axis.start_opl=1", "start_opl is not 0"),
         ("capture.account_first_and_last_bounces=false", "loaders expect the first and last legs"),
         ("render.time_limit_s=3", "time_limit_s alone"),
+        ("capture.sensor_grid.nx=6", r"sensor_grid\.nx is 6: y-tal's converter"),
     ],
 )
 def test_what_is_legal_but_pointless_is_said(override: str, match: str) -> None:
@@ -258,6 +259,13 @@ def test_what_is_legal_but_pointless_is_said(override: str, match: str) -> None:
     assert config_warnings(parse(SMALL)) == ()
     (warning,) = config_warnings(parse(SMALL, override))
     assert re.search(match, warning)
+
+
+def test_six_columns_are_harmless_where_the_file_has_no_laser_axes() -> None:
+    """A confocal file is 5-D: y-tal does not look for the bounce axis by its length there."""
+    text = SMALL.replace("single", "confocal")
+    assert config_warnings(parse(text, "capture.sensor_grid.nx=6")) == ()
+    assert config_warnings(parse(text, "capture.sensor_grid.ny=6")) == ()
 
 
 def test_black_hidden_items_are_said_only_when_all_are() -> None:

@@ -1,0 +1,158 @@
+"""``nlosrender plan`` as its users meet it: what it says agrees with what ``render`` then does."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import h5py
+import pytest
+from typer.testing import CliRunner
+
+from nlosrender.cli.app import app
+from nlosrender.cli.plan_command import readable_size
+from nlosrender.errors import ConfigError, RenderError
+
+SCENE = """
+scene:
+  relay_wall: {type: rectangle, width: 2.0, height: 1.6}
+  hidden_geometry:
+    - {type: rectangle, width: 0.5, height: 0.4, center: [0.1, 0, 0.9], normal: [0, 0, -1]}
+capture:
+  scan_type: SCAN
+  sensor_grid: {nx: 4, ny: 3}
+  LASERS
+time_axis: {bin_width_opl: 0.05, n_bins: auto}
+render: {max_bounces: 4, spp: 64}
+"""
+LASERS = {"single": "laser_point: [0.2, 0.1]", "confocal": "", "exhaustive": "laser_grid: {nx: 2, ny: 5}"}
+KEYS = {
+    "engine", "reason", "skipped", "batches", "bytes_per_batch", "n_bins", "window_opl", "file", "seconds_estimate",
+    "warnings",
+}  # fmt: skip
+
+runner = CliRunner()
+
+
+@pytest.fixture(autouse=True)
+def short_pilot(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Half a second per pilot is for users."""
+    from nlosrender.engine import backend
+
+    backend.start_backend("llvm")  # Mitsuba starts before the engine modules are imported
+    from nlosrender.engine import forecast
+
+    monkeypatch.setattr(forecast, "PILOT_SECONDS", 0.02)
+    monkeypatch.chdir(tmp_path)
+
+
+def write_config(scan: str = "single") -> str:
+    Path("scene.yaml").write_text(SCENE.replace("SCAN", scan).replace("LASERS", LASERS[scan]))
+    return "scene.yaml"
+
+
+def run(command: str, *arguments: str):
+    result = runner.invoke(app, [command, *arguments])
+    if result.exception is not None and not isinstance(result.exception, SystemExit):
+        raise result.exception
+    return result
+
+
+def planned(*arguments: str) -> dict:
+    return json.loads(run("plan", *arguments, "--json").stdout)
+
+
+@pytest.mark.parametrize("scan", ["single", "confocal", "exhaustive"])
+@pytest.mark.parametrize("engine", ["path", "auto"])
+def test_the_plan_agrees_with_the_render(scan, engine):
+    """Bins, window, engine, reason, file size: what is announced is what comes."""
+    changes = ["--set", f"render.engine={engine}", "--set", "render.spp=null", "--set", "render.target_error=0.3"]
+    config = write_config(scan)
+    plan = planned(config, *changes)
+    assert set(plan) >= KEYS
+    assert not Path("scene.hdf5").exists()
+    report = json.loads(run("render", config, *changes, "--json").stdout)
+    assert (plan["n_bins"], plan["engine"], plan["reason"]) == (report["n_bins"], report["engine"], report["reason"])
+    assert plan["engine"] == ("path" if engine == "path" else "virtual_lights")
+    assert plan["warnings"] == report["warnings"] == []
+    with h5py.File("scene.hdf5") as file:
+        assert plan["n_bins"] == file["data"].shape[1] == file["t"][()]
+        assert plan["window_opl"] == pytest.approx([0, plan["n_bins"] * 0.05])
+        assert plan["file"]["logical_bytes"] == sum(d.size * d.dtype.itemsize for d in file.values())
+    # small: between nothing and everything; large captures are in tests/unit/test_forecast.py
+    assert 0 < plan["file"]["disk_bytes_estimate"] < plan["file"]["logical_bytes"] + 100_000
+    assert plan["batches"] == 1
+    assert plan["bytes_per_batch"] > 0
+    assert 0 < plan["seconds_estimate"] < 60
+
+
+def test_the_plan_writes_nothing():
+    """The folder is the same afterwards, an earlier capture untouched."""
+    config = write_config()
+    Path("scene.hdf5").write_text("an earlier capture")
+    run("plan", config)
+    assert sorted(path.name for path in Path().iterdir()) == ["scene.hdf5", "scene.yaml"]
+    assert Path("scene.hdf5").read_text() == "an earlier capture"
+
+
+def test_the_plan_is_readable():
+    """One line per question: which engine and why, what is skipped and why, memory, file, seconds."""
+    result = run("plan", write_config("exhaustive"))
+    assert "engine   path: spp counts paths" in result.stdout
+    assert "skipped  second bounce: no light goes straight" in result.stdout
+    assert "skipped  colour: everything in the scene is grey" in result.stdout
+    assert "4 x 3 sensor points, 2 x 5 laser points" in result.stdout
+    assert [line.split()[0] for line in result.stdout.splitlines()][-5:] == [
+        "scan",
+        "time",
+        "memory",
+        "file",
+        "seconds",
+    ]
+    assert result.stderr == ""
+
+
+@pytest.mark.parametrize("command", ["plan", "render"])
+def test_pointless_geometry_is_said_on_stderr_before_a_render_too(command):
+    """A plate with its back to the wall is legal; both commands say what comes of it, once."""
+    result = run(command, write_config(), "--set", "scene.hidden_geometry.0.normal=[0, 0, 1]")
+    assert result.stderr.count("warning: scene.hidden_geometry.0 (rectangle-0) turns its back to the relay wall") == 1
+    assert "warning" not in result.stdout
+
+
+def test_warnings_are_in_the_report_of_a_render_even_when_it_is_quiet():
+    """A machine that reads the JSON hears the same as a user at the terminal."""
+    changes = ["--set", "scene.hidden_geometry.0.normal=[0, 0, 1]", "--set", "render.time_limit_s=5"]
+    result = run("render", write_config(), *changes, "--json", "--quiet")
+    assert result.stderr == ""
+    assert ["turns its back" in text for text in json.loads(result.stdout)["warnings"]] == [True, False]
+
+
+def test_impossible_sizes_end_in_an_error():
+    """Nothing is allocated for a grid that no machine holds."""
+    with pytest.raises(RenderError, match=r"capture\.sensor_grid: 1000000 x 1000000 points") as caught:
+        run("plan", write_config(), "--set", "capture.sensor_grid={nx: 1000000, ny: 1000000}")
+    assert caught.value.exit_code == 1
+
+
+def test_what_only_mitsuba_rejects_has_its_place():
+    """As for render: file, line, column and key."""
+    config = Path(write_config())
+    config.write_text(config.read_text().replace("-1]}", "-1], bsdf: {type: hair, no_such_parameter: 3}}"))
+    with pytest.raises(ConfigError, match=r"scene\.yaml:5:\d+: scene\.hidden_geometry\.0\.bsdf"):
+        run("plan", str(config))
+
+
+def test_help_ends_with_an_example():
+    """--help shows one real call and what it creates: nothing."""
+    text = " ".join(run("plan", "--help").stdout.split())
+    assert text.rindex("Example: nlosrender plan configs/z-letter.yaml") > text.rindex("--json")
+    assert "writes nothing" in text
+
+
+@pytest.mark.parametrize(
+    ("n_bytes", "text"), [(7, "7 B"), (999, "999 B"), (1_250_000, "1.25 MB"), (999_999_999, "1 GB"), (2**40, "1.1 TB")]
+)
+def test_sizes_are_readable(n_bytes, text):
+    """Three digits and a unit of powers of ten, as disks are sold."""
+    assert readable_size(n_bytes) == text
