@@ -63,6 +63,8 @@ def _obstacle(render: RenderConfig, capture: Capture, built: BuiltScene) -> str 
         return "there is no hidden geometry"
     if not can_tessellate(built):
         return "the wall is curved, or a hidden shape is neither a mesh nor a sphere"
+    if bool(built.wall_bsdf.flags() & mi.BSDFFlags.Delta):
+        return "the relay wall has a mirror lobe"
     hard = mi.BSDFFlags.Delta | mi.BSDFFlags.Transmission | mi.BSDFFlags.Null
     if any(bool(shape.bsdf().flags() & hard) for shape in built.hidden_shapes):
         return "some hidden surfaces are mirrors or let light through"

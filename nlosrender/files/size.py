@@ -60,7 +60,7 @@ def forecast_size(
     if compression == "none":
         lengths = layout.in_file_order({**sizes, "bounce": len(written)}, confocal)
         chunks = chunk_shape(sizes, confocal)
-        stored = samples * prod(n for n, c in zip(lengths, chunks, strict=True))
+        stored = samples * prod(ceil(n / c) * c for n, c in zip(lengths, chunks, strict=True))
         assumption = "every bounce that light can reach is stored in full, without compression"
         return FileSize(logical, stored + small, stored / UNPACKED_SPEED, assumption)
     light = samples * rows * sizes["bin"] * sum(written)

@@ -276,13 +276,16 @@ def test_a_triangle_is_spread_over_its_bins_by_area(delays: tuple[float, float, 
         ([PLATE | {"bsdf": {"type": "roughconductor", "alpha": 0.4}}], {}, "path"),
         ([PLATE | {"bsdf": {"type": "roughconductor", "alpha": 0.4}}], {"engine": "virtual_lights"}, "virtual_lights"),
         ([{"type": "room", "size": [2, 2, 2]}], {}, "path"),
+        ([PLATE], {"engine": "virtual_lights", "wall": {"type": "plastic"}}, "path"),
         ([{"type": "cylinder", "center": [0, 0, 1], "radius": 0.1, "height": 0.5}], {}, "path"),
     ],
 )
 def test_auto_takes_the_cheapest_engine_that_is_right(hidden: list[dict], render_keys: dict, engine: str) -> None:
     """What the gather cannot do goes to the path engine, also when the gather was asked for."""
     config = flat_wall(*hidden)
-    config["render"] = {"max_bounces": 3, **render_keys}
+    wall = render_keys.get("wall", {"type": "diffuse"})
+    config["scene"]["relay_wall"]["bsdf"] = wall
+    config["render"] = {"max_bounces": 3} | {key: value for key, value in render_keys.items() if key != "wall"}
     assert start(config)[-1].name == engine
 
 
