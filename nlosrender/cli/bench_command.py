@@ -11,7 +11,10 @@ import typer
 
 def register(app: typer.Typer) -> None:
     """Add ``bench`` to ``app``."""
-    app.command()(bench)
+    app.command(
+        epilog="Example: nlosrender bench --scene plate --part curves --seconds 30 -o out/bench   "
+        "(prints a table, creates out/bench.json and out/bench.png)"
+    )(bench)
 
 
 def bench(
@@ -37,11 +40,7 @@ def bench(
     ),
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object instead of a table.")] = False,
 ) -> None:
-    """Measure run time against error on scenes with known truth, scaling, and rates.
-
-    Example: nlosrender bench --scene plate --part curves --seconds 30 -o out/bench
-    prints a table and creates out/bench.json and out/bench.png.
-    """
+    """Measure run time against error on scenes with known truth, scaling, and rates."""
     import json
 
     from nlosrender.bench.benchmark import PARTS, run_benchmark

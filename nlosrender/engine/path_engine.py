@@ -299,7 +299,7 @@ class _Schedule:
         if self.limit is not None:
             shares.append(done / self.limit)
         if budget.time_limit_s is not None:
-            shares.append(seconds / budget.time_limit_s)
+            shares.append(seconds / budget.time_limit_s if budget.time_limit_s > 0 else 1.0)
         if budget.target_error is not None and self.errors:
             counted, error = self.errors[-1]
             shares.append((budget.target_error / error) ** 2 * done / counted if error > 0 else 1.0)

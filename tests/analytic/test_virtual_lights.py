@@ -300,3 +300,15 @@ def test_rough_surfaces_agree_with_the_path_engine() -> None:
     histogram = engine.render(plan.batches[0], Budget(target_error=0.003))
     lights = histogram.mean.sum(axis=(0, 1)).reshape(paths.total.shape)
     assert_agrees(paths.total, paths.total_variance, lights, replicas=32, floor=0.01)
+
+
+def test_a_time_limit_that_the_gather_uses_up_still_gives_all_bounces() -> None:
+    """What is left of the time may be nothing: the further bounces then get their shortest run."""
+    from nlosrender.engine.path_engine import Budget
+
+    config = flat_wall(PLATE, BALL) | {"render": {"max_bounces": 5, "engine": "virtual_lights", "time_limit_s": 1e-6}}
+    _, _, _, plan, engine = start(config)
+    shares: list[float] = []
+    histogram = engine.render(plan.batches[0], Budget(time_limit_s=1e-6), shares.append)
+    assert (histogram.mean.sum(axis=(0, 2, 3, 4))[1:] > 0).all()
+    assert all(0 <= share <= 1 for share in shares)

@@ -120,6 +120,13 @@ def test_pointless_geometry_is_said_on_stderr_before_a_render_too(command):
     assert "warning" not in result.stdout
 
 
+@pytest.mark.parametrize("command", ["plan", "render"])
+def test_what_configuration_and_geometry_both_know_is_said_once(command):
+    """An item behind the wall is found without Mitsuba and with it, in the same words."""
+    result = run(command, write_config(), "--set", "scene.hidden_geometry.0.center=[0, 0, -1]")
+    assert result.stderr.count("lies behind the relay wall") == 1
+
+
 def test_warnings_are_in_the_report_of_a_render_even_when_it_is_quiet():
     """A machine that reads the JSON hears the same as a user at the terminal."""
     changes = ["--set", "scene.hidden_geometry.0.normal=[0, 0, 1]", "--set", "render.time_limit_s=5"]

@@ -1,4 +1,4 @@
-"""What is said before a render: bounds in time, sizes, what is skipped, what is pointless, how long it takes."""
+"""What is said before a render: sizes, what is skipped, what is pointless, how long it takes."""
 
 from __future__ import annotations
 
@@ -10,103 +10,18 @@ import pytest
 from rendering import configured, flat_wall
 
 from nlosrender import pipeline
-from nlosrender.capture.arrivals import earliest_arrival, filled_shares, latest_of_bounce, window_warnings
 from nlosrender.capture.bounces import BounceAxis
-from nlosrender.capture.grids import Capture, point_grid, single_point
 from nlosrender.capture.limits import refuse_impossible_grids, refuse_impossible_samples
 from nlosrender.capture.plan import Batch, Plan, Tile
-from nlosrender.capture.time_axis import TimeAxis
 from nlosrender.engine.backend import start_backend
 from nlosrender.errors import RenderError
 from nlosrender.files.size import FileSize, disk_warnings, forecast_size
-from nlosrender.scene.pose import Pose
-from nlosrender.scene.relay_wall import RectangleWall, SphereWall
 
-WALL = RectangleWall(Pose.identity(), 2.0, 1.5)
 BOX = (np.array([-0.4, -0.7, 0.5]), np.array([0.9, 0.2, 1.6]))
 PLATE = {"type": "rectangle", "width": 0.5, "height": 0.4, "center": [0.1, 0, 0.9], "normal": [0, 0, -1]}
 RED = {"type": "diffuse", "reflectance": [0.8, 0.1, 0.1]}
 BALL = {"type": "sphere", "center": [0.5, 0.2, 1.1], "radius": 0.2}
 ROOM = {"type": "room", "size": [2.0, 1.6, 1.5]}
-
-
-def scanned(scan_type: str = "exhaustive", legs: bool = True) -> Capture:
-    sensors = point_grid(WALL, 5, 3)
-    lasers = {"single": single_point(WALL, (0.3, -0.2)), "confocal": sensors, "exhaustive": point_grid(WALL, 7, 2)}
-    return Capture(
-        scan_type, sensors, lasers[scan_type], np.array([-0.5, 0, 0.3]), np.array([0.2, 0.1, 1]), legs, 1.0, 0.0
-    )
-
-
-def path_lengths(shot: Capture, n_hidden: int) -> np.ndarray:
-    """OPL of random paths laser, x_l, n points of BOX, x_s, sensor."""
-    random = np.random.default_rng(7)
-    inside = random.uniform(*BOX, (n_hidden, 20_000, 3))
-    laser = random.integers(shot.n_lasers, size=20_000)
-    sensor = laser if shot.scan_type == "confocal" else random.integers(shot.n_sensors, size=20_000)
-    ends = [grid.positions.reshape(-1, 3)[at] for grid, at in ((shot.laser_grid, laser), (shot.sensor_grid, sensor))]
-    path = np.concatenate([ends[:1], inside, ends[1:]])
-    legs = shot.laser_legs.reshape(-1)[laser] + shot.sensor_legs.reshape(-1)[sensor]
-    return np.linalg.norm(np.diff(path, axis=0), axis=-1).sum(axis=0) + legs
-
-
-# --- when light arrives ---
-
-
-@pytest.mark.parametrize("scan_type", ["single", "confocal", "exhaustive"])
-@pytest.mark.parametrize("legs", [True, False])
-def test_no_path_arrives_before_the_earliest_or_after_the_latest_bound(scan_type, legs):
-    """The bounds hold for every path through the box, and the first one is not far from the shortest."""
-    shot = scanned(scan_type, legs)
-    earliest = earliest_arrival(shot, WALL, BOX)
-    for bounce in (3, 4, 5, 8):
-        lengths = path_lengths(shot, bounce - 2)
-        assert earliest <= lengths.min()
-        assert lengths.max() <= latest_of_bounce(shot, WALL, BOX, bounce)
-    # the box is 0.5 m away; separate minima over lasers and sensors lose less than the wall's extent
-    assert path_lengths(shot, 1).min() - earliest < 0.5
-    assert latest_of_bounce(shot, WALL, BOX, None) == np.inf
-
-
-def test_a_planar_wall_alone_never_receives_light_and_a_curved_one_does():
-    """Light from wall to wall needs a curved wall."""
-    assert earliest_arrival(scanned(), WALL, None) == np.inf
-    sphere = SphereWall(np.zeros(3), 0.8)
-    grid = point_grid(sphere, 5, 3)
-    shot = Capture("confocal", grid, grid, np.zeros(3), np.zeros(3), True, 1.0, 0.0)
-    assert earliest_arrival(shot, sphere, None) == pytest.approx(1.6)  # from the centre and back: two radii
-
-
-@pytest.mark.parametrize(
-    ("start", "n_bins", "max_bounces", "match"),
-    [
-        (0.0, 10, 3, "ends at 1 m, before the first light"),
-        (0.0, 100, 3, None),
-        (30.0, 10, 3, "starts at 30 m, after the last light"),
-        (30.0, 10, None, "after the last of the third bounce"),
-        (8.0, 10, 7, "after the last of the third bounce"),
-        (1000.0, 10, 7, "after the last light"),
-    ],
-)
-def test_a_window_that_misses_the_light_is_said(start, n_bins, max_bounces, match):
-    """Exactly one sentence when nothing (or no third bounce) can be in the window, none otherwise."""
-    said = list(window_warnings(scanned(), WALL, BOX, TimeAxis(start, 0.1, n_bins), max_bounces))
-    assert len(said) == (match is not None)
-    if match:
-        assert match in said[0]
-
-
-def test_filled_shares_are_shares_of_the_window():
-    """No light, no bins; a window twice as long is half as full; the second bounce of a plane stays empty."""
-    shot, bounces = scanned(), BounceAxis(5, True)
-    short, long = (filled_shares(shot, WALL, BOX, TimeAxis(0.0, 0.1, n), bounces) for n in (300, 600))
-    assert short[0] == 0
-    assert 0 < short[1] < short[2] < short[3] < 1
-    assert long == pytest.approx([share / 2 for share in short])
-    assert filled_shares(shot, WALL, None, TimeAxis(0.0, 0.1, 100), bounces) == (0, 0, 0, 0)
-    # all of the third bounce lies in a window from the earliest to the latest of it, and fills part of it per pair
-    third = filled_shares(shot, WALL, BOX, TimeAxis(0.0, 0.1, 300), BounceAxis(3, False))
-    assert third == pytest.approx([short[1]])
 
 
 # --- sizes ---
@@ -115,11 +30,14 @@ def test_filled_shares_are_shares_of_the_window():
 @pytest.mark.parametrize("scan_type", ["single", "confocal", "exhaustive"])
 @pytest.mark.parametrize("variance", [True, False])
 def test_an_unpacked_file_has_exactly_the_size_forecast(scan_type, variance, tmp_path):
-    """Logical bytes are those of all datasets; without compression the stored chunks are known too."""
+    """Logical bytes are those of all datasets; without compression the stored chunks are known too.
+
+    The grid takes several chunks per laser, the last ones of which are partly padding.
+    """
     h5py = pytest.importorskip("h5py")
     from nlosrender.files.writer import CaptureWriter
 
-    config = configured(flat_wall(PLATE, scan=scan_type, sensors=(5, 3), lasers=(2, 7), bins=(0.0, 0.5, 29)))
+    config = configured(flat_wall(PLATE, scan=scan_type, sensors=(101, 97), lasers=(2, 3), bins=(0.0, 0.5, 29)))
     wall, _ = pipeline.place_scene(config)
     built = SimpleNamespace(wall=wall, hidden_bounds=BOX)
     capture, time_axis = pipeline.describe_capture(config, wall, built)
@@ -148,6 +66,21 @@ def test_packing_costs_what_is_lit():
     assert dark.logical_bytes == half.logical_bytes == full.logical_bytes
     assert full.disk_bytes_estimate - dark.disk_bytes_estimate == 2 * 3 * 40 * 50 * 1000 * 4
     assert 0.49 < half.disk_bytes_estimate / full.disk_bytes_estimate < 0.52
+
+
+def test_what_the_pilot_saw_tightens_the_size_and_never_loosens_it():
+    """Boxes bound the light of every bounce; the share of bins a pilot lit replaces a bound that is larger."""
+    from nlosrender.analysis.forecast import forecast_file
+
+    config = configured(flat_wall(PLATE, BALL, sensors=(50, 30), max_bounces=5))
+    _, _, engine = prepared(config)
+    header = pipeline.describe_file(config, engine.built, engine.capture, engine.time_axis)
+    bound, dark, loose = (
+        forecast_file(config, header, engine, lit).disk_bytes_estimate
+        for lit in (None, (0.0, None, 0.0, 0.0), (1.0, None, 1.0, 1.0))
+    )
+    assert dark < bound / 2
+    assert loose == bound
 
 
 def test_a_full_disk_and_a_missing_folder_are_said(tmp_path):
@@ -253,6 +186,11 @@ def test_a_skip_is_said_exactly_when_its_condition_holds(what, holds, does_not):
     """Each line of the plan stands for something the engine really leaves out, and names the reason."""
     assert skipped(*holds[0], **holds[1])[what]
     assert what not in skipped(*does_not[0], **does_not[1])
+
+
+def test_no_triangle_is_said_to_be_skipped_when_none_is():
+    """A plate that faces the wall is used whole."""
+    assert not [what for what in skipped(PLATE) if "triangles" in what]
 
 
 def warnings_of(*hidden, scan="exhaustive", **keys) -> list[str]:
