@@ -13,6 +13,7 @@ from nlosrender.capture.grids import Capture
 from nlosrender.errors import RenderError
 
 BYTES_PER_SUM = 8  # a float64 sum per replica and bin
+MOST_SUMS = 2**32 - 1  # of a batch: Dr.Jit indexes with 32 bits
 BYTES_OF_STATISTICS = 56  # mean and variance on the device and their host copies in memory and file order
 
 
@@ -85,7 +86,7 @@ def plan_capture(capture: Capture, *, rows_per_pair: int, n_bins: int, lanes: in
     replicas = max(2, math.ceil(lanes / capture.n_sensors))
     replicas += replicas % 2
     pair = rows_per_pair * (n_bins + 1) * (BYTES_PER_SUM * replicas + BYTES_OF_STATISTICS)
-    pairs = memory_limit // pair
+    pairs = min(memory_limit // pair, MOST_SUMS // (replicas * rows_per_pair * (n_bins + 1)))
     if pairs < 1:
         raise RenderError(
             f"one sensor point with one laser needs {pair / 1e6:.0f} MB but render.memory_limit leaves "

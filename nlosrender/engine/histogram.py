@@ -14,9 +14,6 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-BYTES_PER_BIN = 8
-MAX_ELEMENTS = 2**32 - 1  # Dr.Jit indexes with 32 bits
-
 
 @dataclass(frozen=True)
 class HistogramShape:

@@ -7,9 +7,8 @@ from collections.abc import Iterator
 from dataclasses import replace
 
 from nlosrender.capture.grids import Capture
-from nlosrender.capture.plan import Batch, Plan
+from nlosrender.capture.plan import BYTES_PER_SUM, MOST_SUMS, Batch, Plan
 from nlosrender.engine.backend import batch_memory, physical_memory
-from nlosrender.engine.histogram import BYTES_PER_BIN, MAX_ELEMENTS
 from nlosrender.engine.path_engine import PathEngine
 from nlosrender.engine.skipped import traces_paths
 from nlosrender.engine.virtual_lights.engine import FIRST_COARSENESS, REFINEMENT, VirtualLightEngine
@@ -34,11 +33,11 @@ def batch_bytes(engine: PathEngine | VirtualLightEngine, plan: Plan) -> int:
     if isinstance(engine, VirtualLightEngine):
         fewest = min(plan.batches, key=lambda batch: batch.sensors.size)
         gathered = max(_gather_entries(engine, batch) for batch in (largest, fewest))
-    if max(entries, gathered) > MAX_ELEMENTS:
+    if max(entries, gathered) > MOST_SUMS:
         raise RenderError(
             f"a batch of {max(entries, gathered):.2e} sums is more than 32-bit indices reach; lower render.memory_limit"
         )
-    return max(plan.bytes_per_batch, gathered * BYTES_PER_BIN)
+    return max(plan.bytes_per_batch, gathered * BYTES_PER_SUM)
 
 
 def memory_warnings(

@@ -13,10 +13,10 @@ import numpy as np
 
 from nlosrender.capture.bounces import THIRD_BOUNCE, BounceAxis
 from nlosrender.capture.grids import Capture
-from nlosrender.capture.plan import Batch
+from nlosrender.capture.plan import MOST_SUMS, Batch
 from nlosrender.capture.time_axis import TimeAxis
 from nlosrender.engine.device_arrays import laser_points, sensor_points
-from nlosrender.engine.histogram import MAX_ELEMENTS, DeviceHistogram, Histogram, HistogramShape, to_memory_order
+from nlosrender.engine.histogram import DeviceHistogram, Histogram, HistogramShape, to_memory_order
 from nlosrender.engine.path_integrator import LaneRandomness, PathSettings, Transport, load_path_integrator
 from nlosrender.engine.second_bounce import deposit_second_bounce
 from nlosrender.engine.surface_sampler import SurfaceSampler
@@ -123,7 +123,7 @@ class PathEngine:
         """
         bounces = self.options.bounces
         shape = self.shape(batch, max(1, bounces.n_slots - 1) if bounces.split else 1)
-        if shape.size > MAX_ELEMENTS:
+        if shape.size > MOST_SUMS:
             raise RenderError(
                 f"a batch of {shape.size:.2e} sums is more than 32-bit indices reach; lower render.memory_limit"
             )

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from nlosrender.capture.grids import Capture, point_grid, single_point
-from nlosrender.capture.plan import BYTES_OF_STATISTICS, BYTES_PER_SUM, plan_capture, tiles
+from nlosrender.capture.plan import BYTES_OF_STATISTICS, BYTES_PER_SUM, MOST_SUMS, plan_capture, tiles
 from nlosrender.errors import RenderError
 from nlosrender.scene.pose import Pose
 from nlosrender.scene.relay_wall import RectangleWall
@@ -64,3 +64,11 @@ def test_a_pair_that_does_not_fit_is_an_error_that_says_what_to_do():
     """Nothing is allocated for a histogram that cannot fit."""
     with pytest.raises(RenderError, match=r"memory_limit.*Raise it"):
         plan_capture(capture("single"), rows_per_pair=6, n_bins=10**9, lanes=8, memory_limit=10**9)
+
+
+def test_a_batch_stays_within_32_bit_indices():
+    """Dr.Jit indexes with 32 bits: more memory than that does not make larger batches."""
+    plan = plan_capture(capture("exhaustive"), rows_per_pair=6, n_bins=10**7, lanes=8, memory_limit=10**15)
+    largest = max(batch.sensors.size * batch.lasers.size for batch in plan.batches)
+    assert largest * plan.replicas * 6 * (10**7 + 1) <= MOST_SUMS
+    assert len(plan.batches) > 1

@@ -162,7 +162,8 @@ class VirtualLightEngine:
 
     def _shape(self, batch: Batch) -> tuple[HistogramShape, int]:
         """Return the histogram's shape, whose replicas are slices: lanes that share the patches of a sensor point."""
-        slices = max(1, math.ceil(self.lanes / batch.sensors.size))
+        # no more than the replicas that the plan has counted memory for
+        slices = max(1, min(math.ceil(self.lanes / batch.sensors.size), self.options.replicas))
         return replace(self.paths.shape(batch, 1), replicas=slices), slices
 
     def _transport(self, batch: Batch, shape: HistogramShape, slices: int) -> tuple[Transport, mi.UInt32]:
