@@ -17,9 +17,10 @@ from nlosrender.capture.plan import MOST_SUMS, Batch
 from nlosrender.capture.time_axis import TimeAxis
 from nlosrender.engine.device_arrays import laser_points, sensor_points
 from nlosrender.engine.histogram import DeviceHistogram, Histogram, HistogramShape, to_memory_order
-from nlosrender.engine.path_integrator import LaneRandomness, PathSettings, Transport, load_path_integrator
+from nlosrender.engine.path_integrator import load_path_integrator
 from nlosrender.engine.second_bounce import deposit_second_bounce
 from nlosrender.engine.surface_sampler import SurfaceSampler
+from nlosrender.engine.transport import LaneRandomness, PathSettings, Transport
 from nlosrender.errors import RenderError
 from nlosrender.scene.build import BuiltScene
 

@@ -11,86 +11,18 @@ reached; a sampled point that turns out to be occluded contributes nothing.
 from __future__ import annotations
 
 import functools
-from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
 
 from nlosrender.capture.bounces import FIRST_BOUNCE, BounceAxis
-from nlosrender.engine.device_arrays import WallPoints
+from nlosrender.engine.connections import connect_to_lasers, deposit_spot, offset_origin
 from nlosrender.engine.histogram import DeviceHistogram
 from nlosrender.engine.low_discrepancy import recurrence_steps
-from nlosrender.engine.surface_sampler import SurfaceSampler
-from nlosrender.scene.build import BuiltScene
+from nlosrender.engine.transport import LaneRandomness, PathSettings, Transport
 
 PLUGIN_NAME = "nlos_path"
-RAY_OFFSET = 2e-5  # engine units; float32 positions of a scene of size 1 are good to 1e-7
 HIGHEST_SURVIVAL = 0.95  # of the roulette: even a white closed room ends
-
-
-@dataclass(frozen=True)
-class PathSettings:
-    """What the integrator computes and how; part of the compiled kernel."""
-
-    bounces: BounceAxis
-    first_bounce: int  # lowest bounce that is deposited, >= 3
-    hidden_fraction: float  # share of wall vertices that sample the hidden geometry; 0 = BSDF only, 1 = hidden only
-    laser_sampling: bool
-    russian_roulette: bool
-    spot_radius: float  # of the laser on the wall [engine units]; 0 = a point
-    has_transmission: bool  # some BSDF refracts: the optical path length needs the medium's index
-
-    @property
-    def goes_on(self) -> bool:
-        """Whether paths have more than one vertex after the sensor point."""
-        return self.last_vertex is None or self.last_vertex > FIRST_BOUNCE + 1
-
-    @property
-    def last_vertex(self) -> int | None:
-        """Bounce index of the last vertex a path may have: one more than the bounces when rays look for the spot."""
-        highest = self.bounces.max_bounces
-        return highest + 1 if highest is not None and self.finds_spot else highest
-
-    @property
-    def finds_spot(self) -> bool:
-        """Whether rays may find the laser's spot by chance."""
-        return self.spot_radius > 0
-
-
-@dataclass(frozen=True, eq=False)
-class Transport:
-    """Everything a launch reads: scene, points, and the conversion from engine units to bins."""
-
-    built: BuiltScene
-    sampler: SurfaceSampler
-    sensors: WallPoints  # one per lane
-    lasers: WallPoints  # all lasers of the batch
-    first_laser: mi.UInt32  # per lane: confocal lanes have their own laser, others start at 0
-    lasers_per_lane: int
-    n_lasers: mi.UInt32  # opaque copy of ``lasers_per_lane``: its value is not part of the kernel
-    bins_per_unit: mi.Float  # engine unit / bin width, opaque
-
-
-@dataclass(frozen=True, eq=False)
-class LaneRandomness:
-    """Random state of every lane; carried from launch to launch, so that splitting a render changes no bit."""
-
-    generator: mi.PCG32
-    sequence: list[mi.UInt32]  # low-discrepancy state, three dimensions
-
-    @classmethod
-    def seeded(cls, seed: int, lane_key: mi.UInt32) -> LaneRandomness:
-        """Seed every lane from the render's seed and the lane's identity, never from its place in a batch."""
-        state_high, state_low = mi.sample_tea_32(mi.UInt32(seed), lane_key, 8)
-        key_high, key_low = mi.sample_tea_32(lane_key, mi.UInt32(seed ^ 0x9E3779B9), 8)
-        wide = mi.UInt64(2**32)
-        generator = mi.PCG32(
-            initstate=mi.UInt64(state_high) * wide + mi.UInt64(state_low),
-            initseq=mi.UInt64(key_high) * wide + mi.UInt64(key_low),
-        )
-        starts = [generator.next_uint32() for _ in range(3)]
-        dr.eval(generator, starts)
-        return cls(generator, starts)
 
 
 @dr.syntax
@@ -155,7 +87,7 @@ def trace_paths(
 
         # ---- Laser spot found by chance --------------------------------------------------------------------------
         if dr.hint(settings.finds_spot, mode="scalar"):
-            _deposit_spot(
+            deposit_spot(
                 settings,
                 transport,
                 histogram,
@@ -183,7 +115,7 @@ def trace_paths(
                 in_reach &= bounce >= settings.first_bounce
             if dr.hint(settings.goes_on and max_bounces is not None, mode="scalar"):
                 in_reach &= bounce <= max_bounces
-            _connect_to_lasers(settings, transport, histogram, generator, lane, si, in_reach, bounce, opl, throughput)
+            connect_to_lasers(settings, transport, histogram, generator, lane, si, in_reach, bounce, opl, throughput)
 
         # ---- Continue, or start the next path ----------------------------------------------------------------------
         go_on = mi.Bool(hit)
@@ -266,7 +198,7 @@ def trace_paths(
         alive &= dr.any(value != 0)
         world = vertex.to_world(wo)
         origin = mi.Point3f(vertex.p)
-        ray_origin = _offset_origin(vertex, world)
+        ray_origin = offset_origin(vertex, world)
         if dr.hint(q > 0, mode="scalar"):
             # from the offset origin: a parallel ray would land beside the target, in another triangle of a fine mesh
             world = dr.select(has_target, dr.normalize(target - ray_origin), world)
@@ -275,150 +207,8 @@ def trace_paths(
     return LaneRandomness(generator, [seq_u, seq_v, seq_t])
 
 
-@dr.syntax
-def _connect_to_lasers(
-    settings: PathSettings,
-    transport: Transport,
-    histogram: DeviceHistogram,
-    generator: mi.PCG32,
-    lane: mi.UInt32,
-    si: mi.SurfaceInteraction3f,
-    active: mi.Bool,
-    bounce: mi.UInt32,
-    opl: mi.Float,
-    throughput: mi.Spectrum,
-) -> None:
-    """Laser sampling: connect the vertex to every laser of the lane and deposit (Royo et al. 2022, Eq. 12)."""
-    slot = _slot(settings, bounce)
-    # one place in the spot for all lasers: what a path draws must not depend on how many lasers a batch has
-    in_spot = mi.Vector3f(0)
-    if dr.hint(settings.finds_spot, mode="scalar"):
-        in_spot = _on_disc(generator, active) * settings.spot_radius
-    if dr.hint(transport.lasers_per_lane == 1, mode="scalar"):
-        _connect(settings, transport, histogram, in_spot, lane, mi.UInt32(0), slot, si, active, opl, throughput)
-    else:
-        laser = mi.UInt32(0)
-        while dr.hint(laser < transport.n_lasers, exclude=[settings, transport, histogram]):
-            _connect(settings, transport, histogram, in_spot, lane, laser, slot, si, active, opl, throughput)
-            laser += 1
-
-
-def _connect(
-    settings: PathSettings,
-    transport: Transport,
-    histogram: DeviceHistogram,
-    in_spot: mi.Vector3f,
-    lane: mi.UInt32,
-    laser: mi.UInt32,
-    slot: mi.UInt32,
-    si: mi.SurfaceInteraction3f,
-    active: mi.Bool,
-    opl: mi.Float,
-    throughput: mi.Spectrum,
-) -> None:
-    built = transport.built
-    context = mi.BSDFContext()
-    points = transport.lasers.gather(transport.first_laser + laser)
-    lit = points.interaction
-    if settings.finds_spot:
-        lit.p = lit.p + lit.to_world(in_spot)
-        # what a spot loses over the wall's edge lights nothing
-        active = active & built.wall_shape.ray_test(mi.Ray3f(lit.p + 1e-2 * lit.n, -lit.n), active=active)
-    to_laser = lit.p - si.p
-    distance2 = dr.squared_norm(to_laser)
-    distance = dr.sqrt(distance2)
-    direction = to_laser / distance
-    bsdf = si.bsdf()
-    reflected, pdf = bsdf.eval_pdf(context, si, si.to_local(direction), active)
-    emitted = built.wall_bsdf.eval(context, lit, lit.to_local(-direction), active)  # includes the laser point's cosine
-    value = throughput * reflected * emitted / distance2
-    if settings.finds_spot:
-        # balance heuristic against finding the same point of the spot by the next ray
-        share = dr.select(si.shape == mi.ShapePtr(built.wall_shape), 1 - settings.hidden_fraction, 1.0)
-        cosine = dr.maximum(dr.dot(lit.n, -direction), 0)
-        value *= _balance(distance2, share * pdf * cosine * dr.pi * settings.spot_radius**2)
-    active = active & dr.any(value > 0)  # not in place: the caller's mask serves the other lasers, too
-    active &= ~built.scene.ray_test(connection_segment(si, direction, lit.p), coherent=False, active=active)
-    bins = delay_bin(transport, points, opl + distance)
-    histogram.deposit(lane, laser, slot, bins, value, active)
-
-
-@dr.syntax
-def _deposit_spot(
-    settings: PathSettings,
-    transport: Transport,
-    histogram: DeviceHistogram,
-    lane: mi.UInt32,
-    si: mi.SurfaceInteraction3f,
-    ray: mi.Ray3f,
-    active: mi.Bool,
-    is_delta: mi.Bool,
-    bounce: mi.UInt32,
-    opl: mi.Float,
-    throughput: mi.Spectrum,
-    value: mi.Spectrum,
-    density: mi.Float,
-    distance2: mi.Float,
-) -> None:
-    """A ray that met the relay wall inside the laser's spot carries the spot's radiance; once per laser of the lane."""
-    context = mi.BSDFContext()
-    slot = _slot(settings, bounce)
-    spot_area = dr.pi * settings.spot_radius**2
-    cosine = dr.maximum(-dr.dot(si.n, ray.d), 1e-9)
-    laser = mi.UInt32(0)
-    while dr.hint(laser < transport.n_lasers, exclude=[settings, transport, histogram]):
-        points = transport.lasers.gather(transport.first_laser + laser)
-        lit = points.interaction
-        inside = active & (dr.squared_norm(si.p - lit.p) < settings.spot_radius**2)
-        emitted = transport.built.wall_bsdf.eval(context, lit, lit.to_local(-ray.d), inside) / (cosine * spot_area)
-        carried = throughput * value * emitted / density
-        if dr.hint(settings.laser_sampling, mode="scalar"):
-            carried *= dr.select(is_delta, 1, _balance(density * cosine * spot_area, distance2))
-        inside &= dr.any(carried > 0)
-        histogram.deposit(lane, laser, slot, delay_bin(transport, points, opl), carried, inside)
-        laser += 1
-
-
-def _slot(settings: PathSettings, bounce: mi.UInt32) -> mi.UInt32:
-    """Return the histogram's slot of a bounce; the second bounce is computed elsewhere and has none."""
-    bounces = settings.bounces
-    if not bounces.split:
-        return mi.UInt32(0)
-    return dr.minimum(bounce - (FIRST_BOUNCE + 1), mi.UInt32(bounces.n_slots - 2))
-
-
-def delay_bin(transport: Transport, points: WallPoints, opl: mi.Float) -> mi.Int32:
-    """Return the bin of a path: its length in bins, plus what laser and sensor point add."""
-    sensors = transport.sensors
-    delay = opl * transport.bins_per_unit + (points.delay_fraction + sensors.delay_fraction)
-    return mi.Int32(dr.floor(dr.minimum(delay, 1e9))) + points.delay_bins + sensors.delay_bins
-
-
-def _balance(own: mi.Float, other: mi.Float) -> mi.Float:
-    return own / dr.maximum(own + other, 1e-30)
-
-
-def _on_disc(generator: mi.PCG32, active: mi.Bool) -> mi.Vector3f:
-    square = mi.Point2f(generator.next_float32(active), generator.next_float32(active))
-    point = mi.warp.square_to_uniform_disk_concentric(square)
-    return mi.Vector3f(point.x, point.y, 0)
-
-
 def _unit_interval(bits: mi.UInt32) -> mi.Float:
     return mi.Float(bits >> 8) * 2.0**-24
-
-
-def _offset_origin(si: mi.SurfaceInteraction3f, direction: mi.Vector3f) -> mi.Point3f:
-    scale = RAY_OFFSET * (1 + dr.max(dr.abs(si.p)))
-    return si.p + si.n * dr.mulsign(mi.Float(scale), dr.dot(si.n, direction))
-
-
-def connection_segment(si: mi.SurfaceInteraction3f, direction: mi.Vector3f, point: mi.Point3f) -> mi.Ray3f:
-    """Ray from the surface to ``point``, which lies in ``direction``, ending just before it."""
-    origin = _offset_origin(si, direction)
-    # aimed from the offset origin: a parallel ray would pass beside the point, behind the wall at oblique incidence
-    distance = dr.norm(point - origin)
-    return mi.Ray3f(origin, (point - origin) / distance, distance - 2 * RAY_OFFSET * (1 + distance), mi.Float(0), [])
 
 
 @functools.cache

@@ -5,8 +5,9 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
+from nlosrender.engine.connections import connection_segment, delay_bin
 from nlosrender.engine.histogram import DeviceHistogram
-from nlosrender.engine.path_integrator import Transport, connection_segment, delay_bin
+from nlosrender.engine.transport import Transport
 
 COINCIDENT = 1e-6  # engine units; a confocal pair has no path between its points
 

@@ -17,7 +17,7 @@ from nlosrender.capture.plan import Batch
 from nlosrender.capture.time_axis import TimeAxis
 from nlosrender.engine.histogram import DeviceHistogram, Histogram, HistogramShape, relative_l2_error, to_memory_order
 from nlosrender.engine.path_engine import Budget, PathEngine, PathOptions, Progress
-from nlosrender.engine.path_integrator import Transport
+from nlosrender.engine.transport import Transport
 from nlosrender.engine.virtual_lights.gather import (
     DevicePatches,
     GatherSettings,

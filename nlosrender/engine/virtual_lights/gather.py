@@ -19,10 +19,11 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from nlosrender.engine.connections import RAY_OFFSET
 from nlosrender.engine.device_arrays import WallPoints
 from nlosrender.engine.histogram import DeviceHistogram
 from nlosrender.engine.low_discrepancy import recurrence_steps
-from nlosrender.engine.path_integrator import RAY_OFFSET, Transport
+from nlosrender.engine.transport import Transport
 from nlosrender.engine.virtual_lights.patches import Patches
 from nlosrender.scene.build import BuiltScene
 from nlosrender.scene.pose import Float64

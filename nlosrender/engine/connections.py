@@ -1,0 +1,160 @@
+"""Connections of a path's vertex to the lasers, and the deposits they make.
+
+Laser sampling connects every vertex to every laser of the lane (Royo et al. 2022, section 4). A laser with a spot may
+also be found by chance: the two ways are weighted by the balance heuristic (Veach 1997).
+"""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+from nlosrender.capture.bounces import FIRST_BOUNCE
+from nlosrender.engine.device_arrays import WallPoints
+from nlosrender.engine.histogram import DeviceHistogram
+from nlosrender.engine.transport import PathSettings, Transport
+
+RAY_OFFSET = 2e-5  # engine units; float32 positions of a scene of size 1 are good to 1e-7
+
+
+@dr.syntax
+def connect_to_lasers(
+    settings: PathSettings,
+    transport: Transport,
+    histogram: DeviceHistogram,
+    generator: mi.PCG32,
+    lane: mi.UInt32,
+    si: mi.SurfaceInteraction3f,
+    active: mi.Bool,
+    bounce: mi.UInt32,
+    opl: mi.Float,
+    throughput: mi.Spectrum,
+) -> None:
+    """Laser sampling: connect the vertex to every laser of the lane and deposit (Royo et al. 2022, section 4)."""
+    slot = _slot(settings, bounce)
+    # one place in the spot for all lasers: what a path draws must not depend on how many lasers a batch has
+    in_spot = mi.Vector3f(0)
+    if dr.hint(settings.finds_spot, mode="scalar"):
+        in_spot = _on_disc(generator, active) * settings.spot_radius
+    if dr.hint(transport.lasers_per_lane == 1, mode="scalar"):
+        _connect(settings, transport, histogram, in_spot, lane, mi.UInt32(0), slot, si, active, opl, throughput)
+    else:
+        laser = mi.UInt32(0)
+        while dr.hint(laser < transport.n_lasers, exclude=[settings, transport, histogram]):
+            _connect(settings, transport, histogram, in_spot, lane, laser, slot, si, active, opl, throughput)
+            laser += 1
+
+
+def _connect(
+    settings: PathSettings,
+    transport: Transport,
+    histogram: DeviceHistogram,
+    in_spot: mi.Vector3f,
+    lane: mi.UInt32,
+    laser: mi.UInt32,
+    slot: mi.UInt32,
+    si: mi.SurfaceInteraction3f,
+    active: mi.Bool,
+    opl: mi.Float,
+    throughput: mi.Spectrum,
+) -> None:
+    built = transport.built
+    context = mi.BSDFContext()
+    points = transport.lasers.gather(transport.first_laser + laser)
+    lit = points.interaction
+    if settings.finds_spot:
+        lit.p = lit.p + lit.to_world(in_spot)
+        # what a spot loses over the wall's edge lights nothing
+        active = active & built.wall_shape.ray_test(mi.Ray3f(lit.p + 1e-2 * lit.n, -lit.n), active=active)
+    to_laser = lit.p - si.p
+    distance2 = dr.squared_norm(to_laser)
+    distance = dr.sqrt(distance2)
+    direction = to_laser / distance
+    bsdf = si.bsdf()
+    reflected, pdf = bsdf.eval_pdf(context, si, si.to_local(direction), active)
+    emitted = built.wall_bsdf.eval(context, lit, lit.to_local(-direction), active)  # includes the laser point's cosine
+    value = throughput * reflected * emitted / distance2
+    if settings.finds_spot:
+        # balance heuristic against finding the same point of the spot by the next ray
+        share = dr.select(si.shape == mi.ShapePtr(built.wall_shape), 1 - settings.hidden_fraction, 1.0)
+        cosine = dr.maximum(dr.dot(lit.n, -direction), 0)
+        value *= _balance(distance2, share * pdf * cosine * dr.pi * settings.spot_radius**2)
+    active = active & dr.any(value > 0)  # not in place: the caller's mask serves the other lasers, too
+    active &= ~built.scene.ray_test(connection_segment(si, direction, lit.p), coherent=False, active=active)
+    bins = delay_bin(transport, points, opl + distance)
+    histogram.deposit(lane, laser, slot, bins, value, active)
+
+
+@dr.syntax
+def deposit_spot(
+    settings: PathSettings,
+    transport: Transport,
+    histogram: DeviceHistogram,
+    lane: mi.UInt32,
+    si: mi.SurfaceInteraction3f,
+    ray: mi.Ray3f,
+    active: mi.Bool,
+    is_delta: mi.Bool,
+    bounce: mi.UInt32,
+    opl: mi.Float,
+    throughput: mi.Spectrum,
+    value: mi.Spectrum,
+    density: mi.Float,
+    distance2: mi.Float,
+) -> None:
+    """A ray that met the relay wall inside the laser's spot carries the spot's radiance; once per laser of the lane."""
+    context = mi.BSDFContext()
+    slot = _slot(settings, bounce)
+    spot_area = dr.pi * settings.spot_radius**2
+    cosine = dr.maximum(-dr.dot(si.n, ray.d), 1e-9)
+    laser = mi.UInt32(0)
+    while dr.hint(laser < transport.n_lasers, exclude=[settings, transport, histogram]):
+        points = transport.lasers.gather(transport.first_laser + laser)
+        lit = points.interaction
+        inside = active & (dr.squared_norm(si.p - lit.p) < settings.spot_radius**2)
+        emitted = transport.built.wall_bsdf.eval(context, lit, lit.to_local(-ray.d), inside) / (cosine * spot_area)
+        carried = throughput * value * emitted / density
+        if dr.hint(settings.laser_sampling, mode="scalar"):
+            carried *= dr.select(is_delta, 1, _balance(density * cosine * spot_area, distance2))
+        inside &= dr.any(carried > 0)
+        histogram.deposit(lane, laser, slot, delay_bin(transport, points, opl), carried, inside)
+        laser += 1
+
+
+def _slot(settings: PathSettings, bounce: mi.UInt32) -> mi.UInt32:
+    """Return the histogram's slot of a bounce; the second bounce is computed elsewhere and has none."""
+    bounces = settings.bounces
+    if not bounces.split:
+        return mi.UInt32(0)
+    return dr.minimum(bounce - (FIRST_BOUNCE + 1), mi.UInt32(bounces.n_slots - 2))
+
+
+def delay_bin(transport: Transport, points: WallPoints, opl: mi.Float) -> mi.Int32:
+    """Return the bin of a path: its length in bins, plus what laser and sensor point add."""
+    sensors = transport.sensors
+    delay = opl * transport.bins_per_unit + (points.delay_fraction + sensors.delay_fraction)
+    return mi.Int32(dr.floor(dr.minimum(delay, 1e9))) + points.delay_bins + sensors.delay_bins
+
+
+def _balance(own: mi.Float, other: mi.Float) -> mi.Float:
+    return own / dr.maximum(own + other, 1e-30)
+
+
+def _on_disc(generator: mi.PCG32, active: mi.Bool) -> mi.Vector3f:
+    square = mi.Point2f(generator.next_float32(active), generator.next_float32(active))
+    point = mi.warp.square_to_uniform_disk_concentric(square)
+    return mi.Vector3f(point.x, point.y, 0)
+
+
+def offset_origin(si: mi.SurfaceInteraction3f, direction: mi.Vector3f) -> mi.Point3f:
+    """Return where a ray that leaves a surface in ``direction`` starts: a little off the surface, on the ray's side."""
+    scale = RAY_OFFSET * (1 + dr.max(dr.abs(si.p)))
+    return si.p + si.n * dr.mulsign(mi.Float(scale), dr.dot(si.n, direction))
+
+
+def connection_segment(si: mi.SurfaceInteraction3f, direction: mi.Vector3f, point: mi.Point3f) -> mi.Ray3f:
+    """Ray from the surface to ``point``, which lies in ``direction``, ending just before it."""
+    origin = offset_origin(si, direction)
+    # aimed from the offset origin: a parallel ray would pass beside the point, behind the wall at oblique incidence
+    distance = dr.norm(point - origin)
+    return mi.Ray3f(origin, (point - origin) / distance, distance - 2 * RAY_OFFSET * (1 + distance), mi.Float(0), [])

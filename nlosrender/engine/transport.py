@@ -1,0 +1,78 @@
+"""What a launch of the path integrator reads and carries on: settings, scene and points, random state."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+from nlosrender.capture.bounces import FIRST_BOUNCE, BounceAxis
+from nlosrender.engine.device_arrays import WallPoints
+from nlosrender.engine.surface_sampler import SurfaceSampler
+from nlosrender.scene.build import BuiltScene
+
+
+@dataclass(frozen=True)
+class PathSettings:
+    """What the integrator computes and how; part of the compiled kernel."""
+
+    bounces: BounceAxis
+    first_bounce: int  # lowest bounce that is deposited, >= 3
+    hidden_fraction: float  # share of wall vertices that sample the hidden geometry; 0 = BSDF only, 1 = hidden only
+    laser_sampling: bool
+    russian_roulette: bool
+    spot_radius: float  # of the laser on the wall [engine units]; 0 = a point
+    has_transmission: bool  # some BSDF refracts: the optical path length needs the medium's index
+
+    @property
+    def goes_on(self) -> bool:
+        """Whether paths have more than one vertex after the sensor point."""
+        return self.last_vertex is None or self.last_vertex > FIRST_BOUNCE + 1
+
+    @property
+    def last_vertex(self) -> int | None:
+        """Bounce index of the last vertex a path may have: one more than the bounces when rays look for the spot."""
+        highest = self.bounces.max_bounces
+        return highest + 1 if highest is not None and self.finds_spot else highest
+
+    @property
+    def finds_spot(self) -> bool:
+        """Whether rays may find the laser's spot by chance."""
+        return self.spot_radius > 0
+
+
+@dataclass(frozen=True, eq=False)
+class Transport:
+    """Everything a launch reads: scene, points, and the conversion from engine units to bins."""
+
+    built: BuiltScene
+    sampler: SurfaceSampler
+    sensors: WallPoints  # one per lane
+    lasers: WallPoints  # all lasers of the batch
+    first_laser: mi.UInt32  # per lane: confocal lanes have their own laser, others start at 0
+    lasers_per_lane: int
+    n_lasers: mi.UInt32  # opaque copy of ``lasers_per_lane``: its value is not part of the kernel
+    bins_per_unit: mi.Float  # engine unit / bin width, opaque
+
+
+@dataclass(frozen=True, eq=False)
+class LaneRandomness:
+    """Random state of every lane; carried from launch to launch, so that splitting a render changes no bit."""
+
+    generator: mi.PCG32
+    sequence: list[mi.UInt32]  # low-discrepancy state, three dimensions
+
+    @classmethod
+    def seeded(cls, seed: int, lane_key: mi.UInt32) -> LaneRandomness:
+        """Seed every lane from the render's seed and the lane's identity, never from its place in a batch."""
+        state_high, state_low = mi.sample_tea_32(mi.UInt32(seed), lane_key, 8)
+        key_high, key_low = mi.sample_tea_32(lane_key, mi.UInt32(seed ^ 0x9E3779B9), 8)
+        wide = mi.UInt64(2**32)
+        generator = mi.PCG32(
+            initstate=mi.UInt64(state_high) * wide + mi.UInt64(state_low),
+            initseq=mi.UInt64(key_high) * wide + mi.UInt64(key_low),
+        )
+        starts = [generator.next_uint32() for _ in range(3)]
+        dr.eval(generator, starts)
+        return cls(generator, starts)
