@@ -129,12 +129,7 @@ def render_capture(
     warnings.say(config_warnings(config))
     with stopwatch.stage("scene"):
         check_writable(config.output.path)
-        backend = start_backend(config.render.backend, colored=config.is_colored)
-        built = load_scene(config)
-        capture, time_axis = describe_capture(config, built.wall, built)
-        plan, engine = prepare(config, backend, built, capture, time_axis)
-        header = describe_file(config, built, capture, time_axis)
-        warnings.say(late_warnings(config, backend, plan, engine, header))
+        backend, plan, engine, header = set_up(config, warnings)
     provenance = provenance_attributes(
         config_to_dict(config), config_hash(config), engine=engine.name, seed=config.render.seed
     )
@@ -159,17 +154,28 @@ def render_capture(
     return RenderReport(
         output=Path(config.output.path),
         engine=engine.name,
-        reason=engine_reason(config, capture, built),
+        reason=engine_reason(config, engine),
         variant=backend.variant,
         samples=totals.samples or 0,
         error_estimate=totals.error_estimate,
         energy=totals.energy_per_bounce(engine.options.bounces),
         out_of_window=totals.outside,
-        n_bins=time_axis.n_bins,
-        n_triangles=built.n_triangles,
+        n_bins=header.n_bins,
+        n_triangles=engine.built.n_triangles,
         seconds=stopwatch.report(),
         warnings=tuple(warnings.said),
     )
+
+
+def set_up(config: Config, warnings: Warnings) -> tuple[Backend, Plan, Engine, CaptureHeader]:
+    """Stages 2 to 4 up to the first ray: scene, capture, plan, engine, and what the file will say of them."""
+    backend = start_backend(config.render.backend, colored=config.is_colored)
+    built = load_scene(config)
+    capture, time_axis = describe_capture(config, built.wall, built)
+    plan, engine = prepare(config, backend, built, capture, time_axis)
+    header = describe_file(config, built, capture, time_axis)
+    warnings.say(late_warnings(config, backend, plan, engine, header))
+    return backend, plan, engine, header
 
 
 def forecast_capture(config: Config) -> Forecast:
@@ -183,14 +189,9 @@ def forecast_capture(config: Config) -> Forecast:
     warnings = Warnings(lambda text: None)
     begun = time.perf_counter()
     warnings.say(config_warnings(config))
-    backend = start_backend(config.render.backend, colored=config.is_colored)
-    built = load_scene(config)
-    capture, time_axis = describe_capture(config, built.wall, built)
-    plan, engine = prepare(config, backend, built, capture, time_axis)
-    header = describe_file(config, built, capture, time_axis)
-    warnings.say(late_warnings(config, backend, plan, engine, header))
+    backend, plan, engine, header = set_up(config, warnings)
     spent = time.perf_counter() - begun
-    reason = engine_reason(config, capture, built)
+    reason = engine_reason(config, engine)
     return forecast_render(config, backend, plan, engine, reason, header, tuple(warnings.said), spent)
 
 
@@ -204,11 +205,11 @@ def late_warnings(config: Config, backend: Backend, plan: Plan, engine: Engine, 
     yield from disk_warnings(Path(config.output.path), forecast_file(config, header, engine))
 
 
-def engine_reason(config: Config, capture: Capture, built: BuiltScene) -> str:
+def engine_reason(config: Config, engine: Engine) -> str:
     """Return why the capture is rendered by the engine it is."""
     from nlosrender.engine.planner import choose_engine
 
-    return choose_engine(config.render, capture, built).reason
+    return choose_engine(config.render, engine.capture, engine.built).reason
 
 
 def load_scene(config: Config) -> BuiltScene:

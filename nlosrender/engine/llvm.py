@@ -9,7 +9,6 @@ before Dr.Jit is imported; one of an unproven version first has to render a smal
 from __future__ import annotations
 
 import ctypes
-import ctypes.util
 import importlib.metadata
 import os
 import re
@@ -78,12 +77,7 @@ def find_libraries() -> list[LlvmLibrary]:
 
     Nothing is loaded into this process; versions not proven are tried in a process of their own.
     """
-    named = os.environ.get(ENVIRONMENT_VARIABLE)
-    if named:
-        return [_judge(Path(named), ENVIRONMENT_VARIABLE)]
-    wheel = _wheel_library()
-    system = [_judge(path, "system") for path in _system_libraries()]
-    return system + ([_judge(wheel, WHEEL)] if wheel else [])
+    return [_judge(*candidate) for candidate in _candidates()]
 
 
 def choose_library() -> LlvmLibrary | None:
@@ -91,12 +85,7 @@ def choose_library() -> LlvmLibrary | None:
 
     Proven versions win over merely probed ones; the user's choice is the only candidate when there is one.
     """
-    named = os.environ.get(ENVIRONMENT_VARIABLE)
-    if named:
-        library = _judge(Path(named), ENVIRONMENT_VARIABLE)
-        return library if library.usable else None
-    wheel = _wheel_library()
-    candidates = [(path, "system") for path in _system_libraries()] + ([(wheel, WHEEL)] if wheel else [])
+    candidates = _candidates()
     # Proven ones first, so that a probe (a process each) runs only when nothing better is there.
     candidates.sort(key=lambda candidate: major_version(candidate[0]) not in PROVEN_MAJORS)
     return next((library for library in (_judge(*candidate) for candidate in candidates) if library.usable), None)
@@ -130,6 +119,15 @@ def major_version(path: Path) -> int | None:
         if match:
             return int(match.group(1))
     return None
+
+
+def _candidates() -> list[tuple[Path, str]]:
+    """Return every library with its origin: the one the user named alone, else the system's and the wheel's."""
+    named = os.environ.get(ENVIRONMENT_VARIABLE)
+    if named:
+        return [(Path(named), ENVIRONMENT_VARIABLE)]
+    wheel = _wheel_library()
+    return [(path, "system") for path in _system_libraries()] + ([(wheel, WHEEL)] if wheel else [])
 
 
 def _judge(path: Path, origin: str) -> LlvmLibrary:

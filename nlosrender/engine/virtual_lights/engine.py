@@ -19,9 +19,7 @@ from nlosrender.engine.histogram import DeviceHistogram, Histogram, HistogramSha
 from nlosrender.engine.path_engine import Budget, PathEngine, PathOptions, Progress
 from nlosrender.engine.transport import Transport
 from nlosrender.engine.virtual_lights.gather import (
-    DevicePatches,
     GatherSettings,
-    Illumination,
     gather_third_bounce,
     illuminate,
     own_rows,
@@ -34,7 +32,6 @@ from nlosrender.scene.build import BuiltScene
 FIRST_COARSENESS = 1.0
 REFINEMENT = 3.0  # at least so many times more patches between the two resolutions that are compared
 DEFAULT_TARGET = 0.01
-LAUNCH_PAIRS = 2e8  # pairs of sensor point and patch per launch, for the progress bar and Ctrl-C
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,27 +135,12 @@ class VirtualLightEngine:
         on_device = upload_patches(self.built, patches)
         light = None if self.settings.is_confocal else illuminate(transport, on_device, shape.lasers)
         histogram = DeviceHistogram(shape)
-        self._launch(shape, transport, on_device, light, histogram, slice_of_lane)
+        jitter = mi.sample_tea_32(dr.arange(mi.UInt32, shape.lanes), mi.UInt32(self.options.seed))[0]
+        stride = dr.opaque(mi.UInt32, shape.replicas)
+        first = mi.UInt32(slice_of_lane)
+        gather_third_bounce(self.settings, transport, on_device, light, histogram, first, stride, jitter)
         values = histogram.sums.numpy().reshape(shape.replicas, -1).sum(axis=0)
         return _Gathered(to_memory_order(values, shape), len(patches))
-
-    def _launch(
-        self,
-        shape: HistogramShape,
-        transport: Transport,
-        patches: DevicePatches,
-        light: Illumination | None,
-        histogram: DeviceHistogram,
-        slice_of_lane: mi.UInt32,
-    ) -> None:
-        seed = mi.UInt32(self.options.seed)
-        jitter = mi.sample_tea_32(dr.arange(mi.UInt32, shape.lanes), seed)[0]
-        stride = dr.opaque(mi.UInt32, shape.replicas)
-        gather_third_bounce(
-            self.settings, transport, patches, light, histogram, mi.UInt32(slice_of_lane), stride, jitter
-        )
-        dr.eval(histogram.sums)
-        dr.sync_thread()
 
     def _shape(self, batch: Batch) -> tuple[HistogramShape, int]:
         """Return the histogram's shape, whose replicas are slices: lanes that share the patches of a sensor point."""

@@ -59,7 +59,7 @@ class Tessellator:
     def __init__(self, built: BuiltScene, bin_width: float):
         self.built, self.bin_width = built, bin_width
         self._meshes: list[tuple[int, Float64]] = []
-        self._curved: list[tuple[int, mi.Shape, Float64]] = []
+        self._spheres: list[tuple[int, Float64]] = []  # centre and signed radius
         for index, shape in enumerate(built.scene.shapes()):
             if shape.id() == WALL_ID:
                 continue
@@ -68,18 +68,18 @@ class Tessellator:
                 vertices = np.asarray(parameters["vertex_positions"], dtype=np.float64).reshape(-1, 3)
                 self._meshes.append((index, vertices[np.asarray(parameters["faces"]).reshape(-1, 3)]))
             else:
-                self._curved.append((index, shape, _sphere_of(shape)))
+                self._spheres.append((index, _sphere_of(shape)))
 
     def patches(self, coarseness: float) -> Patches:
         """Return patches whose error is of order ``coarseness`` squared."""
         parts = [self._flat(index, triangles, coarseness) for index, triangles in self._meshes]
-        parts += [self._sphere(index, sphere, coarseness) for index, _, sphere in self._curved]
+        parts += [self._sphere(index, sphere, coarseness) for index, sphere in self._spheres]
         return Patches.joined(parts)
 
     def count(self, coarseness: float) -> int:
         """Return how many patches ``patches`` would make, without making them."""
         flat = sum(int((self._splits(triangles, coarseness) ** 2).sum()) for _, triangles in self._meshes)
-        return flat + sum(20 * self._sphere_splits(sphere, coarseness) ** 2 for _, _, sphere in self._curved)
+        return flat + sum(20 * self._sphere_splits(sphere, coarseness) ** 2 for _, sphere in self._spheres)
 
     def _allowed(self, distance: Float64, coarseness: float) -> Float64:
         """Return the size a patch may have at ``distance`` from the wall [engine units]."""
@@ -189,7 +189,7 @@ def _split_weights(n: int) -> Float64:
 def _icosahedron() -> Float64:
     """Return the 20 faces (20, 3, 3) of the icosahedron in the unit sphere, counter-clockwise from outside."""
     golden = (1 + 5**0.5) / 2
-    vertices = np.array([(s * a, t * golden * b, 0) for a, b in ((1, 1),) for s in (-1, 1) for t in (-1, 1)])
+    vertices = np.array([(s, t * golden, 0) for s in (-1, 1) for t in (-1, 1)])
     vertices = np.concatenate([vertices, np.roll(vertices, 1, axis=1), np.roll(vertices, 2, axis=1)])
     vertices /= np.linalg.norm(vertices, axis=1, keepdims=True)
     edge = 2 / np.sqrt(1 + golden**2)
