@@ -1,27 +1,27 @@
 """How long a render will take: a pilot of the engine on part of the capture, extrapolated.
 
-The path engine's error falls as 1 / sqrt(paths), the gather's as 1 / patches; cost is linear in both.
+The path engine's error falls as 1 / sqrt(paths), and cost is linear in them; what the virtual lights need for a target
+error they find out themselves.
 """
 
 from __future__ import annotations
 
 import math
 import time
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import drjit as dr
 
 from nlosrender.capture.bounces import THIRD_BOUNCE, BounceAxis
 from nlosrender.capture.grids import Capture
 from nlosrender.capture.plan import Batch, Plan, Tile
 from nlosrender.engine.histogram import Histogram, relative_l2_error
 from nlosrender.engine.memory import n_pairs
-from nlosrender.engine.path_engine import FIRST_SAMPLES, Budget, PathEngine
+from nlosrender.engine.path_engine import DEFAULT_TARGET, FIRST_SAMPLES, Budget, PathEngine
 from nlosrender.engine.skipped import traces_paths
-from nlosrender.engine.virtual_lights.engine import (
-    DEFAULT_TARGET,
-    FIRST_COARSENESS,
-    REFINEMENT,
-    VirtualLightEngine,
-)
+from nlosrender.engine.virtual_lights.engine import VirtualLightEngine
+from nlosrender.engine.virtual_lights.third_bounce import FIRST_COARSENESS, REFINEMENT
 
 PILOT_SECONDS = 0.5
 PILOT_BYTES = 128e6  # of histograms: a forecast must not take the memory of the render
@@ -71,10 +71,9 @@ def estimate_render_time(
     parts = []
     paths = engine.paths if isinstance(engine, VirtualLightEngine) else engine
     if isinstance(engine, VirtualLightEngine):
-        gather, third = _gather_seconds(engine, plan, pilot, budget)
-        known_squares = float((third.mean**2).sum()) / paths.scale**2
+        gather, known_squares = _light_seconds(engine, plan, pilot, budget)
         seconds += gather
-        parts.append("error ~ 1 / patches")
+        parts.append("patches and walks settled")
     if traces_paths(engine):
         traced, rays = _path_seconds(paths, plan, pilot, budget, lanes, known_squares)
         lit_shares = _lit_shares(rays, engine.options.bounces)
@@ -128,8 +127,11 @@ def _path_seconds(
 ) -> tuple[float | None, Histogram]:
     """Return the seconds of path tracing, None when the pilot is nothing but noise, and what the pilot saw."""
     paths.render(pilot, Budget(spp=1))  # compiles
-    first, overhead = _timed(paths, pilot, Budget(spp=1))
-    second, seconds = _timed(paths, pilot, Budget(time_limit_s=PILOT_SECONDS))
+    begun = time.perf_counter()
+    first = paths.render(pilot, Budget(spp=1))
+    overhead = time.perf_counter() - begun
+    second = paths.render(pilot, Budget(time_limit_s=PILOT_SECONDS))
+    seconds = time.perf_counter() - begun - overhead
     per_path = max(seconds - overhead, 1e-6) / max(second.samples - first.samples, 1) / pilot.sensors.size
     if budget.spp is not None:
         needed = float(math.ceil(budget.spp / plan.replicas) * plan.replicas)
@@ -167,32 +169,43 @@ def _lit_shares(pilot: Histogram, bounces: BounceAxis) -> tuple[float | None, ..
     return tuple(None if slot == third else share for slot, share in enumerate(shares))
 
 
-def _gather_seconds(engine: VirtualLightEngine, plan: Plan, pilot: Batch, budget: Budget) -> tuple[float, Histogram]:
-    """Return the seconds of the gather, and the third bounce of the pilot's sensor points."""
-    third_only = replace(engine.options, bounces=BounceAxis(THIRD_BOUNCE, engine.options.bounces.split))
-    scene = (engine.built, engine.capture, engine.time_axis, third_only, engine.lanes)
-    gather = VirtualLightEngine(*scene)
-    goal = Budget(target_error=budget.target_error or DEFAULT_TARGET, time_limit_s=PILOT_SECONDS)
-    gather.render(pilot, goal)  # compiles, and finds how fine the patches have to be
+def _light_seconds(engine: VirtualLightEngine, plan: Plan, pilot: Batch, budget: Budget) -> tuple[float, float]:
+    """Return the seconds of settling, the gather and the walks, and the pilot's sum of squares of the third bounce."""
+    begun = time.perf_counter()
+    settled = engine.settle_lights(budget)
+    settling = time.perf_counter() - begun
     part = _middle(pilot.sensors, max(1, pilot.sensors.size // 4))
     quarter = Batch(part, part if engine.capture.scan_type == "confocal" else pilot.lasers)
-    # Every run starts as coarse as the render does; of many batches only the first one would.
-    gathers = [gather if len(plan.batches) > 1 else VirtualLightEngine(*scene) for _ in range(2)]
-    _, quarter_seconds = _timed(gathers[0], quarter, goal)
-    third, seconds = _timed(gathers[1], pilot, goal)
-    # what every batch pays for its patches, and what every sensor point adds
-    more = pilot.sensors.size - part.size
-    per_point = max(seconds - quarter_seconds, 0.0) / more if more else seconds / pilot.sensors.size
+    fineness, rounds = settled.fineness or FIRST_COARSENESS, settled.rounds or 0
+    third = engine.third.gather(pilot, fineness)  # compiles
+    seconds = _extrapolated(engine, plan, pilot, quarter, lambda batch: engine.third.pair(batch, fineness))
+    further = engine.further
+    if further is not None and rounds:
+        further.accumulate(pilot, further.histogram(pilot, plan.replicas), 0)
+
+        def walk(batch: Batch) -> None:
+            further.accumulate(batch, further.histogram(batch, plan.replicas), 0)
+            dr.sync_thread()
+
+        seconds += rounds * _extrapolated(engine, plan, pilot, quarter, walk)
+    return settling + seconds, third.squares
+
+
+def _extrapolated(
+    engine: VirtualLightEngine, plan: Plan, pilot: Batch, quarter: Batch, work: Callable[[Batch], object]
+) -> float:
+    """Return the seconds of ``work`` for the whole plan: what every batch pays, and what every sensor point adds."""
+    seconds, of_quarter = _timed(work, pilot), _timed(work, quarter)
+    more = pilot.sensors.size - quarter.sensors.size
+    per_point = max(seconds - of_quarter, 0.0) / more if more else seconds / pilot.sensors.size
     per_batch = max(seconds - per_point * pilot.sensors.size, 0.0)
-    points = _sensor_visits(engine.capture, plan, pilot)
-    finer = max(1.0, _error(third) / (goal.target_error or DEFAULT_TARGET))
-    return (per_batch * len(plan.batches) + per_point * points) * finer, third
+    return per_batch * len(plan.batches) + per_point * _sensor_visits(engine.capture, plan, pilot)
 
 
-def _timed(engine: PathEngine | VirtualLightEngine, batch: Batch, budget: Budget) -> tuple[Histogram, float]:
+def _timed(work: Callable[[Batch], object], batch: Batch) -> float:
     begun = time.perf_counter()
-    histogram = engine.render(batch, budget)
-    return histogram, time.perf_counter() - begun
+    work(batch)
+    return time.perf_counter() - begun
 
 
 def _error(histogram: Histogram, known_squares: float = 0.0) -> float:

@@ -11,7 +11,8 @@ from nlosrender.capture.plan import BYTES_PER_SUM, MOST_SUMS, Batch, Plan
 from nlosrender.engine.backend import batch_memory, physical_memory
 from nlosrender.engine.path_engine import PathEngine
 from nlosrender.engine.skipped import traces_paths
-from nlosrender.engine.virtual_lights.engine import FIRST_COARSENESS, REFINEMENT, VirtualLightEngine
+from nlosrender.engine.virtual_lights.engine import VirtualLightEngine
+from nlosrender.engine.virtual_lights.third_bounce import FIRST_COARSENESS, REFINEMENT
 from nlosrender.errors import RenderError
 
 PATCH_BYTES = 400  # float64 on the host, while they are cut and joined, and float32 on the device

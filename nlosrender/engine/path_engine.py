@@ -18,6 +18,7 @@ from nlosrender.capture.time_axis import TimeAxis
 from nlosrender.engine.device_arrays import laser_points, sensor_points
 from nlosrender.engine.histogram import DeviceHistogram, Histogram, HistogramShape, to_memory_order
 from nlosrender.engine.path_integrator import load_path_integrator
+from nlosrender.engine.pilot import Pilot, pilot_of
 from nlosrender.engine.second_bounce import deposit_second_bounce
 from nlosrender.engine.surface_sampler import SurfaceSampler
 from nlosrender.engine.transport import LaneRandomness, PathSettings, Transport
@@ -27,6 +28,10 @@ from nlosrender.scene.build import BuiltScene
 FIRST_SAMPLES = 32  # per lane, before the first look at the error
 LAUNCH_SECONDS = 0.5  # launches are kept this short, for the progress bar and Ctrl-C
 NEAR_RATIO = 4.0  # hidden area over pi times (its distance from the wall)^2 above which its density is too peaked
+DEFAULT_TARGET = 0.01  # where neither an error nor samples are asked for
+SETTLED_SHARE = 0.9  # of the target error: the pilot's estimate has an error of its own
+PILOT_ERROR = 3.0  # times the goal: when a pilot has seen enough
+PILOT_LANES = 2048
 SURROUNDED = 0.75  # share of the hemisphere above which BSDF sampling alone does better
 
 Progress = Callable[[float], None]
@@ -34,11 +39,16 @@ Progress = Callable[[float], None]
 
 @dataclass(frozen=True)
 class Budget:
-    """When to stop: after ``spp`` samples per sensor point, at ``target_error`` (relative L2 of H), after seconds."""
+    """When to stop: after ``spp`` samples per sensor point, at ``target_error`` (relative L2 of H), after seconds.
+
+    An engine's ``settle`` turns a target error into fixed settings.
+    """
 
     spp: int | None = None
     target_error: float | None = None
     time_limit_s: float | None = None
+    fineness: float | None = None  # settled: coarseness of the patches of the virtual lights
+    rounds: int | None = None  # settled: rounds of walks of the virtual lights
 
 
 @dataclass(frozen=True)
@@ -129,7 +139,7 @@ class PathEngine:
                 f"a batch of {shape.size:.2e} sums is more than 32-bit indices reach; lower render.memory_limit"
             )
         transport = self.transport(batch, shape)
-        if bounces.max_bounces is not None and bounces.max_bounces < self.settings.first_bounce:
+        if not self._has_bounces:
             mean, variance = np.zeros(shape.axes), np.zeros(shape.axes)
             per_lane = 0
         else:
@@ -148,12 +158,44 @@ class PathEngine:
             raise RenderError("the path engine produced a value that is not finite; please report the configuration")
         return Histogram(mean[..., :-1], variance[..., :-1], mean[..., -1], per_lane * shape.replicas)
 
+    def settle(self, budget: Budget, known_squares: float = 0.0) -> Budget:
+        """Turn a target error into samples for the whole capture, found by a pilot on a few of its points.
+
+        The number does not depend on how the capture is cut. Budgets with ``spp`` or a time limit stay as they are.
+
+        Parameters
+        ----------
+        budget
+            What is asked for.
+        known_squares
+            Sum of the squares of H over the pilot's points known from elsewhere [(engine unit)^-4].
+        """
+        if budget.target_error is None or budget.spp is not None or budget.time_limit_s is not None:
+            return budget
+        if not self._has_bounces:
+            return budget
+        pilot = pilot_of(self.capture)
+        bounces = self.options.bounces
+        slots = max(1, bounces.n_slots - 1) if bounces.split else 1
+        replicas = max(self.options.replicas, PILOT_LANES // pilot.sensors.size // 2 * 2)
+        shape = replace(self.shape(pilot, slots), replicas=replicas)
+        goal = SETTLED_SHARE * budget.target_error
+        schedule = _Schedule(Budget(target_error=PILOT_ERROR * goal), replicas, known_squares)
+        _, _, per_lane = self._accumulate(pilot, shape, self.transport(pilot, shape), schedule, lambda share: None)
+        error = schedule.errors[-1][1]
+        return replace(budget, spp=max(1, math.ceil(per_lane * replicas * (error / goal) ** 2)))
+
+    @property
+    def _has_bounces(self) -> bool:
+        highest = self.options.bounces.max_bounces
+        return highest is None or highest >= self.settings.first_bounce
+
     def _accumulate(
-        self, batch: Batch, shape: HistogramShape, transport: Transport, schedule: _Schedule, progress: Progress
+        self, batch: Batch | Pilot, shape: HistogramShape, transport: Transport, schedule: _Schedule, progress: Progress
     ) -> tuple[np.ndarray, np.ndarray, int]:
         histogram = DeviceHistogram(shape)
         lane = dr.arange(mi.UInt32, shape.lanes)
-        point = dr.gather(mi.UInt32, mi.UInt32(self._sensor_indices(batch)), lane % shape.sensors)
+        point = dr.gather(mi.UInt32, mi.UInt32(self.sensor_indices(batch)), lane % shape.sensors)
         key = point * shape.replicas + lane // shape.sensors
         randomness = LaneRandomness.seeded(self.options.seed, key)
         begun = time.perf_counter()
@@ -175,16 +217,18 @@ class PathEngine:
         dr.eval(mean, variance)
         return mean.numpy(), variance.numpy(), done
 
-    def shape(self, batch: Batch, slots: int) -> HistogramShape:
+    def shape(self, batch: Batch | Pilot, slots: int) -> HistogramShape:
+        """Return the shape of a batch's histogram with ``slots`` bounce slots."""
         lasers = batch.lasers.size if self.capture.scan_type == "exhaustive" else 1
         options = self.options
         return HistogramShape(
             options.replicas, batch.sensors.size, lasers, slots, options.channels, self.time_axis.n_bins
         )
 
-    def transport(self, batch: Batch, shape: HistogramShape) -> Transport:
-        sensors = sensor_points(self.built, self.capture, self.time_axis, self._sensor_indices(batch))
-        lasers = laser_points(self.built, self.capture, self.time_axis, self._laser_indices(batch))
+    def transport(self, batch: Batch | Pilot, shape: HistogramShape) -> Transport:
+        """Return what the lanes of a batch read."""
+        sensors = sensor_points(self.built, self.capture, self.time_axis, self.sensor_indices(batch))
+        lasers = laser_points(self.built, self.capture, self.time_axis, self.laser_indices(batch))
         lane = dr.arange(mi.UInt32, shape.lanes)
         sensor = lane % shape.sensors
         confocal = self.capture.scan_type == "confocal"
@@ -216,10 +260,12 @@ class PathEngine:
         dr.eval(histogram.sums)
         return to_memory_order(histogram.sums.numpy(), shape)
 
-    def _sensor_indices(self, batch: Batch) -> np.ndarray:
+    def sensor_indices(self, batch: Batch | Pilot) -> np.ndarray:
+        """Return the flat indices of a batch's sensor points."""
         return np.array(batch.sensors.flat_indices(self.capture.sensor_grid.nx), dtype=np.uint32)
 
-    def _laser_indices(self, batch: Batch) -> np.ndarray:
+    def laser_indices(self, batch: Batch | Pilot) -> np.ndarray:
+        """Return the flat indices of a batch's laser points."""
         return np.array(batch.lasers.flat_indices(self.capture.laser_grid.nx), dtype=np.uint32)
 
     def _choose_hidden_fraction(self) -> float:

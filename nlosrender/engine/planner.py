@@ -11,13 +11,12 @@ from nlosrender.capture.bounces import THIRD_BOUNCE
 from nlosrender.capture.grids import Capture
 from nlosrender.config.render import RenderConfig
 from nlosrender.engine.virtual_lights.engine import is_lambertian
-from nlosrender.engine.virtual_lights.patches import MAX_PATCHES, can_tessellate
+from nlosrender.engine.virtual_lights.patches import MAX_PATCHES, Tessellator, can_tessellate
 from nlosrender.scene.build import BuiltScene
 
 EngineName = Literal["path", "virtual_lights"]
-# Nearer to the wall than this share of its extent, the light a patch sends to the closest sensor points is too peaked
-# for one value per patch.
-NEAREST = 0.05
+# Engine units: a surface this near to a laser or sensor point is seen under a large angle however finely it is cut.
+TOUCHING = 2e-3
 
 
 @dataclass(frozen=True)
@@ -43,10 +42,9 @@ def choose_engine(render: RenderConfig, capture: Capture, built: BuiltScene) -> 
         return EngineChoice("virtual_lights", "asked for")
     if not all(is_lambertian(shape.bsdf()) for shape in built.hidden_shapes):
         return EngineChoice("path", "some hidden surfaces are not Lambertian")
-    nearest = float(built.hidden_bounds[0][2]) if built.hidden_bounds is not None else 0.0
-    if nearest < NEAREST * max(built.wall.width, built.wall.height):
-        return EngineChoice("path", "hidden geometry comes close to the wall")
-    return EngineChoice("virtual_lights", "Lambertian surfaces at a distance from a planar wall")
+    if Tessellator(built, capture, 1.0).nearest < TOUCHING:
+        return EngineChoice("path", "hidden geometry touches a laser or sensor point")
+    return EngineChoice("virtual_lights", "Lambertian surfaces before a planar wall")
 
 
 def _obstacle(render: RenderConfig, capture: Capture, built: BuiltScene) -> str | None:

@@ -14,9 +14,10 @@ from nlosrender.capture.bounces import THIRD_BOUNCE
 from nlosrender.capture.grids import Capture, PointGrid
 from nlosrender.capture.time_axis import TimeAxis
 from nlosrender.engine.path_engine import PathEngine
-from nlosrender.engine.surface_sampler import SAMPLEABLE_PLUGINS, visible_triangles
-from nlosrender.engine.virtual_lights.engine import FIRST_COARSENESS, REFINEMENT, VirtualLightEngine
+from nlosrender.engine.surface_sampler import SAMPLEABLE_PLUGINS, facing_triangles
+from nlosrender.engine.virtual_lights.engine import VirtualLightEngine
 from nlosrender.engine.virtual_lights.patches import MAX_PATCHES
+from nlosrender.engine.virtual_lights.third_bounce import FIRST_COARSENESS, REFINEMENT
 from nlosrender.scene.build import BuiltScene, wall_box
 from nlosrender.scene.hidden_geometry import Surface
 from nlosrender.scene.pose import Float64
@@ -103,7 +104,7 @@ def _surface_points(built: BuiltScene, shape: mi.Shape) -> _SurfacePoints:
     k = np.arange(count)
     u, v = (k + 0.5) / count, k * 0.618033988749895 % 1  # golden ratio: even in both dimensions
     if shape.is_mesh():
-        triangles = visible_triangles(built, shape)
+        triangles, _ = facing_triangles(built, shape)
         normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
         areas = np.linalg.norm(normals, axis=-1)
         if not len(areas):

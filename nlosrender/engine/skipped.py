@@ -48,14 +48,11 @@ def skipped_work(engine: PathEngine | VirtualLightEngine, *, scene_is_colored: b
     if options.channels == 1:
         why = "render.color is grey" if scene_is_colored else "everything in the scene is grey"
         skipped.append(Skipped("colour", why))
-    return (*skipped, *_techniques(paths))
+    return (*skipped, *(_techniques(paths) if traces_paths(engine) else ()))
 
 
 def _techniques(paths: PathEngine) -> Iterator[Skipped]:
     """Yield the sampling technique that is left out where one covers everything."""
-    highest = paths.options.bounces.max_bounces
-    if highest is not None and highest < paths.settings.first_bounce:
-        return  # no path is traced
     if paths.hidden_fraction == 1:
         yield Skipped("BSDF sampling at the wall (MIS)", "hidden geometry sampling alone finds all light there")
     elif paths.hidden_fraction == 0:
@@ -69,7 +66,8 @@ def _techniques(paths: PathEngine) -> Iterator[Skipped]:
 
 
 def traces_paths(engine: PathEngine | VirtualLightEngine) -> bool:
-    """Return whether any path is traced: not when the gather does the third bounce and no other is asked for."""
+    """Return whether the path engine has anything to do: not when patches and walks give all bounces asked for."""
+    if isinstance(engine, VirtualLightEngine):
+        return engine.has_further_bounces and engine.further is None
     highest = engine.options.bounces.max_bounces
-    lowest = THIRD_BOUNCE + 1 if isinstance(engine, VirtualLightEngine) else THIRD_BOUNCE
-    return highest is None or highest >= lowest
+    return highest is None or highest >= THIRD_BOUNCE

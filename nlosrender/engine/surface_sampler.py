@@ -44,7 +44,6 @@ class SurfaceSampler:
 
     def __init__(self, built: BuiltScene):
         shapes = built.scene.shapes()
-        wall_corners = wall_box(built.wall) / built.unit
         corners: list[Float64] = []
         owners: list[NDArray[np.uint32]] = []
         primitives: list[NDArray[np.uint32]] = []
@@ -57,13 +56,10 @@ class SurfaceSampler:
             # Shading normals may light a little of a geometric back side.
             self.dark_behind &= _is_one_sided(shape) and not (shape.is_mesh() and shape.has_vertex_normals())
             if shape.is_mesh():
-                triangles = _triangles(shape)
-                kept = np.flatnonzero(
-                    _visible_from(wall_corners, triangles, _is_one_sided(shape), built.wall.is_planar)
-                )
-                corners.append(triangles[kept])
+                triangles, kept = facing_triangles(built, shape)
+                corners.append(triangles)
                 owners.append(np.full(len(kept), index, np.uint32))
-                primitives.append(kept.astype(np.uint32))
+                primitives.append(kept)
             elif shape.class_name() in SAMPLEABLE_PLUGINS:
                 analytic.append((index, float(np.ravel(shape.surface_area())[0])))
             else:
@@ -197,11 +193,14 @@ def _visible_from(
     return visible & (height.max(axis=0) > 0)
 
 
-def visible_triangles(built: BuiltScene, mesh: mi.Mesh) -> Float64:
-    """Return the corners (n, 3, 3) of a mesh's triangles that the wall may see from a reflecting side [engine units].
+def facing_triangles(built: BuiltScene, mesh: mi.Mesh) -> tuple[Float64, NDArray[np.uint32]]:
+    """Return the corners (n, 3, 3) [engine units] of the triangles that the wall may see lit, and their numbers (n,).
 
-    Occlusion by other surfaces is not looked at.
+    Those are left out that turn their dark side to all of the wall. Occlusion by other surfaces is not looked at.
     """
     triangles = _triangles(mesh)
     corners = wall_box(built.wall) / built.unit
-    return triangles[_visible_from(corners, triangles, _is_one_sided(mesh), built.wall.is_planar)]
+    # Shading normals may light a little of a geometric back side.
+    one_sided = _is_one_sided(mesh) and not mesh.has_vertex_normals()
+    kept = np.flatnonzero(_visible_from(corners, triangles, one_sided, built.wall.is_planar))
+    return triangles[kept], kept.astype(np.uint32)

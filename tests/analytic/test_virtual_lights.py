@@ -222,8 +222,8 @@ def test_patches_cover_every_surface_once(coarseness: float) -> None:
     """However fine, the areas of the patches add up to those of the surfaces, and their sizes stay below the limit."""
     from nlosrender.engine.virtual_lights.patches import Tessellator
 
-    built, *_ = start(flat_wall(PLATE, BALL))
-    tessellator = Tessellator(built, 0.02 / built.unit)
+    built, capture, *_ = start(flat_wall(PLATE, BALL))
+    tessellator = Tessellator(built, capture, 0.02 / built.unit)
     patches = tessellator.patches(coarseness)
     assert patches.areas.sum() * built.unit**2 == pytest.approx(0.8 * 0.6 + 4 * np.pi * 0.3**2, rel=1e-6)
     assert len(patches) == tessellator.count(coarseness)
@@ -249,7 +249,7 @@ def test_a_triangle_is_spread_over_its_bins_by_area(delays: tuple[float, float, 
     histogram = DeviceHistogram(HistogramShape(1, 1, 1, 1, 1, 8))
     corners = [mi.Float(delay) for delay in (delays[1], delays[0], delays[2])]
     zero = mi.UInt32(0)
-    _spread(histogram, zero, zero, *corners, mi.Int32(0), mi.Spectrum(2.0), mi.Bool(True))
+    _spread(histogram, zero, zero, mi.Vector3f(*corners), mi.Int32(0), mi.Spectrum(2.0), mi.Bool(True))
     dr.eval(histogram.sums)
     shares = histogram.sums.numpy()
     # midpoints of n^2 equal parts: strips along an edge misplace at most 1 / n of the area
@@ -275,7 +275,8 @@ def test_a_triangle_is_spread_over_its_bins_by_area(delays: tuple[float, float, 
         ([PLATE | {"bsdf": {"type": "conductor"}}], {"engine": "virtual_lights"}, "path"),
         ([PLATE | {"bsdf": {"type": "roughconductor", "alpha": 0.4}}], {}, "path"),
         ([PLATE | {"bsdf": {"type": "roughconductor", "alpha": 0.4}}], {"engine": "virtual_lights"}, "virtual_lights"),
-        ([{"type": "room", "size": [2, 2, 2]}], {}, "path"),
+        ([{"type": "room", "size": [2, 2, 2]}], {}, "virtual_lights"),
+        ([PLATE | {"center": [0.0, 0.0, 0.0], "normal": [1, 0, 0]}], {}, "path"),
         ([PLATE], {"engine": "virtual_lights", "wall": {"type": "plastic"}}, "path"),
         ([{"type": "cylinder", "center": [0, 0, 1], "radius": 0.1, "height": 0.5}], {}, "path"),
     ],

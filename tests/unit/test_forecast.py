@@ -173,7 +173,7 @@ TUBE = {"type": "cylinder", "center": [0, 0, 0], "axis": [0, 1, 0], "radius": 1.
         ("colour", ((PLATE,), {}), (({**PLATE, "bsdf": RED},), {})),
         ("colour", (({**PLATE, "bsdf": RED},), {"color": "grey"}), ((PLATE,), {"color": "rgb"})),
         ("BSDF sampling at the wall (MIS)", ((PLATE,), {"engine": "path"}), ((ROOM,), {"engine": "path"})),
-        ("BSDF sampling at the wall (MIS)", ((PLATE,), {"max_bounces": 4}), ((PLATE,), {"max_bounces": 3})),
+        ("BSDF sampling at the wall (MIS)", ((PLATE,), {"max_bounces": 4, "engine": "path"}), ((PLATE,), {"max_bounces": 4})),
         ("hidden geometry sampling (MIS)", ((ROOM,), {"engine": "path"}), ((PLATE,), {"engine": "path"})),
         (
             "hidden geometry sampling (MIS)",

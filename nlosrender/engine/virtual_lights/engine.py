@@ -1,10 +1,10 @@
-"""The virtual-light engine: third bounce gathered to the asked-for error, further bounces by the path engine."""
+"""The virtual-light engine: third bounce gathered from patches, further bounces from walks, to the asked-for error."""
 
 from __future__ import annotations
 
 import math
 import time
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import drjit as dr
 import mitsuba as mi
@@ -15,35 +15,27 @@ from nlosrender.capture.bounces import THIRD_BOUNCE
 from nlosrender.capture.grids import Capture
 from nlosrender.capture.plan import Batch
 from nlosrender.capture.time_axis import TimeAxis
-from nlosrender.engine.histogram import DeviceHistogram, Histogram, HistogramShape, relative_l2_error, to_memory_order
-from nlosrender.engine.path_engine import Budget, PathEngine, PathOptions, Progress
-from nlosrender.engine.transport import Transport
-from nlosrender.engine.virtual_lights.gather import (
-    GatherSettings,
-    gather_third_bounce,
-    illuminate,
-    own_rows,
-    upload_patches,
-)
+from nlosrender.engine.histogram import Histogram, to_memory_order
+from nlosrender.engine.path_engine import DEFAULT_TARGET, Budget, PathEngine, PathOptions, Progress
+from nlosrender.engine.pilot import pilot_of
+from nlosrender.engine.virtual_lights.further_bounces import FurtherBounces, rounds_needed
+from nlosrender.engine.virtual_lights.lights import GatherSettings
 from nlosrender.engine.virtual_lights.occlusion import nothing_occludes
-from nlosrender.engine.virtual_lights.patches import MAX_PATCHES, Tessellator
+from nlosrender.engine.virtual_lights.patches import Tessellator
+from nlosrender.engine.virtual_lights.third_bounce import FIRST_COARSENESS, ThirdBounce, estimated_error
+from nlosrender.errors import RenderError
 from nlosrender.scene.build import BuiltScene
 
-FIRST_COARSENESS = 1.0
-REFINEMENT = 3.0  # at least so many times more patches between the two resolutions that are compared
-DEFAULT_TARGET = 0.01
-
-
-@dataclass(frozen=True, eq=False)
-class _Gathered:
-    """The third bounce at one resolution, (channel, 1, laser, sensor, row), per J and (engine unit)^2."""
-
-    values: NDArray[np.float64]
-    n_patches: int
+# Shares of the target error: squares add up to less than 1, for what a pilot cannot know.
+THIRD_ALONE = 0.9
+THIRD_OF_MANY, REST_OF_MANY = 0.35, 0.88  # patches are cheaper than walks
+PILOT_ERROR = 4.0  # times the target: when a pilot has seen enough to say how many rounds are needed
+MOST_PILOT_ROUNDS = 16
+PILOT_LANES = 2048
 
 
 class VirtualLightEngine:
-    """Third bounce by the gather, further bounces by path tracing.
+    """Third bounce by the gather of patches, further bounces by the gather of walks.
 
     Parameters
     ----------
@@ -58,18 +50,66 @@ class VirtualLightEngine:
     def __init__(self, built: BuiltScene, capture: Capture, time_axis: TimeAxis, options: PathOptions, lanes: int):
         self.built, self.capture, self.time_axis, self.options, self.lanes = built, capture, time_axis, options, lanes
         self.paths = PathEngine(built, capture, time_axis, options, first_bounce=THIRD_BOUNCE + 1)
-        self.tessellator = Tessellator(built, time_axis.bin_width_opl / built.unit)
+        self.tessellator = Tessellator(built, capture, time_axis.bin_width_opl / built.unit)
         self.settings = GatherSettings(
             is_confocal=capture.scan_type == "confocal",
             is_diffuse=all(is_lambertian(shape.bsdf()) for shape in built.hidden_shapes),
             needs_visibility=not nothing_occludes(built),
         )
-        self._coarseness = FIRST_COARSENESS  # where the last batch ended: the next one starts near it
+        self.third = ThirdBounce(self.paths, self.tessellator, self.settings, lanes)
+        self.further: FurtherBounces | None = None  # else the path engine
+        if self.has_further_bounces and self.settings.is_diffuse and not self.settings.is_confocal:
+            self.further = FurtherBounces(self.paths, self.tessellator, self.settings.needs_visibility)
+        self._settled: dict[Budget, Budget] = {}
+
+    @property
+    def has_further_bounces(self) -> bool:
+        """Whether bounces above the third are asked for."""
+        highest = self.options.bounces.max_bounces
+        return highest is None or highest > THIRD_BOUNCE
 
     @property
     def compile_seconds(self) -> float:
         """Seconds spent compiling so far; the gather's own kernels count as rendering."""
         return self.paths.compile_seconds
+
+    def settle(self, budget: Budget) -> Budget:
+        """Turn a target error into settings for the whole capture, tried on a few of its points.
+
+        The settings do not depend on how the capture is cut. With a time limit only the patches are settled.
+        """
+        if budget.fineness is not None:
+            return budget
+        if budget not in self._settled:
+            settled = self.settle_lights(budget)
+            if self.has_further_bounces and self.further is None:
+                squares = self.third.gather(pilot_of(self.capture), settled.fineness or FIRST_COARSENESS).squares
+                goal = REST_OF_MANY * (budget.target_error or DEFAULT_TARGET)
+                paths = self.paths.settle(replace(budget, target_error=goal), known_squares=squares)
+                settled = replace(settled, spp=paths.spp)
+            self._settled[budget] = settled
+        return self._settled[budget]
+
+    def settle_lights(self, budget: Budget) -> Budget:
+        """Return ``budget`` with the settings of patches and walks; what the path engine has to do is left open."""
+        pilot = pilot_of(self.capture)
+        target = budget.target_error or DEFAULT_TARGET
+        share = THIRD_OF_MANY if self.has_further_bounces else THIRD_ALONE
+        if budget.time_limit_s is not None:
+            return replace(budget, fineness=self._fineness_in_time(budget, share * target))
+        fineness, third = self.third.settle(pilot, share * target)
+        settled = replace(budget, fineness=fineness)
+        if self.further is None:
+            return settled
+        goal = REST_OF_MANY * target
+        replicas = max(2, PILOT_LANES // pilot.sensors.size // 2 * 2)
+        histogram = self.further.histogram(pilot, replicas)
+        done, error = 0, math.inf
+        while done < MOST_PILOT_ROUNDS and error > PILOT_ERROR * goal:
+            self.further.accumulate(pilot, histogram, done)
+            done += 1
+            error = histogram.relative_error(done, third.squares)
+        return replace(settled, rounds=rounds_needed(error, done, goal))
 
     def render(self, batch: Batch, budget: Budget, progress: Progress = lambda fraction: None) -> Histogram:
         """Render one batch; as ``PathEngine.render``, whose errors it raises.
@@ -77,97 +117,77 @@ class VirtualLightEngine:
         The variance of the third bounce is the square of its estimated discretisation error.
         """
         begun = time.perf_counter()
-        bounces = self.options.bounces
-        has_more = bounces.max_bounces is None or bounces.max_bounces > THIRD_BOUNCE
-        third, variance = self._third_bounce(batch, budget, lambda share: progress(share / 2 if has_more else share))
+        budget = self.settle(budget)
+        fineness = budget.fineness or FIRST_COARSENESS
+        coarse, fine = self.third.pair(batch, fineness)
+        _, divisor = estimated_error(coarse, fine)
+        third, scale = fine.values, self.paths.scale
+        progress(0.5 if self.has_further_bounces else 1.0)
         left = budget.time_limit_s
         if left is not None:
             left = max(0.0, left - (time.perf_counter() - begun))
-        rest = self.paths.render(
-            batch,
-            replace(budget, time_limit_s=left),
-            lambda share: progress((1 + share) / 2),
-            known_squares=float((third[..., :-1] ** 2).sum()) / self.paths.scale**2,
+        result = self._further_bounces(
+            batch, replace(budget, time_limit_s=left), fine.squares, lambda share: progress((1 + share) / 2)
         )
-        slot = bounces.slot(THIRD_BOUNCE)
-        mean, total_variance, outside = rest.mean, rest.variance, rest.outside
-        mean[:, slot] += third[:, 0, ..., :-1]
-        total_variance[:, slot] += variance[:, 0, ..., :-1]
-        outside[:, slot] += third[:, 0, ..., -1]
-        return Histogram(mean, total_variance, outside, rest.samples)
+        slot = self.options.bounces.slot(THIRD_BOUNCE)
+        result.mean[:, slot] += third[:, 0, ..., :-1] * scale
+        result.variance[:, slot] += ((third - coarse.values)[:, 0, ..., :-1] * (scale / divisor)) ** 2
+        result.outside[:, slot] += third[:, 0, ..., -1] * scale
+        if not np.isfinite(result.mean).all():
+            raise RenderError("the gather produced a value that is not finite; please report the configuration")
+        return result
 
-    def _third_bounce(
-        self, batch: Batch, budget: Budget, progress: Progress
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Refine until two resolutions say that the error is met; return H and its squared error per bin."""
+    def _further_bounces(self, batch: Batch, budget: Budget, known_squares: float, progress: Progress) -> Histogram:
+        if self.further is None:
+            return self.paths.render(batch, budget, progress, known_squares=known_squares)
+        histogram = self.further.histogram(batch, self.options.replicas)
         begun = time.perf_counter()
-        target = budget.target_error or DEFAULT_TARGET
-        shape, slices = self._shape(batch)
-        transport, slice_of_lane = self._transport(batch, shape, slices)
-        coarse = self._gather(batch, shape, transport, slice_of_lane, self._coarseness)
-        fineness = self._finer(self._coarseness, coarse.n_patches, REFINEMENT)
+        done = 0
         while True:
-            fine = self._gather(batch, shape, transport, slice_of_lane, fineness)
-            error, divisor = _estimated_error(coarse, fine)
-            progress(min(1.0, target / error) if error > 0 else 1.0)
-            spent = time.perf_counter() - begun
-            out_of_time = budget.time_limit_s is not None and 3 * spent > budget.time_limit_s
-            needed = fine.n_patches * error / target
-            if error <= target or out_of_time or max(needed, 2 * fine.n_patches) > MAX_PATCHES:
+            self.further.accumulate(batch, histogram, done)
+            dr.sync_thread()
+            done += 1
+            if budget.rounds is not None:
+                share = done / budget.rounds
+            else:
+                share = (time.perf_counter() - begun) / max(budget.time_limit_s or 0.0, 1e-9)
+                if budget.target_error is not None:
+                    error = histogram.relative_error(done, known_squares) / (REST_OF_MANY * budget.target_error)
+                    share = max(share, 1 / max(error, 1e-9) ** 2)
+            progress(min(share, 1.0))
+            if share >= 1:
                 break
-            more = min(max(1.2 * error / target, 2.0), 16.0)
-            coarse, fineness = fine, self._finer(fineness, fine.n_patches, more)
-        self._coarseness = min(FIRST_COARSENESS, fineness * math.sqrt(REFINEMENT))
-        scale = self.paths.scale
-        return fine.values * scale, ((fine.values - coarse.values) * (scale / divisor)) ** 2
+        mean, variance = (to_memory_order(values.numpy(), histogram.shape) for values in histogram.statistics(done))
+        return self._placed(mean * self.paths.scale, variance * self.paths.scale**2, done)
 
-    def _finer(self, coarseness: float, n_patches: int, factor: float) -> float:
-        """Return a coarseness with at least ``factor`` times the patches (a mesh may be finer than asked for)."""
-        finer = coarseness / math.sqrt(factor)
-        while self.tessellator.count(finer) < 0.9 * factor * n_patches:
-            finer *= 0.8
-        return finer
+    def _placed(self, mean: NDArray[np.float64], variance: NDArray[np.float64], rounds: int) -> Histogram:
+        """Return the statistics of bounces 4 and up with all bounce slots of the capture."""
+        bounces = self.options.bounces
+        first = bounces.slot(THIRD_BOUNCE + 1)
+        channels, slots, lasers, sensors, row = mean.shape
+        whole = [np.zeros((channels, bounces.n_slots, lasers, sensors, row)) for _ in range(2)]
+        for target, values in zip(whole, (mean, variance), strict=True):
+            target[:, first : first + slots] = values
+        impulses = rounds * self.further.impulses_per_round if self.further is not None else 0
+        return Histogram(whole[0][..., :-1], whole[1][..., :-1], whole[0][..., -1], impulses)
 
-    def _gather(
-        self, batch: Batch, shape: HistogramShape, transport: Transport, slice_of_lane: mi.UInt32, coarseness: float
-    ) -> _Gathered:
-        patches = self.tessellator.patches(coarseness)
-        on_device = upload_patches(self.built, patches)
-        light = None if self.settings.is_confocal else illuminate(transport, on_device, shape.lasers)
-        histogram = DeviceHistogram(shape)
-        jitter = mi.sample_tea_32(dr.arange(mi.UInt32, shape.lanes), mi.UInt32(self.options.seed))[0]
-        stride = dr.opaque(mi.UInt32, shape.replicas)
-        first = mi.UInt32(slice_of_lane)
-        gather_third_bounce(self.settings, transport, on_device, light, histogram, first, stride, jitter)
-        values = histogram.sums.numpy().reshape(shape.replicas, -1).sum(axis=0)
-        return _Gathered(to_memory_order(values, shape), len(patches))
-
-    def _shape(self, batch: Batch) -> tuple[HistogramShape, int]:
-        """Return the histogram's shape, whose replicas are slices: lanes that share the patches of a sensor point."""
-        # no more than the replicas that the plan has counted memory for
-        slices = max(1, min(math.ceil(self.lanes / batch.sensors.size), self.options.replicas))
-        return replace(self.paths.shape(batch, 1), replicas=slices), slices
-
-    def _transport(self, batch: Batch, shape: HistogramShape, slices: int) -> tuple[Transport, mi.UInt32]:
-        transport = self.paths.transport(batch, replace(shape, replicas=1))
-        sensors, slice_of_lane = own_rows(transport.sensors, shape.sensors, slices)
-        lane = dr.arange(mi.UInt32, shape.lanes)
-        first_laser = dr.gather(mi.UInt32, transport.first_laser, lane % shape.sensors)
-        dr.eval(sensors.interaction, sensors.delay_bins, sensors.delay_fraction, first_laser, slice_of_lane)
-        return replace(transport, sensors=sensors, first_laser=first_laser), slice_of_lane
-
-
-def _estimated_error(coarse: _Gathered, fine: _Gathered) -> tuple[float, float]:
-    """Return the relative L2 error of the finer resolution, and what to divide the difference of the two by.
-
-    The discretisation error falls as 1 / n patches: the difference is (r - 1) times the finer's error, with r the
-    ratio of the counts. The error of random visibility rays falls as n^(-3/4) and is independent: sqrt(r^1.5 + 1).
-    """
-    ratio = fine.n_patches / coarse.n_patches
-    divisor = min(ratio - 1, math.sqrt(ratio**1.5 + 1))
-    noise = float(((fine.values - coarse.values)[..., :-1] ** 2).sum()) / divisor**2
-    energy = float((fine.values[..., :-1] ** 2).sum())
-    return relative_l2_error(noise, energy + noise), divisor
+    def _fineness_in_time(self, budget: Budget, target: float) -> float:
+        """Return the fineness for ``target``, or the one that half of the time is predicted to suffice for."""
+        pilot = pilot_of(self.capture)
+        pairs = self.capture.n_sensors * (self.capture.n_lasers if self.capture.scan_type == "exhaustive" else 1)
+        lasers = pilot.lasers.size if self.capture.scan_type == "exhaustive" else 1
+        more = pairs / (pilot.sensors.size * lasers)
+        fineness = FIRST_COARSENESS
+        coarse = self.third.gather(pilot, fineness)
+        while True:
+            finer = self.third.finer(fineness, coarse.n_patches, 3.0)
+            begun = time.perf_counter()
+            fine = self.third.gather(pilot, finer)
+            predicted = (time.perf_counter() - begun) * more * 4
+            error, _ = estimated_error(coarse, fine)
+            if error <= target or predicted > (budget.time_limit_s or 0.0) / 2:
+                return finer if error <= target else fineness
+            fineness, coarse = finer, fine
 
 
 def is_lambertian(bsdf: mi.BSDF) -> bool:

@@ -1,8 +1,8 @@
 """Hidden surfaces -> patches small enough to be gathered as one light each.
 
-A patch of size h at distance d from the wall has an error of order (h/d)^2 in its geometry and of h^2/(4 d w) bins
-in its delay, with w the bin width: within a triangle the delay is taken as linear. One number, ``coarseness``,
-scales the size allowed by both, so that the error falls with its square.
+A patch of size h at distance d from the nearest laser or sensor point has an error of order (h/d)^2 in its geometry
+and of h^2/(4 d w) bins in its delay, with w the bin width: within a triangle the delay is taken as linear. One number,
+``coarseness``, scales the size allowed by both, so that the error falls with its square.
 """
 
 from __future__ import annotations
@@ -13,10 +13,13 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from nlosrender.capture.grids import Capture, PointGrid
+from nlosrender.engine.surface_sampler import facing_triangles
 from nlosrender.scene.build import WALL_ID, BuiltScene
 from nlosrender.scene.pose import Float64
 
 MAX_PATCHES = 4_000_000  # of one gather; beyond it the path engine is the better choice
+NEAREST = 1e-3  # engine units: surfaces nearer to a laser or sensor point are not cut any finer
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,77 +48,157 @@ class Patches:
         return cls(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
 
 
+@dataclass(frozen=True, eq=False)
+class Cells:
+    """Triangles, or quarters of quarters of them, no longer than their distance from any laser or sensor point."""
+
+    corners: Float64  # (n, 3, 3) [engine units]
+    weights: Float64  # (n, 3, 3) barycentric coordinates of the corners in the mesh's triangle
+    shapes: NDArray[np.uint32]  # (n,) index into the scene's shapes
+    primitives: NDArray[np.uint32]  # (n,) triangle of the mesh
+    sizes: Float64  # (n,) longest edge
+    distances: Float64  # (n,) of the centre from the nearest laser or sensor point, at least NEAREST
+
+    def at(self, chosen: NDArray[np.bool_]) -> Cells:
+        """Return the cells that are ``chosen``."""
+        return Cells(*(values[chosen] for values in self._arrays()))
+
+    @classmethod
+    def joined(cls, parts: list[Cells]) -> Cells:
+        """Return the cells of all parts."""
+        if not parts:
+            none, index = np.zeros((0, 3, 3)), np.zeros(0, np.uint32)
+            return cls(none, none, index, index, np.zeros(0), np.zeros(0))
+        return cls(*(np.concatenate(values) for values in zip(*(part._arrays() for part in parts), strict=True)))
+
+    def _arrays(self) -> tuple[NDArray, ...]:
+        return self.corners, self.weights, self.shapes, self.primitives, self.sizes, self.distances
+
+
+@dataclass(frozen=True)
+class _RegularPoints:
+    """A regular grid of points on the plane z = 0 [engine units]."""
+
+    first: tuple[float, float]
+    step: tuple[float, float]
+    count: tuple[int, int]  # columns, rows
+
+    @classmethod
+    def of(cls, grid: PointGrid, unit: float) -> _RegularPoints:
+        x, y = grid.positions[0, :, 0] / unit, grid.positions[:, 0, 1] / unit
+        steps = tuple(float(axis[1] - axis[0]) if len(axis) > 1 else 1.0 for axis in (x, y))
+        return cls((float(x[0]), float(y[0])), (steps[0], steps[1]), (len(x), len(y)))
+
+    def squared_distance(self, points: Float64) -> Float64:
+        """Return the squared distance (n,) from ``points`` (n, 3) to the nearest point of the grid."""
+        squares = points[:, 2] ** 2
+        for axis in range(2):
+            along = (points[:, axis] - self.first[axis]) / self.step[axis]
+            nearest = np.clip(np.rint(along), 0, self.count[axis] - 1)
+            squares = squares + ((along - nearest) * self.step[axis]) ** 2
+        return squares
+
+
 class Tessellator:
     """Cuts the hidden geometry of one scene into patches, as fine as asked.
+
+    Triangles are first quartered until none is longer than its distance from the nearest laser or sensor point
+    (the *cells*), then cut into equal parts.
 
     Parameters
     ----------
     built
-        The scene: meshes, spheres and cylinders; ``can_tessellate`` tells beforehand.
+        The scene: meshes and spheres; ``can_tessellate`` tells beforehand.
+    capture
+        Where the laser and sensor points are.
     bin_width
         Bin width [engine units].
     """
 
-    def __init__(self, built: BuiltScene, bin_width: float):
+    def __init__(self, built: BuiltScene, capture: Capture, bin_width: float):
         self.built, self.bin_width = built, bin_width
-        self._meshes: list[tuple[int, Float64]] = []
+        grids = {id(grid): grid for grid in (capture.sensor_grid, capture.laser_grid)}
+        self._points = [_RegularPoints.of(grid, built.unit) for grid in grids.values()]
+        self.reach = max(capture.sensor_grid.size) / (2 * built.unit)  # half the sensor grid's extent [engine units]
+        cells: list[Cells] = []
         self._spheres: list[tuple[int, Float64]] = []  # centre and signed radius
         for index, shape in enumerate(built.scene.shapes()):
             if shape.id() == WALL_ID:
                 continue
             if shape.is_mesh():
-                parameters = mi.traverse(shape)
-                vertices = np.asarray(parameters["vertex_positions"], dtype=np.float64).reshape(-1, 3)
-                self._meshes.append((index, vertices[np.asarray(parameters["faces"]).reshape(-1, 3)]))
+                cells.append(self._cells_of_mesh(index, shape))
             else:
                 self._spheres.append((index, _sphere_of(shape)))
+        self.cells = Cells.joined(cells)
 
     def patches(self, coarseness: float) -> Patches:
         """Return patches whose error is of order ``coarseness`` squared."""
-        parts = [self._flat(index, triangles, coarseness) for index, triangles in self._meshes]
+        parts = [self._flat(coarseness)]
         parts += [self._sphere(index, sphere, coarseness) for index, sphere in self._spheres]
         return Patches.joined(parts)
 
     def count(self, coarseness: float) -> int:
         """Return how many patches ``patches`` would make, without making them."""
-        flat = sum(int((self._splits(triangles, coarseness) ** 2).sum()) for _, triangles in self._meshes)
+        flat = int((self._splits(coarseness) ** 2).sum())
         return flat + sum(20 * self._sphere_splits(sphere, coarseness) ** 2 for _, sphere in self._spheres)
 
+    @property
+    def nearest(self) -> float:
+        """Distance of the nearest cell's centre, or sphere, from any laser or sensor point [engine units]."""
+        round_ones = [abs(float(self.distance(sphere[None, :3])[0]) - abs(sphere[3])) for _, sphere in self._spheres]
+        return min([float(self.cells.distances.min(initial=np.inf)), *round_ones])
+
+    def sphere_cells(self) -> list[tuple[Float64, Patches]]:
+        """Return centre and signed radius of every sphere, and its cells, whose corners lie on it."""
+        return [(sphere, self._sphere(index, sphere, 1.0)) for index, sphere in self._spheres]
+
+    def distance(self, points: Float64) -> Float64:
+        """Return the distance (n,) of ``points`` (n, 3) from the nearest laser or sensor point [engine units]."""
+        return np.sqrt(np.min([grid.squared_distance(points) for grid in self._points], axis=0))
+
     def _allowed(self, distance: Float64, coarseness: float) -> Float64:
-        """Return the size a patch may have at ``distance`` from the wall [engine units]."""
+        """Return the size a patch may have at ``distance`` from the points [engine units]."""
         return coarseness * np.minimum(distance, 2 * np.sqrt(distance * self.bin_width))
 
-    def _splits(self, triangles: Float64, coarseness: float) -> NDArray[np.int64]:
-        edges = np.linalg.norm(triangles - np.roll(triangles, 1, axis=1), axis=-1).max(axis=1)
-        distance = np.maximum(self._distance_to_wall(triangles.mean(axis=1)), edges / 8)
-        return np.maximum(np.ceil(edges / self._allowed(distance, coarseness)), 1).astype(np.int64)
+    def _cells_of_mesh(self, index: int, mesh: mi.Mesh) -> Cells:
+        corners, primitives = facing_triangles(self.built, mesh)
+        weights = np.broadcast_to(np.eye(3), corners.shape)
+        done: list[Cells] = []
+        while len(corners):
+            sizes = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=-1).max(axis=1)
+            distances = np.maximum(self.distance(corners.mean(axis=1)), NEAREST)
+            large = sizes > distances
+            small = Cells(corners, weights, np.full(len(corners), index, np.uint32), primitives, sizes, distances)
+            done.append(small.at(~large))
+            corners, weights = _quartered(corners[large]), _quartered(weights[large])
+            primitives = np.tile(primitives[large], 4)
+        return Cells.joined(done)
 
-    def _distance_to_wall(self, points: Float64) -> Float64:
-        half = np.array([self.built.wall.width, self.built.wall.height]) / (2 * self.built.unit)
-        beyond = np.maximum(np.abs(points[:, :2]) - half, 0)
-        return np.sqrt((beyond**2).sum(axis=1) + points[:, 2] ** 2)
+    def _splits(self, coarseness: float) -> NDArray[np.int64]:
+        cells = self.cells
+        return np.maximum(np.ceil(cells.sizes / self._allowed(cells.distances, coarseness)), 1).astype(np.int64)
 
-    def _flat(self, index: int, triangles: Float64, coarseness: float) -> Patches:
-        normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+    def _flat(self, coarseness: float) -> Patches:
+        cells = self.cells
+        normals = np.cross(cells.corners[:, 1] - cells.corners[:, 0], cells.corners[:, 2] - cells.corners[:, 0])
         lengths = np.linalg.norm(normals, axis=1)
-        kept = np.flatnonzero((lengths > 0) & (triangles[:, :, 2].max(axis=1) > 0))  # nothing behind the wall counts
-        splits = self._splits(triangles[kept], coarseness)
+        splits = self._splits(coarseness)
         parts = []
         for n in np.unique(splits):
-            owners = kept[splits == n]
+            owners = np.flatnonzero(splits == n)
             weights = _split_weights(int(n))  # (n^2, 3 corners, 3 barycentric)
-            corners = np.einsum("pkb,tbx->tpkx", weights, triangles[owners]).reshape(-1, 3, 3)
+            corners = np.einsum("pkb,tbx->tpkx", weights, cells.corners[owners]).reshape(-1, 3, 3)
+            centres = np.einsum("pb,tbx->tpx", weights.mean(axis=1), cells.weights[owners]).reshape(-1, 3)
             repeated = np.repeat(owners, n * n)
-            centre = np.tile(weights.mean(axis=1), (len(owners), 1))
             parts.append(
                 Patches(
                     corners,
-                    np.repeat(lengths[owners] / (2 * n * n), n * n),
+                    lengths[repeated] / (2 * n * n),
                     corners.mean(axis=1),
-                    np.repeat(normals[owners] / lengths[owners, None], n * n, axis=0),
-                    np.full(len(repeated), index, np.uint32),
-                    repeated.astype(np.uint32),
-                    centre[:, 1:],
+                    normals[repeated] / lengths[repeated, None],
+                    cells.shapes[repeated],
+                    cells.primitives[repeated],
+                    centres[:, 1:],
                     np.zeros(len(repeated)),
                 )
             )
@@ -123,7 +206,7 @@ class Tessellator:
 
     def _sphere_splits(self, sphere: Float64, coarseness: float) -> int:
         radius = sphere[3]
-        nearest = max(float(self._distance_to_wall(sphere[None, :3])[0]) - abs(radius), abs(radius) / 8)
+        nearest = max(float(self.distance(sphere[None, :3])[0]) - abs(radius), abs(radius) / 8)
         allowed = min(float(self._allowed(np.array([nearest]), coarseness)[0]), coarseness * abs(radius))
         return int(np.ceil(1.052 * abs(radius) / allowed))  # 1.052: edge of the icosahedron in its unit sphere
 
@@ -172,6 +255,14 @@ def _sphere_of(shape: mi.Shape) -> Float64:
     low, high = np.ravel(np.asarray(box.min, dtype=np.float64)), np.ravel(np.asarray(box.max, dtype=np.float64))
     sign = -1.0 if shape.has_flipped_normals() else 1.0
     return np.append((low + high) / 2, sign * (high - low).max() / 2)
+
+
+def _quartered(triangles: Float64) -> Float64:
+    """Return the four similar parts (4 n, 3, 3) of every triangle."""
+    a, b, c = (triangles[:, k] for k in range(3))
+    ab, bc, ca = (a + b) / 2, (b + c) / 2, (c + a) / 2
+    parts = [(a, ab, ca), (ab, b, bc), (ca, bc, c), (bc, ca, ab)]
+    return np.concatenate([np.stack(part, axis=1) for part in parts])
 
 
 def _split_weights(n: int) -> Float64:

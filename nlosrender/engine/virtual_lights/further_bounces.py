@@ -1,0 +1,173 @@
+"""Bounces 4 and up: rounds of walks from random sites, each gathered by all sensor points."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from nlosrender.capture.bounces import THIRD_BOUNCE
+from nlosrender.capture.plan import Batch
+from nlosrender.engine.device_arrays import laser_points
+from nlosrender.engine.histogram import DeviceHistogram, HistogramShape
+from nlosrender.engine.path_engine import PathEngine
+from nlosrender.engine.pilot import LASERS_PER_AXIS, Pilot, spread
+from nlosrender.engine.transport import Transport
+from nlosrender.engine.virtual_lights.lights import is_visible, to_points
+from nlosrender.engine.virtual_lights.patches import Tessellator
+from nlosrender.engine.virtual_lights.sites import Sites, SiteSampler
+from nlosrender.engine.virtual_lights.walks import Impulses, TriedLasers, WalkPlan, walk_back
+
+SITES_PER_ROUND = 4096  # of all replicas together
+IMPULSES_PER_SITE = 8
+WALKS_PER_SITE = (16, 64)  # walks are cheap beside the gather when many sensor points share them
+MOST_ROUNDS = 2**20  # of a target that is out of reach
+
+
+@dataclass(frozen=True, eq=False)
+class SiteTable:
+    """What the gather reads of the sites that anything leaves, one lane per site."""
+
+    packed: mi.Float  # eight a site: position, first impulse; normal times area, end of the impulses
+    shading: mi.Normal3f
+    first: mi.UInt32  # per replica: its sites are first[r] to first[r + 1]
+
+
+class FurtherBounces:
+    """Bounces above the third of a scene of Lambertian surfaces before a planar wall.
+
+    Parameters
+    ----------
+    paths
+        Engine whose scene, points and histogram shapes are used; not of a confocal capture.
+    tessellator
+        Holds the cells the sites lie on.
+    needs_visibility
+        Whether anything may lie between wall and hidden surfaces.
+    """
+
+    def __init__(self, paths: PathEngine, tessellator: Tessellator, needs_visibility: bool):
+        self.paths, self.needs_visibility = paths, needs_visibility
+        self.built, self.options = paths.built, paths.options
+        built, capture, time_axis = paths.built, paths.capture, paths.time_axis
+        self.sampler = SiteSampler(tessellator)
+        tried = spread(capture.laser_grid, LASERS_PER_AXIS)
+        points = laser_points(built, capture, time_axis, np.array(tried.indices, dtype=np.uint32))
+        self.tried = TriedLasers(points, tried.size, tried.size == capture.n_lasers)
+        pairs = capture.n_sensors * (capture.n_lasers if capture.scan_type == "exhaustive" else 1)
+        fewest, most = WALKS_PER_SITE
+        self.walks = int(min(max(pairs / 32, fewest), most))
+
+    def plan(self, replicas: int) -> WalkPlan:
+        """Return the numbers of a round of ``replicas`` independent sets of sites."""
+        sites = max(SITES_PER_ROUND // replicas, 16)
+        return WalkPlan(replicas, sites, self.walks, IMPULSES_PER_SITE, self.options.bounces.max_bounces)
+
+    @property
+    def impulses_per_round(self) -> int:
+        """Impulses that every sensor point receives per round, at most."""
+        return SITES_PER_ROUND * IMPULSES_PER_SITE
+
+    def histogram(self, batch: Batch | Pilot, replicas: int) -> DeviceHistogram:
+        """Return an empty histogram of a batch: bounce slots from the fourth bounce on."""
+        bounces = self.options.bounces
+        slots = bounces.n_slots - bounces.slot(THIRD_BOUNCE + 1) if bounces.split else 1
+        return DeviceHistogram(replace(self.paths.shape(batch, slots), replicas=replicas))
+
+    def accumulate(self, batch: Batch | Pilot, histogram: DeviceHistogram, number: int) -> None:
+        """Add round ``number`` to ``histogram``; a round is the same for every batch of a capture."""
+        shape = histogram.shape
+        plan = self.plan(shape.replicas)
+        if self.sampler.is_empty:
+            return
+        state = np.random.SeedSequence([self.options.seed, number]).generate_state(2)
+        generator = np.random.default_rng(state[0])
+        sites = Sites.joined([self.sampler.sample(plan.sites, generator) for _ in range(plan.replicas)])
+        transport = self.paths.transport(batch, shape)
+        impulses = walk_back(plan, transport, sites, self.tried, int(state[1]))
+        if not impulses.count:
+            return
+        table = self._table(plan, sites, impulses)
+        lowest = mi.UInt32(THIRD_BOUNCE + 1)
+        slots = dr.minimum(impulses.bounces - lowest, shape.slots - 1) if self.options.bounces.split else lowest * 0
+        slots = dr.full(mi.UInt32, 0, impulses.count) + slots
+        dr.eval(slots)
+        _gather_impulses(transport, self.needs_visibility, table, impulses, slots, shape, histogram)
+        dr.eval(histogram.sums)
+
+    def _table(self, plan: WalkPlan, sites: Sites, impulses: Impulses) -> SiteTable:
+        used, starts = np.unique(impulses.sites, return_index=True)
+        ends = np.append(starts[1:], impulses.count)
+        first = np.searchsorted(used, np.arange(plan.replicas + 1) * plan.sites)
+        as_float = np.stack([starts, ends]).astype(np.uint32).view(np.float32)
+        rows = np.zeros((len(used), 8), np.float32)
+        rows[:, 0:3], rows[:, 3] = sites.positions[used], as_float[0]
+        rows[:, 4:7], rows[:, 7] = sites.normals[used] * sites.areas[used, None], as_float[1]
+        shading = mi.Normal3f(to_points(sites.normals[used]))
+        return SiteTable(mi.Float(rows.ravel()), shading, mi.UInt32(first.astype(np.uint32)))
+
+
+@dr.syntax
+def _gather_impulses(
+    transport: Transport,
+    needs_visibility: bool,
+    table: SiteTable,
+    impulses: Impulses,
+    slots: mi.UInt32,
+    shape: HistogramShape,
+    histogram: DeviceHistogram,
+) -> None:
+    """Deposit what leaves the sites: lane by lane over the sites of its replica, site by site over the impulses."""
+    built, sensors = transport.built, transport.sensors
+    sensor, wall_bsdf, context = sensors.interaction, built.wall_bsdf, mi.BSDFContext()
+    lane = dr.arange(mi.UInt32, shape.lanes)
+    replica = lane // shape.sensors
+    n_lasers = transport.n_lasers
+    count = dr.opaque(mi.UInt32, impulses.count)
+    scale = transport.bins_per_unit
+    site = dr.gather(mi.UInt32, table.first, replica)
+    end = dr.gather(mi.UInt32, table.first, replica + 1)
+
+    while dr.hint(site < end, exclude=[transport, table, impulses, histogram, built, sensors, sensor, wall_bsdf, end]):
+        # ---- The site as the sensor point sees it ------------------------------------------------------------------
+        at = dr.gather(mi.Vector4f, table.packed, site * 2)
+        by = dr.gather(mi.Vector4f, table.packed, site * 2 + 1)
+        position, areas = mi.Point3f(at.x, at.y, at.z), mi.Vector3f(by.x, by.y, by.z)
+        to_site = position - sensor.p
+        distance2 = dr.squared_norm(to_site)
+        distance = dr.sqrt(distance2)
+        direction = to_site / distance
+        weight = wall_bsdf.eval(context, sensor, sensor.to_local(direction))
+        weight *= dr.maximum(-dr.dot(areas, direction), 0) / distance2
+        active = dr.any(weight > 0)
+        if dr.hint(needs_visibility, mode="scalar"):
+            active = is_visible(built, sensor, position, active)
+
+        # ---- Deposit its impulses ------------------------------------------------------------------------------------
+        delay = distance * scale + sensors.delay_fraction
+        impulse = dr.reinterpret_array(mi.UInt32, at.w)
+        last = dr.select(active, dr.reinterpret_array(mi.UInt32, by.w), 0)
+        while dr.hint(impulse < last, exclude=[transport, impulses, slots, histogram, sensors, weight, delay, last]):
+            slot = dr.gather(mi.UInt32, slots, impulse)
+            laser = mi.UInt32(0)
+            while dr.hint(
+                laser < n_lasers,
+                exclude=[transport, impulses, histogram, sensors, weight, delay, impulse, slot, count],
+            ):
+                points = transport.lasers.gather(transport.first_laser + laser)
+                entry = laser * count + impulse
+                value = weight * dr.gather(mi.Spectrum, impulses.values, entry)
+                arrival = delay + dr.gather(mi.Float, impulses.delays, entry) + points.delay_fraction
+                bins = mi.Int32(dr.floor(dr.minimum(arrival, 1e9))) + points.delay_bins + sensors.delay_bins
+                histogram.deposit(lane, laser, slot, bins, value, dr.any(value > 0))
+                laser += 1
+            impulse += 1
+        site += 1
+
+
+def rounds_needed(error: float, done: int, target: float) -> int:
+    """Return how many rounds bring the ``error`` after ``done`` rounds to ``target``: it falls as 1 / sqrt(rounds)."""
+    return min(max(1, math.ceil(done * (error / target) ** 2)), MOST_ROUNDS) if math.isfinite(error) else MOST_ROUNDS

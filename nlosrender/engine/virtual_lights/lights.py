@@ -1,0 +1,221 @@
+"""Virtual lights: patches on the device, and what the lasers make of them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+
+from nlosrender.engine.connections import RAY_OFFSET
+from nlosrender.engine.low_discrepancy import recurrence_steps
+from nlosrender.engine.transport import Transport
+from nlosrender.engine.virtual_lights.patches import Patches
+from nlosrender.scene.build import BuiltScene
+from nlosrender.scene.pose import Float64
+
+LASER_RAYS = 4  # shadow rays from a laser to points spread over a patch
+
+
+@dataclass(frozen=True)
+class GatherSettings:
+    """What the gather's kernel does; part of the compiled kernel."""
+
+    is_confocal: bool
+    is_diffuse: bool  # every hidden BSDF is Lambertian: reflectance and a cosine are all there is
+    needs_visibility: bool  # something may lie between wall and patches
+
+
+@dataclass(frozen=True, eq=False)
+class DevicePatches:
+    """Patches on the device, engine units; one lane per patch."""
+
+    corners: list[mi.Point3f]  # three
+    lift: mi.Vector3f  # from the plane of the corners to the surface
+    areas: mi.Vector3f  # geometric normal times area
+    interaction: mi.SurfaceInteraction3f  # at the centres
+    reflectance: mi.Spectrum  # of Lambertian patches
+
+
+@dataclass(frozen=True, eq=False)
+class Lights:
+    """What the gather's loop reads: patches that are lit, packed so that one load brings four numbers."""
+
+    packed: mi.Float  # 16 a patch: three corners and the centre, each with one component of normal times area, lift
+    shading: mi.Normal3f  # shading normals
+    interaction: mi.SurfaceInteraction3f  # at the centres; not read for Lambertian patches
+    reflectance: mi.Spectrum  # confocal Lambertian patches: reflectance / pi
+    arriving: mi.Spectrum  # index = laser * count + patch: light that arrives, per area perpendicular to it;
+    # of Lambertian patches the light that leaves; empty for confocal captures
+    delays: mi.Float  # four an index: from the laser point to each corner [bins], and 0
+    count: mi.UInt32  # of lit patches, opaque
+
+
+def upload_patches(built: BuiltScene, patches: Patches) -> DevicePatches:
+    """Bring patches to the device and evaluate their reflectance and shading frames."""
+    interaction = surface_at(
+        built, patches.centres, patches.normals, patches.shapes, patches.primitives, patches.barycentric
+    )
+    reflectance = normal_reflectance(interaction)
+    corners = [to_points(patches.corners[:, k]) for k in range(3)]
+    areas = mi.Vector3f(to_points(patches.normals * patches.areas[:, None]))
+    lift = mi.Vector3f(to_points(patches.normals * patches.lifts[:, None]))
+    dr.eval(interaction, reflectance, corners, areas, lift)
+    return DevicePatches(corners, lift, areas, interaction, reflectance)
+
+
+def surface_at(
+    built: BuiltScene,
+    positions: Float64,
+    normals: Float64,
+    shapes: NDArray[np.uint32],
+    primitives: NDArray[np.uint32],
+    barycentric: Float64,
+) -> mi.SurfaceInteraction3f:
+    """Return the surface at known points, as a ray from one unit above would find it; no ray is traced.
+
+    Parameters
+    ----------
+    built
+        The scene.
+    positions, normals
+        (n, 3) points [engine units] and geometric normals.
+    shapes, primitives
+        (n,) index into the scene's shapes; triangle of a mesh.
+    barycentric
+        (n, 2) coordinates within the triangle.
+    """
+    point, normal = to_points(positions), mi.Vector3f(to_points(normals))
+    hit = dr.zeros(mi.PreliminaryIntersection3f, len(positions))
+    hit.t = dr.full(mi.Float, 1.0, len(positions))
+    hit.prim_uv = mi.Point2f(np.ascontiguousarray(barycentric.T, dtype=np.float32))
+    hit.prim_index = mi.UInt32(primitives)
+    shape = dr.gather(mi.ShapePtr, built.scene.shapes_dr(), mi.UInt32(shapes))
+    interaction = shape.compute_surface_interaction(mi.Ray3f(point + normal, -normal), hit, mi.RayFlags.All)
+    interaction.initialize_sh_frame()
+    interaction.shape = shape
+    interaction.p = point
+    interaction.n = mi.Normal3f(normal)
+    interaction.wi = mi.Vector3f(0, 0, 1)
+    return interaction
+
+
+def normal_reflectance(interaction: mi.SurfaceInteraction3f) -> mi.Spectrum:
+    """Return pi times the BSDF along the normal: the reflectance of a Lambertian surface."""
+    up = mi.Vector3f(0, 0, 1)
+    return interaction.bsdf().eval(mi.BSDFContext(), interaction, up) * dr.pi
+
+
+def light_patches(settings: GatherSettings, transport: Transport, patches: DevicePatches, n_lasers: int) -> Lights:
+    """Return the patches that some laser of the batch lights; confocal captures keep all and light them as they go."""
+    count = dr.width(patches.areas)
+    lit = dr.arange(mi.UInt32, count)
+    arriving, delays = mi.Spectrum(0), mi.Float(0)
+    if not settings.is_confocal:
+        arriving, brightest = _illuminate(settings, transport, patches, n_lasers)
+        lit = dr.compress(brightest > 0)
+        if not dr.width(lit):
+            lit = mi.UInt32(0)  # all is dark: one dark patch, since arrays of no length cannot be read
+        index = dr.arange(mi.UInt32, dr.width(lit) * n_lasers)
+        laser, patch = index // dr.width(lit), dr.gather(mi.UInt32, lit, index % dr.width(lit))
+        arriving = dr.gather(mi.Spectrum, arriving, laser * count + patch)
+        points = dr.gather(mi.Point3f, transport.lasers.interaction.p, laser)
+        legs = [
+            dr.norm(dr.gather(mi.Point3f, corner, patch) - points) * transport.bins_per_unit
+            for corner in patches.corners
+        ]
+        delays = dr.ravel(mi.Vector4f(*legs, 0))
+    a, b, c = (dr.gather(mi.Point3f, corner, lit) for corner in patches.corners)
+    areas, interaction = (
+        dr.gather(mi.Vector3f, patches.areas, lit),
+        dr.gather(mi.SurfaceInteraction3f, patches.interaction, lit),
+    )
+    lift = dr.norm(dr.gather(mi.Vector3f, patches.lift, lit)) / dr.maximum(dr.norm(areas), 1e-30)
+    rows = [(a, areas.x), (b, areas.y), (c, areas.z), (interaction.p, lift)]
+    packed = dr.zeros(mi.Float, 16 * dr.width(lit))
+    lane = dr.arange(mi.UInt32, dr.width(lit))
+    for k, (point, fourth) in enumerate(rows):
+        dr.scatter(packed, mi.Vector4f(*point, fourth), lane * 4 + k)
+    reflectance = dr.gather(mi.Spectrum, patches.reflectance, lit) * dr.inv_pi
+    dr.eval(packed, arriving, delays, interaction, reflectance)
+    return Lights(
+        packed,
+        interaction.sh_frame.n,
+        interaction,
+        reflectance,
+        arriving,
+        delays,
+        dr.opaque(mi.UInt32, dr.width(lit)),
+    )
+
+
+def _illuminate(
+    settings: GatherSettings, transport: Transport, patches: DevicePatches, n_lasers: int
+) -> tuple[mi.Spectrum, mi.Float]:
+    """Light every patch by every laser: emission, distance, and the share of the patch that is not in shadow.
+
+    Returns
+    -------
+    tuple
+        What arrives (of Lambertian patches: leaves), index = laser * n_patches + patch; and the most of it per patch.
+    """
+    built = transport.built
+    n_patches = dr.width(patches.areas)
+    index = dr.arange(mi.UInt32, n_patches * n_lasers)
+    patch, laser = index % n_patches, index // n_patches
+    points = transport.lasers.gather(laser)
+    lit = points.interaction
+    corners = [dr.gather(mi.Point3f, corner, patch) for corner in patches.corners]
+    centre = dr.gather(mi.Point3f, patches.interaction.p, patch)
+    to_patch = centre - lit.p
+    distance2 = dr.squared_norm(to_patch)
+    direction = to_patch * dr.rsqrt(distance2)
+    arriving = built.wall_bsdf.eval(mi.BSDFContext(), lit, lit.to_local(direction)) / distance2
+    cosine = -dr.dot(dr.gather(mi.Normal3f, patches.interaction.sh_frame.n, patch), direction)
+    active = dr.any(arriving > 0)
+    if settings.is_diffuse:
+        arriving *= dr.maximum(cosine, 0) * dr.gather(mi.Spectrum, patches.reflectance, patch) * dr.inv_pi
+        active &= dr.any(arriving > 0)
+    else:
+        flags = dr.gather(mi.SurfaceInteraction3f, patches.interaction, patch).bsdf().flags()
+        active &= (cosine > 0) | mi.has_flag(flags, mi.BSDFFlags.BackSide)
+    lift = dr.gather(mi.Vector3f, patches.lift, patch)
+    seen = mi.Float(1)
+    if settings.needs_visibility:
+        seen = mi.Float(0)
+        steps = recurrence_steps(2)
+        for k in range(LASER_RAYS):
+            u, v = _fraction(patch * LASER_RAYS + k, steps[0]), _fraction(patch * LASER_RAYS + k, steps[1])
+            seen += dr.select(is_visible(built, lit, point_inside(corners, u, v) + lift, active), 1.0 / LASER_RAYS, 0)
+    arriving = dr.select(active, arriving * seen, 0)
+    brightest = dr.zeros(mi.Float, n_patches)
+    dr.scatter_reduce(dr.ReduceOp.Max, brightest, dr.max(arriving), patch)
+    dr.eval(arriving, brightest)
+    return arriving, brightest
+
+
+def is_visible(built: BuiltScene, wall_point: mi.SurfaceInteraction3f, target: mi.Point3f, active: mi.Bool) -> mi.Bool:
+    """Return whether nothing lies between a point of the wall and a point of a patch."""
+    origin = wall_point.p + wall_point.n * RAY_OFFSET
+    direction = target - origin
+    # stops short of the patch by 1e-4 of the way: a thin sheet 4 mm in front still hides it
+    ray = mi.Ray3f(origin, direction, mi.Float(1 - 1e-4), mi.Float(0), [])
+    return active & ~built.scene.ray_test(ray, coherent=False, active=active)
+
+
+def point_inside(corners: list[mi.Point3f], u: mi.Float, v: mi.Float) -> mi.Point3f:
+    """Return the point of a triangle that two uniform numbers choose, uniform by area."""
+    root = dr.sqrt(u)
+    a, b, c = corners
+    return a + (b - a) * (root * (1 - v)) + (c - a) * (root * v)
+
+
+def _fraction(index: mi.UInt32, step: int) -> mi.Float:
+    return mi.Float((index * mi.UInt32(step)) >> 8) * 2.0**-24
+
+
+def to_points(values: Float64) -> mi.Point3f:
+    """Bring vectors (n, 3) to the device."""
+    return mi.Point3f(np.ascontiguousarray(values.T, dtype=np.float32))

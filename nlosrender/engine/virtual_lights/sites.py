@@ -1,0 +1,147 @@
+"""Random points of the hidden geometry from which light leaves for the sensor points: where walks begin.
+
+A sensor point sees a surface element by its area over its squared distance. Cells of the hidden geometry are chosen
+by that measure, with the distance to the nearest sensor or laser point, so that no connection is near-singular: what
+a site contributes to any sensor point is bounded.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nlosrender.engine.low_discrepancy import recurrence_steps
+from nlosrender.engine.virtual_lights.patches import Tessellator
+from nlosrender.scene.pose import Float64
+
+
+@dataclass(frozen=True, eq=False)
+class Sites:
+    """Points of the hidden geometry [engine units], sorted along its cells."""
+
+    positions: Float64  # (n, 3)
+    normals: Float64  # (n, 3) geometric, unit
+    shapes: NDArray[np.uint32]  # (n,) index into the scene's shapes
+    primitives: NDArray[np.uint32]  # (n,) triangle of a mesh, 0 on spheres
+    barycentric: Float64  # (n, 2) within that triangle
+    areas: Float64  # (n,) area a site stands for: the reciprocal of n times its density
+    importance: Float64  # (n,) area over squared distance from the nearest laser or sensor point
+
+    def __len__(self) -> int:
+        return len(self.areas)
+
+    @classmethod
+    def joined(cls, parts: list[Sites]) -> Sites:
+        """Return the sites of all parts, one after the other."""
+        names = [field.name for field in fields(cls)]
+        return cls(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
+
+
+class SiteSampler:
+    """Draws sites on the cells of a scene.
+
+    Parameters
+    ----------
+    tessellator
+        Holds the cells of the meshes, and cuts spheres.
+    """
+
+    def __init__(self, tessellator: Tessellator):
+        cells, round_patches = tessellator.cells, tessellator.sphere_cells()
+        corners = [cells.corners, *(patches.corners for _, patches in round_patches)]
+        self._corners = np.concatenate(corners)
+        self._weights = np.concatenate(
+            [cells.weights, *(np.zeros((len(patches), 3, 3)) for _, patches in round_patches)]
+        )
+        self._shapes = np.concatenate([cells.shapes, *(patches.shapes for _, patches in round_patches)])
+        self._primitives = np.concatenate([cells.primitives, *(patches.primitives for _, patches in round_patches)])
+        # centre and signed radius of the sphere a cell lies on; radius 0 on flat cells
+        spheres = [np.zeros((len(cells.corners), 4))]
+        spheres += [np.repeat(sphere[None], len(patches), axis=0) for sphere, patches in round_patches]
+        self._spheres = np.concatenate(spheres)
+        normals = np.cross(self._corners[:, 1] - self._corners[:, 0], self._corners[:, 2] - self._corners[:, 0])
+        lengths = np.linalg.norm(normals, axis=1)
+        self._normals = normals / np.maximum(lengths, 1e-300)[:, None]
+        self._areas = lengths / 2
+        distances = tessellator.distance(self._corners.mean(axis=1))
+        sizes = np.linalg.norm(self._corners - np.roll(self._corners, 1, axis=1), axis=-1).max(axis=1)
+        # a cell is no longer than its distance; its own size stands for the distance where it touches a point
+        distances = np.maximum(distances, sizes / 2)
+        self._reach = distances * (distances + tessellator.reach)
+        order = _along_a_curve(self._corners.mean(axis=1), self._shapes)
+        importance = (self._areas / self._reach)[order]
+        self._order = order
+        self.is_empty = not importance.sum() > 0
+        if not self.is_empty:
+            self._probability = importance / importance.sum()
+            self._cumulative = np.cumsum(self._probability)
+
+    def sample(self, count: int, generator: np.random.Generator) -> Sites:
+        """Draw ``count`` sites: one in each of as many equal parts of the cells' measure.
+
+        Parameters
+        ----------
+        count
+            Number of sites.
+        generator
+            Source of the random offsets; the points themselves are low-discrepancy.
+        """
+        steps = np.array(recurrence_steps(2), dtype=np.uint64)
+        at = (np.arange(count) + generator.random(count)) / count
+        chosen = np.minimum(np.searchsorted(self._cumulative, at * self._cumulative[-1]), len(self._cumulative) - 1)
+        cell = self._order[chosen]
+        starts = generator.integers(0, 2**32, 2, dtype=np.uint64)
+        bits = (starts[:, None] + steps[:, None] * np.arange(count, dtype=np.uint64)) % 2**32
+        u, v = bits / 2.0**32
+        root = np.sqrt(u)
+        weights = np.stack([1 - root, root * (1 - v), root * v], axis=1)
+        positions = np.einsum("nk,nkx->nx", weights, self._corners[cell])
+        barycentric = np.einsum("nk,nkb->nb", weights, self._weights[cell])[:, 1:]
+        areas = self._areas[cell] / (count * self._probability[chosen])
+        positions, normals, stretch = _on_spheres(positions, self._normals[cell], self._spheres[cell])
+        areas *= stretch
+        return Sites(
+            positions,
+            normals,
+            self._shapes[cell],
+            self._primitives[cell],
+            barycentric,
+            areas,
+            areas / self._reach[cell],
+        )
+
+
+def _on_spheres(positions: Float64, normals: Float64, spheres: Float64) -> tuple[Float64, Float64, Float64]:
+    """Project points of a sphere's cells to the sphere; return positions, normals and the area's stretch.
+
+    dA_sphere = radius^2 cos / distance^2 dA_plane, with distance and cosine seen from the centre.
+    """
+    stretch = np.ones(len(positions))
+    is_round = spheres[:, 3] != 0
+    if is_round.any():
+        centre, radius = spheres[is_round, :3], spheres[is_round, 3]
+        outward = positions[is_round] - centre
+        distance = np.linalg.norm(outward, axis=1)
+        outward /= distance[:, None]
+        cosine = np.abs(np.einsum("nx,nx->n", outward, normals[is_round]))
+        stretch[is_round] = radius**2 * cosine / distance**2
+        positions[is_round] = centre + np.abs(radius)[:, None] * outward
+        normals = normals.copy()
+        normals[is_round] = np.sign(radius)[:, None] * outward
+    return positions, normals, stretch
+
+
+def _along_a_curve(points: Float64, shapes: NDArray[np.uint32]) -> NDArray[np.int64]:
+    """Return an order in which neighbours are near in space: shape by shape, along a Z-order curve (Morton 1966)."""
+    if not len(points):
+        return np.zeros(0, np.int64)
+    low = points.min(axis=0)
+    scaled = (points - low) / max(float((points.max(axis=0) - low).max()), 1e-300)
+    grid = np.minimum((scaled * 1024).astype(np.int64), 1023)
+    code = np.zeros(len(points), np.int64)
+    for bit in range(10):
+        for axis in range(3):
+            code |= ((grid[:, axis] >> bit) & 1) << (3 * bit + axis)
+    return np.lexsort((code, shapes))

@@ -1,0 +1,135 @@
+"""The third bounce of a batch: patches of the hidden geometry gathered at two resolutions, as fine as needed."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+
+from nlosrender.capture.plan import Batch
+from nlosrender.engine.histogram import DeviceHistogram, HistogramShape, relative_l2_error, to_memory_order
+from nlosrender.engine.path_engine import PathEngine
+from nlosrender.engine.pilot import Pilot
+from nlosrender.engine.transport import Transport
+from nlosrender.engine.virtual_lights.gather import gather_third_bounce, own_rows
+from nlosrender.engine.virtual_lights.lights import GatherSettings, light_patches, upload_patches
+from nlosrender.engine.virtual_lights.patches import MAX_PATCHES, Tessellator
+
+FIRST_COARSENESS = 1.0
+REFINEMENT = 3.0  # at least so many times more patches between the two resolutions that are compared
+MARGIN = 1.1  # on the patches that an extrapolated error asks for
+
+
+@dataclass(frozen=True, eq=False)
+class Gathered:
+    """The third bounce at one resolution, (channel, 1, laser, sensor, row), per J and (engine unit)^2."""
+
+    values: NDArray[np.float64]
+    n_patches: int
+
+    @property
+    def squares(self) -> float:
+        """Sum of squares inside the time window."""
+        return float((self.values[..., :-1] ** 2).sum())
+
+
+class ThirdBounce:
+    """Gathers the third bounce.
+
+    Parameters
+    ----------
+    paths
+        Engine whose scene, points and histogram shapes are used.
+    tessellator
+        Cuts the hidden geometry.
+    settings
+        What the gather's kernel does.
+    lanes
+        Lanes that keep the backend busy.
+    """
+
+    def __init__(self, paths: PathEngine, tessellator: Tessellator, settings: GatherSettings, lanes: int):
+        self.paths, self.tessellator, self.settings, self.lanes = paths, tessellator, settings, lanes
+
+    def gather(self, batch: Batch | Pilot, coarseness: float) -> Gathered:
+        """Gather a batch at one resolution."""
+        shape = self.shape(batch)
+        patches = self.tessellator.patches(coarseness)
+        if not len(patches):  # nothing faces the wall
+            return Gathered(np.zeros(to_memory_order(np.zeros(shape.axes), shape).shape), 1)
+        transport, slice_of_lane, jitter = self._transport(batch, shape)
+        on_device = upload_patches(self.paths.built, patches)
+        lights = light_patches(self.settings, transport, on_device, shape.lasers)
+        histogram = DeviceHistogram(shape)
+        stride = dr.opaque(mi.UInt32, shape.replicas)
+        gather_third_bounce(self.settings, transport, lights, histogram, slice_of_lane, stride, jitter)
+        values = histogram.sums.numpy().reshape(shape.replicas, -1).sum(axis=0)
+        return Gathered(to_memory_order(values, shape), len(patches))
+
+    def pair(self, batch: Batch | Pilot, fineness: float) -> tuple[Gathered, Gathered]:
+        """Gather a batch at ``fineness`` and at the coarser resolution it is compared with."""
+        return self.gather(batch, self.coarser(fineness)), self.gather(batch, fineness)
+
+    def settle(self, pilot: Pilot, target: float) -> tuple[float, Gathered]:
+        """Return the fineness whose estimated error is at most ``target``, and the pilot's third bounce at it."""
+        coarse = self.gather(pilot, FIRST_COARSENESS)
+        fineness = self.finer(FIRST_COARSENESS, coarse.n_patches, REFINEMENT)
+        while True:
+            fine = self.gather(pilot, fineness)
+            error, _ = estimated_error(coarse, fine)
+            needed = fine.n_patches * error / target
+            if error <= target or max(needed, 2 * fine.n_patches) > MAX_PATCHES:
+                return fineness, fine
+            coarse, fineness = fine, self.finer(fineness, fine.n_patches, min(max(MARGIN * error / target, 1.5), 16.0))
+
+    def finer(self, coarseness: float, n_patches: int, factor: float) -> float:
+        """Return a coarseness with at least ``factor`` times the patches (a mesh may be finer than asked for)."""
+        finer = coarseness / math.sqrt(factor)
+        while 0 < self.tessellator.count(finer) < 0.9 * factor * n_patches:
+            finer *= 0.9
+        return finer
+
+    def coarser(self, fineness: float) -> float:
+        """Return the coarseness that ``fineness`` is compared with: a third of the patches, or all there are."""
+        count, coarser = self.tessellator.count(fineness), fineness * math.sqrt(REFINEMENT)
+        while self.tessellator.count(coarser) > count / REFINEMENT and coarser < FIRST_COARSENESS:
+            coarser *= 1.1
+        return coarser
+
+    def shape(self, batch: Batch | Pilot) -> HistogramShape:
+        """Return the histogram's shape, whose replicas are slices: lanes that share the patches of a sensor point.
+
+        As many as the capture needs, not the batch: how a capture is cut must not show in the result. No more than
+        the replicas that the plan has counted memory for.
+        """
+        most = self.paths.options.replicas if isinstance(batch, Batch) else self.lanes
+        points = self.paths.capture.n_sensors if isinstance(batch, Batch) else batch.sensors.size
+        return replace(self.paths.shape(batch, 1), replicas=max(1, min(math.ceil(self.lanes / points), most)))
+
+    def _transport(self, batch: Batch | Pilot, shape: HistogramShape) -> tuple[Transport, mi.UInt32, mi.UInt32]:
+        """Return what the lanes read, each lane's slice, and its start in the sequence of visibility rays."""
+        transport = self.paths.transport(batch, replace(shape, replicas=1))
+        sensors, slice_of_lane = own_rows(transport.sensors, shape.sensors, shape.replicas)
+        lane = dr.arange(mi.UInt32, shape.lanes)
+        first_laser = dr.gather(mi.UInt32, transport.first_laser, lane % shape.sensors)
+        point = dr.gather(mi.UInt32, mi.UInt32(self.paths.sensor_indices(batch)), lane % shape.sensors)
+        key = point * shape.replicas + slice_of_lane
+        jitter = mi.sample_tea_32(key, mi.UInt32(self.paths.options.seed))[0]
+        dr.eval(sensors.interaction, sensors.delay_bins, sensors.delay_fraction, first_laser, slice_of_lane, jitter)
+        return replace(transport, sensors=sensors, first_laser=first_laser), slice_of_lane, jitter
+
+
+def estimated_error(coarse: Gathered, fine: Gathered) -> tuple[float, float]:
+    """Return the relative L2 error of the finer resolution, and what to divide the difference of the two by.
+
+    The discretisation error falls as 1 / n patches: the difference is (r - 1) times the finer's error, with r the
+    ratio of the counts. The error of random visibility rays falls as n^(-3/4) and is independent: sqrt(r^1.5 + 1).
+    """
+    ratio = max(fine.n_patches / coarse.n_patches, 1.0 + 1e-9)
+    divisor = min(ratio - 1, math.sqrt(ratio**1.5 + 1))
+    noise = float(((fine.values - coarse.values)[..., :-1] ** 2).sum()) / divisor**2
+    return relative_l2_error(noise, fine.squares + noise), divisor
