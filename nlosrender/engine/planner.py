@@ -11,7 +11,7 @@ from nlosrender.capture.bounces import THIRD_BOUNCE
 from nlosrender.capture.grids import Capture
 from nlosrender.config.render import RenderConfig
 from nlosrender.engine.virtual_lights.engine import is_lambertian
-from nlosrender.engine.virtual_lights.patches import MAX_PATCHES, Tessellator, can_tessellate
+from nlosrender.engine.virtual_lights.tessellator import MAX_PATCHES, Tessellator, can_tessellate
 from nlosrender.scene.build import BuiltScene
 
 EngineName = Literal["path", "virtual_lights"]

@@ -16,7 +16,7 @@ from nlosrender.capture.time_axis import TimeAxis
 from nlosrender.engine.path_engine import PathEngine
 from nlosrender.engine.surface_sampler import SAMPLEABLE_PLUGINS, facing_triangles
 from nlosrender.engine.virtual_lights.engine import VirtualLightEngine
-from nlosrender.engine.virtual_lights.patches import MAX_PATCHES
+from nlosrender.engine.virtual_lights.tessellator import MAX_PATCHES
 from nlosrender.engine.virtual_lights.third_bounce import FIRST_COARSENESS, REFINEMENT
 from nlosrender.scene.build import BuiltScene, wall_box
 from nlosrender.scene.hidden_geometry import Surface

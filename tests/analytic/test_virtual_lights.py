@@ -220,7 +220,7 @@ def test_rays_are_left_out_exactly_where_nothing_can_hide(hidden: list[dict], fr
 @pytest.mark.parametrize("coarseness", [1.0, 0.3])
 def test_patches_cover_every_surface_once(coarseness: float) -> None:
     """However fine, the areas of the patches add up to those of the surfaces, and their sizes stay below the limit."""
-    from nlosrender.engine.virtual_lights.patches import Tessellator
+    from nlosrender.engine.virtual_lights.tessellator import Tessellator
 
     built, capture, *_ = start(flat_wall(PLATE, BALL))
     tessellator = Tessellator(built, capture, 0.02 / built.unit)
@@ -244,12 +244,12 @@ def test_a_triangle_is_spread_over_its_bins_by_area(delays: tuple[float, float, 
     import mitsuba as mi
 
     from nlosrender.engine.histogram import DeviceHistogram, HistogramShape
-    from nlosrender.engine.virtual_lights.gather import _spread
+    from nlosrender.engine.virtual_lights.gather import spread_triangle
 
     histogram = DeviceHistogram(HistogramShape(1, 1, 1, 1, 1, 8))
     corners = [mi.Float(delay) for delay in (delays[1], delays[0], delays[2])]
     zero = mi.UInt32(0)
-    _spread(histogram, zero, zero, mi.Vector3f(*corners), mi.Int32(0), mi.Spectrum(2.0), mi.Bool(True))
+    spread_triangle(histogram, zero, zero, mi.Vector3f(*corners), mi.Int32(0), mi.Spectrum(2.0), mi.Bool(True))
     dr.eval(histogram.sums)
     shares = histogram.sums.numpy()
     # midpoints of n^2 equal parts: strips along an edge misplace at most 1 / n of the area

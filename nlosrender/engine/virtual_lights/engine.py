@@ -21,7 +21,7 @@ from nlosrender.engine.pilot import pilot_of
 from nlosrender.engine.virtual_lights.further_bounces import FurtherBounces, rounds_needed
 from nlosrender.engine.virtual_lights.lights import GatherSettings
 from nlosrender.engine.virtual_lights.occlusion import nothing_occludes
-from nlosrender.engine.virtual_lights.patches import Tessellator
+from nlosrender.engine.virtual_lights.tessellator import Tessellator
 from nlosrender.engine.virtual_lights.third_bounce import FIRST_COARSENESS, ThirdBounce, estimated_error
 from nlosrender.errors import RenderError
 from nlosrender.scene.build import BuiltScene

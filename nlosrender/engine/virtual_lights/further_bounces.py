@@ -17,8 +17,8 @@ from nlosrender.engine.path_engine import PathEngine
 from nlosrender.engine.pilot import LASERS_PER_AXIS, Pilot, spread
 from nlosrender.engine.transport import Transport
 from nlosrender.engine.virtual_lights.lights import is_visible, to_points
-from nlosrender.engine.virtual_lights.patches import Tessellator
 from nlosrender.engine.virtual_lights.sites import Sites, SiteSampler
+from nlosrender.engine.virtual_lights.tessellator import Tessellator
 from nlosrender.engine.virtual_lights.walks import Impulses, TriedLasers, WalkPlan, walk_back
 
 SITES_PER_ROUND = 4096  # of all replicas together

@@ -22,7 +22,7 @@ from nlosrender.engine.device_arrays import WallPoints
 from nlosrender.engine.histogram import DeviceHistogram
 from nlosrender.engine.low_discrepancy import recurrence_steps
 from nlosrender.engine.transport import Transport
-from nlosrender.engine.virtual_lights.lights import GatherSettings, Lights, is_visible, point_inside
+from nlosrender.engine.virtual_lights.lights import GatherSettings, Lights, four_corners, is_visible, point_inside
 
 NARROWEST = 1e-3  # bins: below it a triangle's delay counts as one number
 
@@ -78,16 +78,26 @@ def gather_third_bounce(
             cosine = -dr.dot(dr.gather(mi.Normal3f, lights.shading, patch), direction)
             active &= cosine > 0
 
+        is_cluster = None
+        if dr.hint(lights.has_clusters, mode="scalar"):
+            member = dr.gather(mi.Vector4f, lights.members, patch)
+            is_cluster = member.w > 0
+
         # ---- Visibility --------------------------------------------------------------------------------------------
         if dr.hint(settings.needs_visibility, mode="scalar"):
             seq_u += steps[0]
             seq_v += steps[1]
             point = point_inside([a, b, c], mi.Float(seq_u >> 8) * 2.0**-24, mi.Float(seq_v >> 8) * 2.0**-24)
-            active = is_visible(built, sensor, point + areas * rows[3].w, active)
+            point += areas * rows[3].w
+            if dr.hint(lights.has_clusters, mode="scalar"):
+                point = dr.select(is_cluster, mi.Point3f(*member.xyz), point)
+            active = is_visible(built, sensor, point, active)
 
         # ---- Reflect towards the lasers and deposit ----------------------------------------------------------------
         scale = transport.bins_per_unit
-        delays = mi.Vector3f(*(dr.norm(corner - sensor.p) * scale + sensors.delay_fraction for corner in (a, b, c)))
+        delays = mi.Vector4f(
+            *(dr.norm(end - sensor.p) * scale + sensors.delay_fraction for end in four_corners(a, b, c))
+        )
         if dr.hint(settings.is_confocal, mode="scalar"):
             lit = own_laser.interaction
             value = weight * wall_bsdf.eval(context, lit, lit.to_local(direction)) / distance2
@@ -97,9 +107,9 @@ def gather_third_bounce(
                 value *= _reflected(lights, patch, direction, -direction, active)
             delays = 2 * delays + (own_laser.delay_fraction - sensors.delay_fraction)
             whole = own_laser.delay_bins + sensors.delay_bins
-            _spread(histogram, lane, mi.UInt32(0), delays, whole, value, active)
+            _spread(histogram, lane, mi.UInt32(0), delays, whole, value, is_cluster, active)
         elif dr.hint(transport.lasers_per_lane == 1, mode="scalar"):
-            seen = _SeenPatch(patch, weight, delays, direction, active)
+            seen = _SeenPatch(patch, weight, delays, is_cluster, direction, active)
             _deposit(settings, lights, histogram, sensors, own_laser, lane, mi.UInt32(0), patch, seen)
         else:
             laser = mi.UInt32(0)
@@ -108,7 +118,7 @@ def gather_third_bounce(
                 exclude=[settings, transport, lights, histogram, sensors, weight, delays, direction, patch, count],
             ):
                 points = transport.lasers.gather(laser)
-                seen = _SeenPatch(patch, weight, delays, direction, active)
+                seen = _SeenPatch(patch, weight, delays, is_cluster, direction, active)
                 _deposit(settings, lights, histogram, sensors, points, lane, laser, laser * count + patch, seen)
                 laser += 1
         patch += stride
@@ -120,7 +130,8 @@ class _SeenPatch:
 
     patch: mi.UInt32
     weight: mi.Spectrum  # wall's BSDF and the geometry between; of patches that are not Lambertian without their BSDF
-    delays: mi.Vector3f  # from the corners [bins]
+    delays: mi.Vector4f  # from the corners [bins]
+    is_cluster: mi.Bool | None  # None: no patch is
     direction: mi.Vector3f  # towards it
     active: mi.Bool
 
@@ -145,12 +156,32 @@ def _deposit(
         value *= _reflected(lights, seen.patch, seen.direction, to_laser, lit)
         lit &= dr.any(value > 0)
     legs = dr.gather(mi.Vector4f, lights.delays, entry)
-    delays = seen.delays + mi.Vector3f(legs.x, legs.y, legs.z) + laser_points.delay_fraction
-    _spread(histogram, lane, laser, delays, laser_points.delay_bins + sensors.delay_bins, value, lit)
+    delays = seen.delays + legs + laser_points.delay_fraction
+    _spread(histogram, lane, laser, delays, laser_points.delay_bins + sensors.delay_bins, value, seen.is_cluster, lit)
+
+
+def _spread(
+    histogram: DeviceHistogram,
+    lane: mi.UInt32,
+    laser: mi.UInt32,
+    delays: mi.Vector4f,
+    whole: mi.Int32,
+    value: mi.Spectrum,
+    is_cluster: mi.Bool | None,
+    active: mi.Bool,
+) -> None:
+    """Deposit a patch: one triangle, or the two halves of a cluster's parallelogram."""
+    a, b, c, d = delays
+    if is_cluster is None:
+        spread_triangle(histogram, lane, laser, mi.Vector3f(a, b, c), whole, value, active)
+        return
+    value = value * dr.select(is_cluster, mi.Float(0.5), 1)
+    spread_triangle(histogram, lane, laser, mi.Vector3f(a, b, c), whole, value, active)
+    spread_triangle(histogram, lane, laser, mi.Vector3f(a, c, d), whole, value, active & is_cluster)
 
 
 @dr.syntax
-def _spread(
+def spread_triangle(
     histogram: DeviceHistogram,
     lane: mi.UInt32,
     laser: mi.UInt32,

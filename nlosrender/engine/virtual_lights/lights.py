@@ -34,6 +34,8 @@ class DevicePatches:
 
     corners: list[mi.Point3f]  # three
     lift: mi.Vector3f  # from the plane of the corners to the surface
+    members: mi.Vector4f  # where shadow rays of clusters end, and 1 for a cluster, else 0
+    has_clusters: bool
     areas: mi.Vector3f  # geometric normal times area
     interaction: mi.SurfaceInteraction3f  # at the centres
     reflectance: mi.Spectrum  # of Lambertian patches
@@ -49,7 +51,9 @@ class Lights:
     reflectance: mi.Spectrum  # confocal Lambertian patches: reflectance / pi
     arriving: mi.Spectrum  # index = laser * count + patch: light that arrives, per area perpendicular to it;
     # of Lambertian patches the light that leaves; empty for confocal captures
-    delays: mi.Float  # four an index: from the laser point to each corner [bins], and 0
+    delays: mi.Float  # four an index: from the laser point to each corner [bins]
+    members: mi.Float  # four a patch: ``DevicePatches.members``
+    has_clusters: bool
     count: mi.UInt32  # of lit patches, opaque
 
 
@@ -62,8 +66,12 @@ def upload_patches(built: BuiltScene, patches: Patches) -> DevicePatches:
     corners = [to_points(patches.corners[:, k]) for k in range(3)]
     areas = mi.Vector3f(to_points(patches.normals * patches.areas[:, None]))
     lift = mi.Vector3f(to_points(patches.normals * patches.lifts[:, None]))
-    dr.eval(interaction, reflectance, corners, areas, lift)
-    return DevicePatches(corners, lift, areas, interaction, reflectance)
+    members = mi.Vector4f(*to_points(patches.members), mi.Float(patches.is_cluster.astype(np.float32)))
+    # a cluster's members have normals of their own: it is lit and seen by their mean
+    frame, own = interaction.sh_frame, mi.Frame3f(mi.Normal3f(interaction.n))
+    interaction.sh_frame = dr.select(members.w > 0, own, frame)
+    dr.eval(interaction, reflectance, corners, areas, lift, members)
+    return DevicePatches(corners, lift, members, bool(patches.is_cluster.any()), areas, interaction, reflectance)
 
 
 def surface_at(
@@ -122,11 +130,8 @@ def light_patches(settings: GatherSettings, transport: Transport, patches: Devic
         laser, patch = index // dr.width(lit), dr.gather(mi.UInt32, lit, index % dr.width(lit))
         arriving = dr.gather(mi.Spectrum, arriving, laser * count + patch)
         points = dr.gather(mi.Point3f, transport.lasers.interaction.p, laser)
-        legs = [
-            dr.norm(dr.gather(mi.Point3f, corner, patch) - points) * transport.bins_per_unit
-            for corner in patches.corners
-        ]
-        delays = dr.ravel(mi.Vector4f(*legs, 0))
+        ends = four_corners(*(dr.gather(mi.Point3f, corner, patch) for corner in patches.corners))
+        delays = dr.ravel(mi.Vector4f(*(dr.norm(end - points) * transport.bins_per_unit for end in ends)))
     a, b, c = (dr.gather(mi.Point3f, corner, lit) for corner in patches.corners)
     areas, interaction = (
         dr.gather(mi.Vector3f, patches.areas, lit),
@@ -139,7 +144,8 @@ def light_patches(settings: GatherSettings, transport: Transport, patches: Devic
     for k, (point, fourth) in enumerate(rows):
         dr.scatter(packed, mi.Vector4f(*point, fourth), lane * 4 + k)
     reflectance = dr.gather(mi.Spectrum, patches.reflectance, lit) * dr.inv_pi
-    dr.eval(packed, arriving, delays, interaction, reflectance)
+    members = dr.ravel(dr.gather(mi.Vector4f, patches.members, lit))
+    dr.eval(packed, arriving, delays, interaction, reflectance, members)
     return Lights(
         packed,
         interaction.sh_frame.n,
@@ -147,6 +153,8 @@ def light_patches(settings: GatherSettings, transport: Transport, patches: Devic
         reflectance,
         arriving,
         delays,
+        members,
+        patches.has_clusters,
         dr.opaque(mi.UInt32, dr.width(lit)),
     )
 
@@ -182,13 +190,15 @@ def _illuminate(
         flags = dr.gather(mi.SurfaceInteraction3f, patches.interaction, patch).bsdf().flags()
         active &= (cosine > 0) | mi.has_flag(flags, mi.BSDFFlags.BackSide)
     lift = dr.gather(mi.Vector3f, patches.lift, patch)
+    member = dr.gather(mi.Vector4f, patches.members, patch)
     seen = mi.Float(1)
     if settings.needs_visibility:
         seen = mi.Float(0)
         steps = recurrence_steps(2)
         for k in range(LASER_RAYS):
             u, v = _fraction(patch * LASER_RAYS + k, steps[0]), _fraction(patch * LASER_RAYS + k, steps[1])
-            seen += dr.select(is_visible(built, lit, point_inside(corners, u, v) + lift, active), 1.0 / LASER_RAYS, 0)
+            point = dr.select(member.w > 0, mi.Point3f(*member.xyz), point_inside(corners, u, v) + lift)
+            seen += dr.select(is_visible(built, lit, point, active), 1.0 / LASER_RAYS, 0)
     arriving = dr.select(active, arriving * seen, 0)
     brightest = dr.zeros(mi.Float, n_patches)
     dr.scatter_reduce(dr.ReduceOp.Max, brightest, dr.max(arriving), patch)
@@ -203,6 +213,11 @@ def is_visible(built: BuiltScene, wall_point: mi.SurfaceInteraction3f, target: m
     # stops short of the patch by 1e-4 of the way: a thin sheet 4 mm in front still hides it
     ray = mi.Ray3f(origin, direction, mi.Float(1 - 1e-4), mi.Float(0), [])
     return active & ~built.scene.ray_test(ray, coherent=False, active=active)
+
+
+def four_corners(a: mi.Point3f, b: mi.Point3f, c: mi.Point3f) -> tuple[mi.Point3f, ...]:
+    """Return a triangle's corners and the fourth that makes it a parallelogram."""
+    return a, b, c, a + (c - b)
 
 
 def point_inside(corners: list[mi.Point3f], u: mi.Float, v: mi.Float) -> mi.Point3f:

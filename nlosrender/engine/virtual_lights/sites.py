@@ -13,7 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nlosrender.engine.low_discrepancy import recurrence_steps
-from nlosrender.engine.virtual_lights.patches import Tessellator
+from nlosrender.engine.virtual_lights.cells import longest_edges, normals_and_areas
+from nlosrender.engine.virtual_lights.tessellator import Tessellator
 from nlosrender.scene.pose import Float64
 
 
@@ -61,12 +62,9 @@ class SiteSampler:
         spheres = [np.zeros((len(cells.corners), 4))]
         spheres += [np.repeat(sphere[None], len(patches), axis=0) for sphere, patches in round_patches]
         self._spheres = np.concatenate(spheres)
-        normals = np.cross(self._corners[:, 1] - self._corners[:, 0], self._corners[:, 2] - self._corners[:, 0])
-        lengths = np.linalg.norm(normals, axis=1)
-        self._normals = normals / np.maximum(lengths, 1e-300)[:, None]
-        self._areas = lengths / 2
+        self._normals, self._areas = normals_and_areas(self._corners)
         distances = tessellator.distance(self._corners.mean(axis=1))
-        sizes = np.linalg.norm(self._corners - np.roll(self._corners, 1, axis=1), axis=-1).max(axis=1)
+        sizes = longest_edges(self._corners)
         # a cell is no longer than its distance; its own size stands for the distance where it touches a point
         distances = np.maximum(distances, sizes / 2)
         self._reach = distances * (distances + tessellator.reach)

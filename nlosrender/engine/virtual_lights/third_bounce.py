@@ -17,7 +17,7 @@ from nlosrender.engine.pilot import Pilot
 from nlosrender.engine.transport import Transport
 from nlosrender.engine.virtual_lights.gather import gather_third_bounce, own_rows
 from nlosrender.engine.virtual_lights.lights import GatherSettings, light_patches, upload_patches
-from nlosrender.engine.virtual_lights.patches import MAX_PATCHES, Tessellator
+from nlosrender.engine.virtual_lights.tessellator import MAX_PATCHES, Tessellator
 
 FIRST_COARSENESS = 1.0
 REFINEMENT = 3.0  # at least so many times more patches between the two resolutions that are compared

@@ -1,0 +1,123 @@
+"""Hidden triangles, quartered where a laser or sensor point is near: the units that patches and sites are made of."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+
+from nlosrender.capture.grids import Capture, PointGrid
+from nlosrender.engine.surface_sampler import facing_triangles
+from nlosrender.scene.build import BuiltScene
+from nlosrender.scene.pose import Float64
+
+NEAREST = 1e-3  # engine units: surfaces nearer to a laser or sensor point are not cut any finer
+
+
+@dataclass(frozen=True, eq=False)
+class Cells:
+    """Triangles, or quarters of quarters of them, no longer than their distance from any laser or sensor point."""
+
+    corners: Float64  # (n, 3, 3) [engine units]
+    weights: Float64  # (n, 3, 3) barycentric coordinates of the corners in the mesh's triangle
+    shapes: NDArray[np.uint32]  # (n,) index into the scene's shapes
+    primitives: NDArray[np.uint32]  # (n,) triangle of the mesh
+    sizes: Float64  # (n,) longest edge
+    distances: Float64  # (n,) of the centre from the nearest laser or sensor point, at least NEAREST
+
+    def at(self, chosen: NDArray[np.bool_]) -> Cells:
+        """Return the cells that are ``chosen``."""
+        return Cells(*(values[chosen] for values in self._arrays()))
+
+    @classmethod
+    def joined(cls, parts: list[Cells]) -> Cells:
+        """Return the cells of all parts."""
+        if not parts:
+            none, index = np.zeros((0, 3, 3)), np.zeros(0, np.uint32)
+            return cls(none, none, index, index, np.zeros(0), np.zeros(0))
+        return cls(*(np.concatenate(values) for values in zip(*(part._arrays() for part in parts), strict=True)))
+
+    def _arrays(self) -> tuple[NDArray, ...]:
+        return self.corners, self.weights, self.shapes, self.primitives, self.sizes, self.distances
+
+
+@dataclass(frozen=True)
+class RegularPoints:
+    """A regular grid of points on the plane z = 0 [engine units]."""
+
+    first: tuple[float, float]
+    step: tuple[float, float]
+    count: tuple[int, int]  # columns, rows
+
+    @classmethod
+    def of(cls, grid: PointGrid, unit: float) -> RegularPoints:
+        x, y = grid.positions[0, :, 0] / unit, grid.positions[:, 0, 1] / unit
+        steps = tuple(float(axis[1] - axis[0]) if len(axis) > 1 else 1.0 for axis in (x, y))
+        return cls((float(x[0]), float(y[0])), (steps[0], steps[1]), (len(x), len(y)))
+
+    def squared_distance(self, points: Float64) -> Float64:
+        """Return the squared distance (n,) from ``points`` (n, 3) to the nearest point of the grid."""
+        squares = points[:, 2] ** 2
+        for axis in range(2):
+            along = (points[:, axis] - self.first[axis]) / self.step[axis]
+            nearest = np.clip(np.rint(along), 0, self.count[axis] - 1)
+            squares = squares + ((along - nearest) * self.step[axis]) ** 2
+        return squares
+
+
+class WallDistance:
+    """Distance from the nearest laser or sensor point of a capture before a planar wall.
+
+    Parameters
+    ----------
+    capture
+        Where the points are.
+    unit
+        Metres per engine unit.
+    """
+
+    def __init__(self, capture: Capture, unit: float):
+        grids = {id(grid): grid for grid in (capture.sensor_grid, capture.laser_grid)}
+        self._grids = [RegularPoints.of(grid, unit) for grid in grids.values()]
+
+    def __call__(self, points: Float64) -> Float64:
+        """Return the distance (n,) of ``points`` (n, 3) [engine units]."""
+        return np.sqrt(np.min([grid.squared_distance(points) for grid in self._grids], axis=0))
+
+
+def cells_of_mesh(built: BuiltScene, index: int, mesh: mi.Mesh, distance: WallDistance) -> Cells:
+    """Quarter the triangles of shape ``index`` until none is longer than its distance from the nearest point."""
+    corners, primitives = facing_triangles(built, mesh)
+    weights = np.broadcast_to(np.eye(3), corners.shape)
+    done: list[Cells] = []
+    while len(corners):
+        sizes = longest_edges(corners)
+        distances = np.maximum(distance(corners.mean(axis=1)), NEAREST)
+        large = sizes > distances
+        small = Cells(corners, weights, np.full(len(corners), index, np.uint32), primitives, sizes, distances)
+        done.append(small.at(~large))
+        corners, weights = _quartered(corners[large]), _quartered(weights[large])
+        primitives = np.tile(primitives[large], 4)
+    return Cells.joined(done)
+
+
+def normals_and_areas(triangles: Float64) -> tuple[Float64, Float64]:
+    """Return the unit normals (n, 3) and areas (n,) of triangles (n, 3, 3); the normal of no area is zero."""
+    normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+    lengths = np.linalg.norm(normals, axis=1)
+    return normals / np.maximum(lengths, 1e-300)[:, None], lengths / 2
+
+
+def longest_edges(triangles: Float64) -> Float64:
+    """Return the length (n,) of the longest edge of triangles (n, 3, 3)."""
+    return np.linalg.norm(triangles - np.roll(triangles, 1, axis=1), axis=-1).max(axis=1)
+
+
+def _quartered(triangles: Float64) -> Float64:
+    """Return the four similar parts (4 n, 3, 3) of every triangle."""
+    a, b, c = (triangles[:, k] for k in range(3))
+    ab, bc, ca = (a + b) / 2, (b + c) / 2, (c + a) / 2
+    parts = [(a, ab, ca), (ab, b, bc), (ca, bc, c), (bc, ca, ab)]
+    return np.concatenate([np.stack(part, axis=1) for part in parts])
