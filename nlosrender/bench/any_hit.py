@@ -2,25 +2,29 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
-from nlosrender.bench.runs import LoadedScene, Timer
-
-if TYPE_CHECKING:
-    from nlosrender.engine.virtual_lights.patches import Patches
+from nlosrender.bench.runs import Float64, LoadedScene, Timer
 
 REPEATS = 3
 RAYS_PER_LAUNCH = 2**24
 SPREAD = 1024  # counters that the lanes share, so that they rarely wait for one another
 
 
-def trace_any_hit(loaded: LoadedScene, patches: Patches) -> tuple[int, float]:
+def trace_any_hit(loaded: LoadedScene, positions: Float64, facing: Float64) -> tuple[int, float]:
     """Trace the shadow ray of every pair of sensor point and patch that face each other.
 
     Neighbouring lanes are neighbouring sensor points looking at the same patch, as in the gather. A ray ends at the
     patch's centre, where the gather takes a random point of the patch.
+
+    Parameters
+    ----------
+    loaded
+        Scene and sensor points.
+    positions, facing
+        (n, 3) centres [engine units] and normals of the patches.
 
     Returns
     -------
@@ -32,29 +36,29 @@ def trace_any_hit(loaded: LoadedScene, patches: Patches) -> tuple[int, float]:
 
     built, n_sensors = loaded.built, loaded.capture.n_sensors
     sensors = _device_points(mi, loaded.capture.sensor_grid.positions.reshape(-1, 3) / built.unit)
-    centres, normals = _device_points(mi, patches.centres), _device_points(mi, patches.normals)
+    centres, normals = _device_points(mi, positions), _device_points(mi, facing)
     step = max(1, RAYS_PER_LAUNCH // n_sensors)
     dr.eval(sensors, centres, normals)
 
     def trace(first: int) -> tuple[int, int]:
-        count = min(step, len(patches) - first) * n_sensors
+        count = min(step, len(positions) - first) * n_sensors
         index = dr.arange(mi.UInt32, count)
         patch = index // n_sensors + dr.opaque(mi.UInt32, first)
         origin = dr.gather(mi.Point3f, sensors, index % n_sensors) + mi.Vector3f(0, 0, 1e-4)
         towards = dr.gather(mi.Point3f, centres, patch) - origin
-        facing = (dr.dot(mi.Vector3f(dr.gather(mi.Point3f, normals, patch)), towards) < 0) & (towards.z > 0)
+        turned = (dr.dot(mi.Vector3f(dr.gather(mi.Point3f, normals, patch)), towards) < 0) & (towards.z > 0)
         ray = mi.Ray3f(origin, towards, mi.Float(1 - 1e-4), mi.Float(0), [])
-        hit = built.scene.ray_test(ray, coherent=False, active=facing)
+        hit = built.scene.ray_test(ray, coherent=False, active=turned)
         # sums inside the kernel: nothing of the size of the rays is written
         counts = dr.zeros(mi.UInt32, 2 * SPREAD)
-        dr.scatter_add(counts, mi.UInt32(1), (index % SPREAD) * 2, facing)
-        dr.scatter_add(counts, mi.UInt32(1), (index % SPREAD) * 2 + 1, hit & facing)
+        dr.scatter_add(counts, mi.UInt32(1), (index % SPREAD) * 2, turned)
+        dr.scatter_add(counts, mi.UInt32(1), (index % SPREAD) * 2 + 1, hit & turned)
         return tuple(np.asarray(counts.numpy(), dtype=np.int64).reshape(-1, 2).sum(axis=0).tolist())
 
     spent, rays = [], 0
     for _ in range(REPEATS):
         timer = Timer()
-        rays = sum(trace(first)[0] for first in range(0, len(patches), step))
+        rays = sum(trace(first)[0] for first in range(0, len(positions), step))
         spent.append(timer.read()[0])
     return rays, min(spent)
 

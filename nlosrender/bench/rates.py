@@ -26,27 +26,30 @@ GATHER_TARGET = 0.01
 class GatherRate:
     """How the third bounce's gather compares with tracing its shadow rays and doing nothing else.
 
-    A pair is a sensor point and a patch. The gather's time is all of the engine's: patches, lighting, histogram. The
-    any-hit queries go from the same sensor points to the same patches, in the same order, eight or sixteen
-    neighbouring sensor points to one patch at a time; pairs that face away from each other are traced by neither.
+    A pair is a sensor point and a patch. The gather's time is all of it: patches, lighting, histogram. The any-hit
+    queries go from the same sensor points to the same patches, in the same order, neighbouring sensor points to one
+    patch at a time; pairs that face away from each other are traced by neither.
     """
 
     scene: str
-    patches: int  # of all resolutions the gather went through
-    pairs: int
-    facing_pairs: int
+    triangles: int
+    patches: int  # at the resolution of the target error
+    lit_patches: int  # of them, seen by a laser point: only these are gathered
+    pairs: int  # sensor points times all patches: the rays of a gather that leaves out none
+    rays: int  # lit pairs that face each other
     gather_seconds: float
-    any_hit_seconds: float
+    any_hit_seconds: float  # for ``rays``
     traces_rays: bool  # the gather leaves out visibility where nothing can occlude
 
     def report(self) -> dict[str, Any]:
-        """Return counts, and rates in pairs and rays per second."""
+        """Return counts, rates in pairs and rays per second, and the share of rays left out."""
         return {
             **vars(self),
             "gather_pairs_per_second": self.pairs / self.gather_seconds,
-            "gather_rays_per_second": self.facing_pairs / self.gather_seconds,
-            "any_hit_rays_per_second": self.facing_pairs / self.any_hit_seconds,
+            "gather_rays_per_second": self.rays / self.gather_seconds,
+            "any_hit_rays_per_second": self.rays / self.any_hit_seconds,
             "gather_share_of_any_hit": self.any_hit_seconds / self.gather_seconds,
+            "rays_left_out": 1 - (self.rays / self.pairs if self.traces_rays else 0.0),
         }
 
 
@@ -63,41 +66,30 @@ def gather_rate(loaded: LoadedScene) -> GatherRate:
     from nlosrender.engine.virtual_lights.engine import VirtualLightEngine
 
     config = loaded.scene.config(engine="virtual_lights", split_bounces=False)
-    spent, patch_sets, traces_rays = [], [], True
+    plan, engine = pipeline.prepare(config, loaded.backend, loaded.built, loaded.capture, loaded.time_axis)
+    if not isinstance(engine, VirtualLightEngine):
+        raise RenderError(f"{loaded.scene.name}: the virtual-light engine does not take this scene")
+    fineness = engine.settle(Budget(target_error=GATHER_TARGET)).fineness or 1.0
+    spent = []
     for _ in range(REPEATS + 1):  # the first run compiles
         timer = Timer()
-        plan, engine = pipeline.prepare(config, loaded.backend, loaded.built, loaded.capture, loaded.time_axis)
-        if not isinstance(engine, VirtualLightEngine):
-            raise RenderError(f"{loaded.scene.name}: the virtual-light engine does not take this scene")
-        traces_rays = engine.settings.needs_visibility
-        patch_sets = _recorded(engine.tessellator)
         for batch in plan.batches:
-            engine.render(batch, Budget(target_error=GATHER_TARGET))
+            engine.third.gather(batch, fineness)
         spent.append(timer.read()[0])
-    traced = [trace_any_hit(loaded, patches) for patches in patch_sets]
-    n_patches = sum(len(patches) for patches in patch_sets)
+    lit = engine.third.lit_patches(plan.batches[0], fineness)
+    rays, any_hit_seconds = trace_any_hit(loaded, lit.positions, lit.normals)
+    n_patches = len(engine.tessellator.patches(fineness))
     return GatherRate(
         loaded.scene.name,
+        loaded.built.n_triangles,
         n_patches,
+        len(lit.positions),
         n_patches * loaded.capture.n_sensors,
-        sum(rays for rays, _ in traced),
+        rays,
         statistics.median(spent[1:]),
-        sum(seconds for _, seconds in traced),
-        traces_rays,
+        any_hit_seconds,
+        engine.settings.needs_visibility,
     )
-
-
-def _recorded(tessellator: Any) -> list[Any]:
-    """Make a tessellator note the patches it hands out from now on; return the list they go to."""
-    handed_out: list[Any] = []
-    make = tessellator.patches
-
-    def patches(coarseness: float) -> Any:
-        handed_out.append(make(coarseness))
-        return handed_out[-1]
-
-    tessellator.patches = patches
-    return handed_out
 
 
 def whole_process(scene: BenchScene) -> dict[str, Any]:

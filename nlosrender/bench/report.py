@@ -50,10 +50,11 @@ def table(report: dict[str, Any]) -> str:
         lines += ["", "gather against Embree's any-hit queries on the same pairs of sensor point and patch"]
     for rate in report["rates"]:
         lines.append(
-            f"  {rate['scene']}: {rate['patches']} patches, {rate['gather_pairs_per_second'] / 1e6:.1f} M pairs/s; "
-            f"facing pairs {rate['gather_rays_per_second'] / 1e6:.1f} M/s gathered, "
-            f"{rate['any_hit_rays_per_second'] / 1e6:.1f} M/s any-hit: {rate['gather_share_of_any_hit']:.0%}"
-            + ("" if rate["traces_rays"] else " (nothing can occlude here: the gather traces no rays)")
+            f"  {rate['scene']}: {rate['patches']} patches, {rate['lit_patches']} lit, "
+            f"{rate['gather_pairs_per_second'] / 1e6:.1f} M pairs/s; rays {rate['gather_rays_per_second'] / 1e6:.1f} "
+            f"M/s gathered, {rate['any_hit_rays_per_second'] / 1e6:.1f} M/s any-hit: "
+            f"{rate['gather_share_of_any_hit']:.0%}; of all pairs {rate['rays_left_out']:.0%} take no ray"
+            + ("" if rate["traces_rays"] else " (nothing can occlude here)")
         )
     if report["process"]:
         lines += ["", _process_line(report["process"])]

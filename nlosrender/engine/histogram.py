@@ -6,13 +6,14 @@ Sums are float64: float32 stops growing when a deposit is below 6e-8 of what is 
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
+
+from nlosrender.capture.relative_error import relative_l2_error
 
 
 @dataclass(frozen=True)
@@ -124,14 +125,3 @@ class Histogram:
 def to_memory_order(values: NDArray[np.float64], shape: HistogramShape) -> NDArray[np.float64]:
     """Bring flat statistics to (channel, slot, laser, sensor, row)."""
     return values.reshape(shape.axes).transpose(3, 2, 1, 0, 4)
-
-
-def relative_l2_error(noise: float, energy: float) -> float:
-    """Return sqrt(sum of variances / sum of squared truths) from sums over bins of variance and squared estimate.
-
-    E[estimate^2] = truth^2 + variance, so the variances are subtracted; 0 for an empty capture, inf for pure noise.
-    """
-    if noise <= 0:
-        return 0.0
-    truth = energy - noise
-    return math.sqrt(noise / truth) if truth > 0 else math.inf

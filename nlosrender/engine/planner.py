@@ -11,12 +11,13 @@ from nlosrender.capture.bounces import THIRD_BOUNCE
 from nlosrender.capture.grids import Capture
 from nlosrender.config.render import RenderConfig
 from nlosrender.engine.virtual_lights.engine import is_lambertian
-from nlosrender.engine.virtual_lights.tessellator import MAX_PATCHES, Tessellator, can_tessellate
+from nlosrender.engine.virtual_lights.tessellator import Tessellator, can_tessellate
 from nlosrender.scene.build import BuiltScene
 
 EngineName = Literal["path", "virtual_lights"]
 # Engine units: a surface this near to a laser or sensor point is seen under a large angle however finely it is cut.
 TOUCHING = 2e-3
+MAX_TRIANGLES = 5_000_000  # of all meshes: merging them takes about 1 kB each on the way
 
 
 @dataclass(frozen=True)
@@ -66,6 +67,6 @@ def _obstacle(render: RenderConfig, capture: Capture, built: BuiltScene) -> str 
     hard = mi.BSDFFlags.Delta | mi.BSDFFlags.Transmission | mi.BSDFFlags.Null
     if any(bool(shape.bsdf().flags() & hard) for shape in built.hidden_shapes):
         return "some hidden surfaces are mirrors or let light through"
-    if built.n_triangles > MAX_PATCHES // 8:
+    if built.n_triangles > MAX_TRIANGLES:
         return f"{built.n_triangles} triangles are more than the gather takes"
     return None

@@ -58,7 +58,7 @@ class VirtualLightEngine:
         )
         self.third = ThirdBounce(self.paths, self.tessellator, self.settings, lanes)
         self.further: FurtherBounces | None = None  # else the path engine
-        if self.has_further_bounces and self.settings.is_diffuse and not self.settings.is_confocal:
+        if self.has_further_bounces and self.settings.is_diffuse:
             self.further = FurtherBounces(self.paths, self.tessellator, self.settings.needs_visibility)
         self._settled: dict[Budget, Budget] = {}
 

@@ -19,10 +19,12 @@ from nlosrender.engine.transport import Transport
 from nlosrender.engine.virtual_lights.lights import is_visible, to_points
 from nlosrender.engine.virtual_lights.sites import Sites, SiteSampler
 from nlosrender.engine.virtual_lights.tessellator import Tessellator
-from nlosrender.engine.virtual_lights.walks import Impulses, TriedLasers, WalkPlan, walk_back
+from nlosrender.engine.virtual_lights.walks import Impulses, TriedLasers, WalkPlan, arriving, walk_back
 
 SITES_PER_ROUND = 4096  # of all replicas together
 IMPULSES_PER_SITE = 8
+CONFOCAL_IMPULSES_PER_SITE = 2
+MOST_VALUES = 2**24  # impulses of a round times lasers, for memory
 WALKS_PER_SITE = (16, 64)  # walks are cheap beside the gather when many sensor points share them
 MOST_ROUNDS = 2**20  # of a target that is out of reach
 
@@ -42,7 +44,7 @@ class FurtherBounces:
     Parameters
     ----------
     paths
-        Engine whose scene, points and histogram shapes are used; not of a confocal capture.
+        Engine whose scene, points and histogram shapes are used.
     tessellator
         Holds the cells the sites lie on.
     needs_visibility
@@ -59,17 +61,23 @@ class FurtherBounces:
         self.tried = TriedLasers(points, tried.size, tried.size == capture.n_lasers)
         pairs = capture.n_sensors * (capture.n_lasers if capture.scan_type == "exhaustive" else 1)
         fewest, most = WALKS_PER_SITE
+        self.is_confocal = capture.scan_type == "confocal"
+        # every impulse of a confocal capture takes a ray of its own to the laser
+        self.impulses_per_site = CONFOCAL_IMPULSES_PER_SITE if self.is_confocal else IMPULSES_PER_SITE
+        lasers = capture.n_lasers if capture.scan_type == "exhaustive" else 1
+        self.sites_per_round = min(SITES_PER_ROUND, max(64, MOST_VALUES // (self.impulses_per_site * lasers)))
         self.walks = int(min(max(pairs / 32, fewest), most))
 
     def plan(self, replicas: int) -> WalkPlan:
         """Return the numbers of a round of ``replicas`` independent sets of sites."""
-        sites = max(SITES_PER_ROUND // replicas, 16)
-        return WalkPlan(replicas, sites, self.walks, IMPULSES_PER_SITE, self.options.bounces.max_bounces)
+        sites = max(self.sites_per_round // replicas, 16)
+        max_bounces = self.options.bounces.max_bounces
+        return WalkPlan(replicas, sites, self.walks, self.impulses_per_site, max_bounces, self.is_confocal)
 
     @property
     def impulses_per_round(self) -> int:
         """Impulses that every sensor point receives per round, at most."""
-        return SITES_PER_ROUND * IMPULSES_PER_SITE
+        return self.sites_per_round * self.impulses_per_site
 
     def histogram(self, batch: Batch | Pilot, replicas: int) -> DeviceHistogram:
         """Return an empty histogram of a batch: bounce slots from the fourth bounce on."""
@@ -95,7 +103,7 @@ class FurtherBounces:
         slots = dr.minimum(impulses.bounces - lowest, shape.slots - 1) if self.options.bounces.split else lowest * 0
         slots = dr.full(mi.UInt32, 0, impulses.count) + slots
         dr.eval(slots)
-        _gather_impulses(transport, self.needs_visibility, table, impulses, slots, shape, histogram)
+        _gather_impulses(transport, self.needs_visibility, self.is_confocal, table, impulses, slots, shape, histogram)
         dr.eval(histogram.sums)
 
     def _table(self, plan: WalkPlan, sites: Sites, impulses: Impulses) -> SiteTable:
@@ -114,6 +122,7 @@ class FurtherBounces:
 def _gather_impulses(
     transport: Transport,
     needs_visibility: bool,
+    is_confocal: bool,
     table: SiteTable,
     impulses: Impulses,
     slots: mi.UInt32,
@@ -128,10 +137,13 @@ def _gather_impulses(
     n_lasers = transport.n_lasers
     count = dr.opaque(mi.UInt32, impulses.count)
     scale = transport.bins_per_unit
+    own_laser = transport.lasers.gather(transport.first_laser)
     site = dr.gather(mi.UInt32, table.first, replica)
     end = dr.gather(mi.UInt32, table.first, replica + 1)
 
-    while dr.hint(site < end, exclude=[transport, table, impulses, histogram, built, sensors, sensor, wall_bsdf, end]):
+    while dr.hint(
+        site < end, exclude=[transport, table, impulses, histogram, built, sensors, sensor, wall_bsdf, end, own_laser]
+    ):
         # ---- The site as the sensor point sees it ------------------------------------------------------------------
         at = dr.gather(mi.Vector4f, table.packed, site * 2)
         by = dr.gather(mi.Vector4f, table.packed, site * 2 + 1)
@@ -150,20 +162,36 @@ def _gather_impulses(
         delay = distance * scale + sensors.delay_fraction
         impulse = dr.reinterpret_array(mi.UInt32, at.w)
         last = dr.select(active, dr.reinterpret_array(mi.UInt32, by.w), 0)
-        while dr.hint(impulse < last, exclude=[transport, impulses, slots, histogram, sensors, weight, delay, last]):
+        while dr.hint(
+            impulse < last,
+            exclude=[transport, impulses, slots, histogram, built, sensors, weight, delay, last, own_laser],
+        ):
             slot = dr.gather(mi.UInt32, slots, impulse)
-            laser = mi.UInt32(0)
-            while dr.hint(
-                laser < n_lasers,
-                exclude=[transport, impulses, histogram, sensors, weight, delay, impulse, slot, count],
-            ):
-                points = transport.lasers.gather(transport.first_laser + laser)
-                entry = laser * count + impulse
-                value = weight * dr.gather(mi.Spectrum, impulses.values, entry)
-                arrival = delay + dr.gather(mi.Float, impulses.delays, entry) + points.delay_fraction
-                bins = mi.Int32(dr.floor(dr.minimum(arrival, 1e9))) + points.delay_bins + sensors.delay_bins
-                histogram.deposit(lane, laser, slot, bins, value, dr.any(value > 0))
-                laser += 1
+            if dr.hint(is_confocal, mode="scalar"):
+                end_point = dr.gather(mi.Point3f, impulses.ends, impulse)
+                facing = dr.gather(mi.Normal3f, impulses.shading, impulse)
+                value = weight * dr.gather(mi.Spectrum, impulses.values, impulse)
+                value *= arriving(built, own_laser, end_point, facing)
+                lit = dr.any(value > 0)
+                if dr.hint(needs_visibility, mode="scalar"):
+                    lit = is_visible(built, own_laser.interaction, end_point, lit)
+                arrival = delay + dr.gather(mi.Float, impulses.delays, impulse) + own_laser.delay_fraction
+                arrival += dr.norm(end_point - own_laser.interaction.p) * scale
+                bins = mi.Int32(dr.floor(dr.minimum(arrival, 1e9))) + own_laser.delay_bins + sensors.delay_bins
+                histogram.deposit(lane, mi.UInt32(0), slot, bins, value, lit)
+            else:
+                laser = mi.UInt32(0)
+                while dr.hint(
+                    laser < n_lasers,
+                    exclude=[transport, impulses, histogram, sensors, weight, delay, impulse, slot, count],
+                ):
+                    points = transport.lasers.gather(transport.first_laser + laser)
+                    entry = laser * count + impulse
+                    value = weight * dr.gather(mi.Spectrum, impulses.values, entry)
+                    arrival = delay + dr.gather(mi.Float, impulses.delays, entry) + points.delay_fraction
+                    bins = mi.Int32(dr.floor(dr.minimum(arrival, 1e9))) + points.delay_bins + sensors.delay_bins
+                    histogram.deposit(lane, laser, slot, bins, value, dr.any(value > 0))
+                    laser += 1
             impulse += 1
         site += 1
 

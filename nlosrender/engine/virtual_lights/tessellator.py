@@ -21,7 +21,8 @@ from nlosrender.engine.virtual_lights.patches import Patches, sphere_patches, sp
 from nlosrender.scene.build import WALL_ID, BuiltScene
 from nlosrender.scene.pose import Float64
 
-MAX_PATCHES = 4_000_000  # of one gather; beyond it the path engine is the better choice
+MAX_PATCHES = 2_000_000  # of one gather; beyond it the path engine is the better choice
+MOST_KEPT = 200_000  # patches of one resolution that are kept for the next call
 MERGED = 0.4  # of the size allowed: smaller cells are merged
 
 
@@ -57,18 +58,20 @@ class Tessellator:
         self.cells = Cells.joined(cells)
         self._allowed = self._allowed_at(self.cells.distances)
         self._normals, self._areas = normals_and_areas(self.cells.corners)
-        self._patches = lru_cache(maxsize=4)(self._make_patches)
+        self._kept_patches = lru_cache(maxsize=4)(self._make_patches)
 
     def patches(self, coarseness: float) -> Patches:
-        """Return patches whose error is of order ``coarseness`` squared; those of the last calls are kept."""
-        return self._patches(coarseness)
+        """Return patches whose error is of order ``coarseness`` squared; those of the last calls are kept if few."""
+        if self.count(coarseness) > MOST_KEPT:
+            return self._make_patches(coarseness)
+        return self._kept_patches(coarseness)
 
     def _make_patches(self, coarseness: float) -> Patches:
         far_smaller = self._far_smaller(coarseness)
         parts = [split_cells(self.cells.at(~far_smaller), self._splits(coarseness)[~far_smaller])]
         if far_smaller.any():
-            merged = (values[far_smaller] for values in (self._normals, self._areas, self._allowed))
-            parts.append(cluster(self.cells.at(far_smaller), *merged, coarseness))
+            small, normals, areas = self.cells.at(far_smaller), self._normals[far_smaller], self._areas[far_smaller]
+            parts.append(cluster(small, normals, areas, self._allowed[far_smaller], coarseness))
         parts += [
             sphere_patches(index, sphere, self._sphere_splits(sphere, coarseness)) for index, sphere in self._spheres
         ]

@@ -21,6 +21,7 @@ from nlosrender.engine.virtual_lights.tessellator import MAX_PATCHES, Tessellato
 
 FIRST_COARSENESS = 1.0
 REFINEMENT = 3.0  # at least so many times more patches between the two resolutions that are compared
+STUCK = 0.9  # of the error before, with twice the patches: refining further is in vain
 MARGIN = 1.1  # on the patches that an extrapolated error asks for
 
 
@@ -35,6 +36,14 @@ class Gathered:
     def squares(self) -> float:
         """Sum of squares inside the time window."""
         return float((self.values[..., :-1] ** 2).sum())
+
+
+@dataclass(frozen=True, eq=False)
+class LitPatches:
+    """Patches that some laser point lights [engine units]."""
+
+    positions: NDArray[np.float64]  # (n, 3)
+    normals: NDArray[np.float64]  # (n, 3)
 
 
 class ThirdBounce:
@@ -70,6 +79,14 @@ class ThirdBounce:
         values = histogram.sums.numpy().reshape(shape.replicas, -1).sum(axis=0)
         return Gathered(to_memory_order(values, shape), len(patches))
 
+    def lit_patches(self, batch: Batch | Pilot, coarseness: float) -> LitPatches:
+        """Return the patches that the gather of a batch goes through."""
+        shape = self.shape(batch)
+        transport, _, _ = self._transport(batch, shape)
+        on_device = upload_patches(self.paths.built, self.tessellator.patches(coarseness))
+        surface = light_patches(self.settings, transport, on_device, shape.lasers).interaction
+        return LitPatches(np.array(surface.p, np.float64).T, np.array(surface.n, np.float64).T)
+
     def pair(self, batch: Batch | Pilot, fineness: float) -> tuple[Gathered, Gathered]:
         """Gather a batch at ``fineness`` and at the coarser resolution it is compared with."""
         return self.gather(batch, self.coarser(fineness)), self.gather(batch, fineness)
@@ -78,12 +95,16 @@ class ThirdBounce:
         """Return the fineness whose estimated error is at most ``target``, and the pilot's third bounce at it."""
         coarse = self.gather(pilot, FIRST_COARSENESS)
         fineness = self.finer(FIRST_COARSENESS, coarse.n_patches, REFINEMENT)
+        earlier = math.inf
         while True:
             fine = self.gather(pilot, fineness)
             error, _ = estimated_error(coarse, fine)
             needed = fine.n_patches * error / target
-            if error <= target or max(needed, 2 * fine.n_patches) > MAX_PATCHES:
+            # float32 path lengths and grazing contacts leave an error that no refinement takes away
+            is_stuck = error > STUCK * earlier and fine.n_patches > 2 * coarse.n_patches
+            if error <= target or is_stuck or max(needed, 2 * fine.n_patches) > MAX_PATCHES:
                 return fineness, fine
+            earlier = error
             coarse, fineness = fine, self.finer(fineness, fine.n_patches, min(max(MARGIN * error / target, 1.5), 16.0))
 
     def finer(self, coarseness: float, n_patches: int, factor: float) -> float:

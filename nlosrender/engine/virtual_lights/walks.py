@@ -57,7 +57,8 @@ class WalkEnds:
 class Impulses:
     """Light that leaves sites at known delays; those of one site lie together.
 
-    ``values`` and ``delays`` have index laser * count + impulse.
+    ``values`` and ``delays`` have index laser * count + impulse. Of confocal captures, whose sensor points each have a
+    laser of their own, they leave out the way from the laser to the end of the walk.
     """
 
     count: int
@@ -65,6 +66,8 @@ class Impulses:
     bounces: mi.UInt32  # (count,)
     values: mi.Spectrum  # radiance towards the sensor points, for the site's area
     delays: mi.Float  # from the laser point to the site [bins]
+    ends: mi.Point3f  # (count,) where the laser's light meets the walk
+    shading: mi.Normal3f  # (count,) shading normals there
 
 
 @dr.syntax
@@ -123,7 +126,7 @@ def trace_walks(
         lit = mi.Float(0)
         for k in range(tried.count):
             point = tried.points.gather(mi.UInt32(k))
-            lit += dr.mean(leaving * _arriving(built, point, si.p, si.sh_frame.n)) / tried.count
+            lit += dr.mean(leaving * arriving(built, point, si.p, si.sh_frame.n)) / tried.count
         if dr.hint(not tried.are_all, mode="scalar"):
             away = dr.squared_norm(si.p - tried.points.gather(mi.UInt32(0)).interaction.p)
             lit += UNTRIED_SHARE * dr.mean(leaving) / away
@@ -152,7 +155,7 @@ def trace_walks(
     return WalkEnds(position, normal, shading, carried, chosen_opl, chosen_bounce, expected, total)
 
 
-def _arriving(built: BuiltScene, laser: WallPoints, point: mi.Point3f, shading: mi.Normal3f) -> mi.Spectrum:
+def arriving(built: BuiltScene, laser: WallPoints, point: mi.Point3f, shading: mi.Normal3f) -> mi.Spectrum:
     """Return the irradiance at a point from a laser point that it sees [1 / (engine unit)^2 per J]."""
     to_point = point - laser.interaction.p
     distance2 = dr.squared_norm(to_point)
@@ -170,6 +173,7 @@ class WalkPlan:
     walks: int  # per site
     impulses: int  # kept per site, on average
     max_bounces: int | None
+    is_confocal: bool
 
 
 def walk_back(plan: WalkPlan, transport: Transport, sites: Sites, tried: TriedLasers, seed: int) -> Impulses:
@@ -205,28 +209,36 @@ def walk_back(plan: WalkPlan, transport: Transport, sites: Sites, tried: TriedLa
     walk, copies, share = _resample(ends, sites, plan, np.random.default_rng(seed))
     if not len(walk):
         return no_impulses()
-    values, delays, lit = _connect(transport, ends, walk, copies * share)
+    if plan.is_confocal:
+        values, delays, lit = _unconnected(transport, ends, walk, copies * share)
+        n_lasers = 1
+    else:
+        values, delays, lit = _connect(transport, ends, walk, copies * share)
+        n_lasers = transport.lasers_per_lane
     kept = dr.compress(lit)
     n_kept = dr.width(kept)
     if not n_kept:
         return no_impulses()
-    index = dr.arange(mi.UInt32, n_kept * transport.lasers_per_lane)
+    index = dr.arange(mi.UInt32, n_kept * n_lasers)
     entry = index // n_kept * len(walk) + dr.gather(mi.UInt32, kept, index % n_kept)
     chosen = walk[np.asarray(kept.numpy())]
+    end = mi.UInt32(chosen.astype(np.uint32))
     impulses = Impulses(
         n_kept,
         chosen // plan.walks,
-        dr.gather(mi.UInt32, ends.bounce, mi.UInt32(chosen.astype(np.uint32))),
+        dr.gather(mi.UInt32, ends.bounce, end),
         dr.gather(mi.Spectrum, values, entry),
         dr.gather(mi.Float, delays, entry),
+        dr.gather(mi.Point3f, ends.position, end),
+        dr.gather(mi.Normal3f, ends.shading, end),
     )
-    dr.eval(impulses.bounces, impulses.values, impulses.delays)
+    dr.eval(impulses.bounces, impulses.values, impulses.delays, impulses.ends, impulses.shading)
     return impulses
 
 
 def no_impulses() -> Impulses:
     """Return what comes back when no walk finds light."""
-    return Impulses(0, np.zeros(0, np.int64), mi.UInt32(), mi.Spectrum(0), mi.Float())
+    return Impulses(0, np.zeros(0, np.int64), mi.UInt32(), mi.Spectrum(0), mi.Float(), mi.Point3f(), mi.Normal3f())
 
 
 def _resample(
@@ -258,6 +270,18 @@ def _resample(
     return np.concatenate(walks), np.concatenate(copies), np.concatenate(shares)
 
 
+def _unconnected(
+    transport: Transport, ends: WalkEnds, walk: NDArray[np.int64], scale: Float64
+) -> tuple[mi.Spectrum, mi.Float, mi.Bool]:
+    """Return what chosen ends pass on of the light that will meet them there, its delay, and which pass on any."""
+    end = mi.UInt32(walk.astype(np.uint32))
+    values = dr.gather(mi.Spectrum, ends.carried, end) / dr.gather(mi.Float, ends.expected, end)
+    values *= mi.Float(scale.astype(np.float32))
+    delays = dr.gather(mi.Float, ends.opl, end) * transport.bins_per_unit
+    dr.eval(values, delays)
+    return values, delays, dr.any(values > 0)
+
+
 def _connect(
     transport: Transport, ends: WalkEnds, walk: NDArray[np.int64], scale: Float64
 ) -> tuple[mi.Spectrum, mi.Float, mi.Bool]:
@@ -273,7 +297,7 @@ def _connect(
     to_laser = lasers.interaction.p - position
     distance = dr.norm(to_laser)
     value = dr.gather(mi.Spectrum, ends.carried, end) / dr.gather(mi.Float, ends.expected, end)
-    value *= _arriving(built, lasers, position, dr.gather(mi.Normal3f, ends.shading, end))
+    value *= arriving(built, lasers, position, dr.gather(mi.Normal3f, ends.shading, end))
     value *= dr.gather(mi.Float, mi.Float(scale.astype(np.float32)), at)
     active = dr.any(value > 0)
     segment = connection_segment(si, to_laser / distance, lasers.interaction.p)
