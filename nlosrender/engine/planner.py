@@ -61,7 +61,7 @@ def _obstacle(render: RenderConfig, capture: Capture, built: BuiltScene) -> str 
     if built.hidden_bounds is None:
         return "there is no hidden geometry"
     if not can_tessellate(built):
-        return "the wall is curved, or a hidden shape is neither a mesh nor a sphere"
+        return "the wall is curved, or a hidden shape is neither a mesh nor a sphere or cylinder"
     if bool(built.wall_bsdf.flags() & mi.BSDFFlags.Delta):
         return "the relay wall has a mirror lobe"
     hard = mi.BSDFFlags.Delta | mi.BSDFFlags.Transmission | mi.BSDFFlags.Null

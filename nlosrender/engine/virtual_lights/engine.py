@@ -40,7 +40,8 @@ class VirtualLightEngine:
     Parameters
     ----------
     built, capture, time_axis, options
-        As for the path engine. The wall has to be planar, the hidden geometry meshes and spheres without mirrors.
+        As for the path engine. The wall has to be planar, the hidden geometry meshes, spheres and cylinders, none of
+        them a mirror.
     lanes
         Lanes that keep the backend busy.
     """

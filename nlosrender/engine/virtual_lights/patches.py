@@ -64,7 +64,7 @@ def split_cells(cells: Cells, splits: NDArray[np.int64]) -> Patches:
     parts = []
     for n in np.unique(splits):
         owners = np.flatnonzero(splits == n)
-        weights = _split_weights(int(n))  # (n^2, 3 corners, 3 barycentric)
+        weights = split_weights(int(n))  # (n^2, 3 corners, 3 barycentric)
         corners = np.einsum("pkb,tbx->tpkx", weights, cells.corners[owners]).reshape(-1, 3, 3)
         centres = np.einsum("pb,tbx->tpx", weights.mean(axis=1), cells.weights[owners]).reshape(-1, 3)
         repeated = np.repeat(owners, n * n)
@@ -85,45 +85,7 @@ def split_cells(cells: Cells, splits: NDArray[np.int64]) -> Patches:
     return Patches.joined(parts) if parts else no_patches()
 
 
-def sphere_patches(index: int, sphere: Float64, n: int) -> Patches:
-    """Cut a sphere into 20 n^2 spherical triangles: an icosahedron's faces, cut and projected.
-
-    Parameters
-    ----------
-    index
-        Of the shape in the scene.
-    sphere
-        Centre and signed radius (4,) [engine units]: negative when it is seen from within.
-    n
-        Parts of an edge.
-    """
-    flat = np.einsum("pkb,tbx->tpkx", _split_weights(n), _icosahedron()).reshape(-1, 3, 3)
-    unit = flat / np.linalg.norm(flat, axis=-1, keepdims=True)
-    a, b, c = unit[:, 0], unit[:, 1], unit[:, 2]
-    # solid angle of a spherical triangle (Van Oosterom & Strackee 1983)
-    triple = np.einsum("ij,ij->i", a, np.cross(b, c))
-    denominator = 1 + np.einsum("ij,ij->i", a, b) + np.einsum("ij,ij->i", b, c) + np.einsum("ij,ij->i", c, a)
-    solid_angle = 2 * np.arctan2(triple, denominator)
-    direction = unit.mean(axis=1)
-    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
-    centre, radius = sphere[:3], abs(sphere[3])
-    count = len(unit)
-    return Patches(
-        centre + radius * unit,
-        radius**2 * solid_angle,
-        centre + radius * direction,
-        np.sign(sphere[3]) * direction,
-        np.full(count, index, np.uint32),
-        np.zeros(count, np.uint32),
-        np.zeros((count, 2)),
-        # seen from within, a plane through points of the sphere lies in front of it already
-        np.maximum(np.sign(sphere[3]), 0) * radius * (1 - np.linalg.norm(unit.mean(axis=1), axis=1)),
-        centre + radius * direction,
-        np.zeros(count, bool),
-    )
-
-
-def _split_weights(n: int) -> Float64:
+def split_weights(n: int) -> Float64:
     """Return the n^2 similar parts of a triangle, (n^2, 3 corners, 3 barycentric coordinates)."""
     parts = []
     for i in range(n):
@@ -133,21 +95,3 @@ def _split_weights(n: int) -> Float64:
                 parts.append([(i + 1, j), (i + 1, j + 1), (i, j + 1)])
     second_third = np.array(parts, dtype=np.float64) / n
     return np.concatenate([1 - second_third.sum(axis=-1, keepdims=True), second_third], axis=-1)
-
-
-def _icosahedron() -> Float64:
-    """Return the 20 faces (20, 3, 3) of the icosahedron in the unit sphere, counter-clockwise from outside."""
-    golden = (1 + 5**0.5) / 2
-    vertices = np.array([(s, t * golden, 0) for s in (-1, 1) for t in (-1, 1)])
-    vertices = np.concatenate([vertices, np.roll(vertices, 1, axis=1), np.roll(vertices, 2, axis=1)])
-    vertices /= np.linalg.norm(vertices, axis=1, keepdims=True)
-    edge = 2 / np.sqrt(1 + golden**2)
-    near = np.abs(np.linalg.norm(vertices[:, None] - vertices[None], axis=-1) - edge) < 1e-9
-    faces = []
-    for i in range(12):
-        for j in range(i + 1, 12):
-            for k in range(j + 1, 12):
-                if near[i, j] and near[j, k] and near[i, k]:
-                    a, b, c = vertices[i], vertices[j], vertices[k]
-                    faces.append((a, b, c) if np.dot(a, np.cross(b, c)) > 0 else (a, c, b))
-    return np.array(faces)

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from nlosrender.engine.low_discrepancy import recurrence_steps
 from nlosrender.engine.virtual_lights.cells import longest_edges, normals_and_areas
+from nlosrender.engine.virtual_lights.round_shapes import onto_round_shapes
 from nlosrender.engine.virtual_lights.tessellator import Tessellator
 from nlosrender.scene.pose import Float64
 
@@ -25,7 +26,7 @@ class Sites:
     positions: Float64  # (n, 3)
     normals: Float64  # (n, 3) geometric, unit
     shapes: NDArray[np.uint32]  # (n,) index into the scene's shapes
-    primitives: NDArray[np.uint32]  # (n,) triangle of a mesh, 0 on spheres
+    primitives: NDArray[np.uint32]  # (n,) triangle of a mesh, 0 on round shapes
     barycentric: Float64  # (n, 2) within that triangle
     areas: Float64  # (n,) area a site stands for: the reciprocal of n times its density
     importance: Float64  # (n,) area over squared distance from the nearest laser or sensor point
@@ -46,22 +47,17 @@ class SiteSampler:
     Parameters
     ----------
     tessellator
-        Holds the cells of the meshes, and cuts spheres.
+        Holds the cells of meshes and round shapes.
     """
 
     def __init__(self, tessellator: Tessellator):
-        cells, round_patches = tessellator.cells, tessellator.sphere_cells()
-        corners = [cells.corners, *(patches.corners for _, patches in round_patches)]
-        self._corners = np.concatenate(corners)
-        self._weights = np.concatenate(
-            [cells.weights, *(np.zeros((len(patches), 3, 3)) for _, patches in round_patches)]
-        )
-        self._shapes = np.concatenate([cells.shapes, *(patches.shapes for _, patches in round_patches)])
-        self._primitives = np.concatenate([cells.primitives, *(patches.primitives for _, patches in round_patches)])
-        # centre and signed radius of the sphere a cell lies on; radius 0 on flat cells
-        spheres = [np.zeros((len(cells.corners), 4))]
-        spheres += [np.repeat(sphere[None], len(patches), axis=0) for sphere, patches in round_patches]
-        self._spheres = np.concatenate(spheres)
+        cells, on_round = tessellator.cells, tessellator.round_cells()
+        self._corners = np.concatenate([cells.corners, *(patches.corners for _, patches in on_round)])
+        self._weights = np.concatenate([cells.weights, *(np.zeros((len(patches), 3, 3)) for _, patches in on_round)])
+        self._shapes = np.concatenate([cells.shapes, *(patches.shapes for _, patches in on_round)])
+        self._primitives = np.concatenate([cells.primitives, *(patches.primitives for _, patches in on_round)])
+        rows = [np.repeat(shape.row[None], len(patches), axis=0) for shape, patches in on_round]
+        self._round_rows = np.concatenate([np.zeros((len(cells.corners), 7)), *rows])
         self._normals, self._areas = normals_and_areas(self._corners)
         distances = tessellator.distance(self._corners.mean(axis=1))
         sizes = longest_edges(self._corners)
@@ -98,7 +94,7 @@ class SiteSampler:
         positions = np.einsum("nk,nkx->nx", weights, self._corners[cell])
         barycentric = np.einsum("nk,nkb->nb", weights, self._weights[cell])[:, 1:]
         areas = self._areas[cell] / (count * self._probability[chosen])
-        positions, normals, stretch = _on_spheres(positions, self._normals[cell], self._spheres[cell])
+        positions, normals, stretch = onto_round_shapes(positions, self._normals[cell], self._round_rows[cell])
         areas *= stretch
         return Sites(
             positions,
@@ -109,26 +105,6 @@ class SiteSampler:
             areas,
             areas / self._reach[cell],
         )
-
-
-def _on_spheres(positions: Float64, normals: Float64, spheres: Float64) -> tuple[Float64, Float64, Float64]:
-    """Project points of a sphere's cells to the sphere; return positions, normals and the area's stretch.
-
-    dA_sphere = radius^2 cos / distance^2 dA_plane, with distance and cosine seen from the centre.
-    """
-    stretch = np.ones(len(positions))
-    is_round = spheres[:, 3] != 0
-    if is_round.any():
-        centre, radius = spheres[is_round, :3], spheres[is_round, 3]
-        outward = positions[is_round] - centre
-        distance = np.linalg.norm(outward, axis=1)
-        outward /= distance[:, None]
-        cosine = np.abs(np.einsum("nx,nx->n", outward, normals[is_round]))
-        stretch[is_round] = radius**2 * cosine / distance**2
-        positions[is_round] = centre + np.abs(radius)[:, None] * outward
-        normals = normals.copy()
-        normals[is_round] = np.sign(radius)[:, None] * outward
-    return positions, normals, stretch
 
 
 def _along_a_curve(points: Float64, shapes: NDArray[np.uint32]) -> NDArray[np.int64]:

@@ -10,14 +10,14 @@ from __future__ import annotations
 import math
 from functools import lru_cache
 
-import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
 from nlosrender.capture.grids import Capture
 from nlosrender.engine.virtual_lights.cells import Cells, WallDistance, cells_of_mesh, normals_and_areas
 from nlosrender.engine.virtual_lights.clusters import cluster
-from nlosrender.engine.virtual_lights.patches import Patches, sphere_patches, split_cells
+from nlosrender.engine.virtual_lights.patches import Patches, split_cells
+from nlosrender.engine.virtual_lights.round_shapes import ROUND_PLUGINS, RoundShape
 from nlosrender.scene.build import WALL_ID, BuiltScene
 from nlosrender.scene.pose import Float64
 
@@ -35,7 +35,7 @@ class Tessellator:
     Parameters
     ----------
     built
-        The scene: meshes and spheres; ``can_tessellate`` tells beforehand.
+        The scene: meshes, spheres and cylinders; ``can_tessellate`` tells beforehand.
     capture
         Where the laser and sensor points are.
     bin_width
@@ -47,14 +47,14 @@ class Tessellator:
         self.distance = WallDistance(capture, built.unit)
         self.reach = max(capture.sensor_grid.size) / (2 * built.unit)  # half the sensor grid's extent [engine units]
         cells: list[Cells] = []
-        self._spheres: list[tuple[int, Float64]] = []  # centre and signed radius
+        self.round_shapes: list[RoundShape] = []
         for index, shape in enumerate(built.scene.shapes()):
             if shape.id() == WALL_ID:
                 continue
             if shape.is_mesh():
                 cells.append(cells_of_mesh(built, index, shape, self.distance))
             else:
-                self._spheres.append((index, _sphere_of(shape)))
+                self.round_shapes.append(RoundShape.of(index, shape))
         self.cells = Cells.joined(cells)
         self._allowed = self._allowed_at(self.cells.distances)
         self._normals, self._areas = normals_and_areas(self.cells.corners)
@@ -72,9 +72,7 @@ class Tessellator:
         if far_smaller.any():
             small, normals, areas = self.cells.at(far_smaller), self._normals[far_smaller], self._areas[far_smaller]
             parts.append(cluster(small, normals, areas, self._allowed[far_smaller], coarseness))
-        parts += [
-            sphere_patches(index, sphere, self._sphere_splits(sphere, coarseness)) for index, sphere in self._spheres
-        ]
+        parts += [shape.patches(self._allowed_on(shape, coarseness)) for shape in self.round_shapes]
         return Patches.joined(parts)
 
     def count(self, coarseness: float) -> int:
@@ -83,20 +81,18 @@ class Tessellator:
         flat = int((self._splits(coarseness)[~far_smaller] ** 2).sum())
         # an equilateral triangle of the size allowed has 0.43 of its square as area
         areas = self._areas[far_smaller] / (0.43 * (coarseness * self._allowed[far_smaller]) ** 2)
-        spheres = sum(20 * self._sphere_splits(sphere, coarseness) ** 2 for _, sphere in self._spheres)
-        return flat + math.ceil(areas.sum()) + spheres
+        on_round = sum(shape.count(self._allowed_on(shape, coarseness)) for shape in self.round_shapes)
+        return flat + math.ceil(areas.sum()) + on_round
 
     @property
     def nearest(self) -> float:
-        """Distance of the nearest cell's centre, or sphere, from any laser or sensor point [engine units]."""
-        round_ones = [abs(float(self.distance(sphere[None, :3])[0]) - abs(sphere[3])) for _, sphere in self._spheres]
-        return min([float(self.cells.distances.min(initial=np.inf)), *round_ones])
+        """Distance of the nearest cell's centre, or round shape, from any laser or sensor point [engine units]."""
+        on_round = [shape.nearest(self.distance) for shape in self.round_shapes]
+        return min([float(self.cells.distances.min(initial=np.inf)), *on_round])
 
-    def sphere_cells(self) -> list[tuple[Float64, Patches]]:
-        """Return centre and signed radius of every sphere, and its cells, whose corners lie on it."""
-        return [
-            (sphere, sphere_patches(index, sphere, self._sphere_splits(sphere, 1.0))) for index, sphere in self._spheres
-        ]
+    def round_cells(self) -> list[tuple[RoundShape, Patches]]:
+        """Return every round shape, and its cells, whose corners lie on it."""
+        return [(shape, shape.patches(self._allowed_on(shape, 1.0))) for shape in self.round_shapes]
 
     def _allowed_at(self, distance: Float64) -> Float64:
         """Return the size a patch may have at ``distance`` from the points, at coarseness 1 [engine units]."""
@@ -109,23 +105,13 @@ class Tessellator:
         """Return which cells are so small that several make one patch."""
         return self.cells.sizes < MERGED * coarseness * self._allowed
 
-    def _sphere_splits(self, sphere: Float64, coarseness: float) -> int:
-        radius = sphere[3]
-        nearest = max(float(self.distance(sphere[None, :3])[0]) - abs(radius), abs(radius) / 8)
-        allowed = min(coarseness * float(self._allowed_at(np.array([nearest]))[0]), coarseness * abs(radius))
-        return int(np.ceil(1.052 * abs(radius) / allowed))  # 1.052: edge of the icosahedron in its unit sphere
+    def _allowed_on(self, shape: RoundShape, coarseness: float) -> float:
+        nearest = max(shape.nearest(self.distance), abs(shape.radius) / 8)
+        return coarseness * min(float(self._allowed_at(np.array([nearest]))[0]), abs(shape.radius))
 
 
 def can_tessellate(built: BuiltScene) -> bool:
-    """Return whether every hidden shape is a mesh or a sphere, in front of a planar wall."""
+    """Return whether every hidden shape is a mesh, a sphere or a cylinder, in front of a planar wall."""
     return built.wall.is_planar and all(
-        shape.is_mesh() or shape.class_name() == "Sphere" for shape in built.hidden_shapes
+        shape.is_mesh() or shape.class_name() in ROUND_PLUGINS for shape in built.hidden_shapes
     )
-
-
-def _sphere_of(shape: mi.Shape) -> Float64:
-    """Return centre and signed radius (4,) of a sphere: negative when it is seen from within."""
-    box = shape.bbox()
-    low, high = np.ravel(np.asarray(box.min, dtype=np.float64)), np.ravel(np.asarray(box.max, dtype=np.float64))
-    sign = -1.0 if shape.has_flipped_normals() else 1.0
-    return np.append((low + high) / 2, sign * (high - low).max() / 2)
