@@ -6,7 +6,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
 # Exact versions that passed the test suite; pyproject.toml holds the ranges that are allowed.
 PINS := -c .constraints.txt
 
-.PHONY: help install render test test-slow lint format peers bench bench-peers clean
+.PHONY: help install render test test-slow stress lint format peers bench bench-peers clean
 .DEFAULT_GOAL := help
 
 help: ## Show this list.
@@ -33,10 +33,13 @@ render: install ## Render configs/z-letter.yaml to out/: an HDF5 capture and a p
 	@echo "picture: $$($(BIN)/nlosrender plot out/z-letter.hdf5)"
 
 test: $(VENV)/.dev ## Run the default test suite.
-	$(BIN)/python -m pytest -m 'not slow and not peers'
+	$(BIN)/python -m pytest -m 'not slow and not peers and not stress'
 
 test-slow: $(VENV)/.dev ## Run the tests that take longer.
 	$(BIN)/python -m pytest -m slow
+
+stress: $(VENV)/.dev ## Run the stress suite: laws under stress, fuzzed inputs; prints a table of both.
+	$(BIN)/python -m pytest tests/stress
 
 lint: $(VENV)/.dev ## Check style and types.
 	$(BIN)/ruff check .

@@ -46,10 +46,22 @@ class ConfigError(NlosError):
         super().__init__("\n".join(str(problem) for problem in self.problems))
 
 
+class OptionError(NlosError):
+    """An option of a command is impossible, by itself or for what it is used on."""
+
+    exit_code = EXIT_USAGE
+
+
 class FileError(NlosError):
     """A capture or mesh file cannot be read, written or understood."""
 
     exit_code = EXIT_BAD_INPUT
+
+
+class ComparisonError(NlosError):
+    """Two captures, or two datasets, differ by more than their tolerances allow."""
+
+    exit_code = EXIT_COMPARISON_EXCEEDED
 
 
 class BackendError(NlosError):
@@ -60,6 +72,12 @@ class BackendError(NlosError):
 
 class RenderError(NlosError):
     """The render itself failed: a non-finite result, not enough memory, a scene the renderer rejects."""
+
+
+class IncompleteRender(NlosError):
+    """The render failed half-way; what was finished is saved, and the same command goes on from there."""
+
+    exit_code = EXIT_INCOMPLETE
 
 
 class InterruptedRender(NlosError):

@@ -27,9 +27,10 @@ class Backend:
     @property
     def lanes(self) -> int:
         """Number of parallel lanes that keeps this backend busy."""
-        # 128 lanes keep two cores at full speed; more replicas than needed cost memory and slow the convergence
-        # of low-discrepancy numbers
-        return 2**17 if self.name == "cuda" else 64 * (os.cpu_count() or 1)
+        # 128 lanes keep two cores at full speed, 8 x 8 points with their two replicas eight vector units, and 32 x 32
+        # points any machine. Not the cores there are: the same capture is to be the same file on every machine. More
+        # replicas than needed cost memory and slow the convergence of low-discrepancy numbers.
+        return 2**17 if self.name == "cuda" else 128
 
 
 def cuda_available() -> bool:

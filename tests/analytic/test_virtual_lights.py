@@ -315,7 +315,7 @@ def test_rough_surfaces_agree_with_the_path_engine() -> None:
 @pytest.mark.parametrize("inside", [False, True])
 @pytest.mark.parametrize("scan", ["single", "confocal"])
 def test_a_cylinder_is_round(scan: str, inside: bool) -> None:
-    """A tilted cylinder without caps, before a plate, seen from outside or through its open ends: both engines agree."""
+    """A tilted cylinder without caps before a plate, seen from outside or through its ends: both engines agree."""
     scene = (PLATE | {"center": [0.15, -0.1, 0.9]}, TUBE | {"inside": inside})
     keys = {"bins": (0.6, 0.08, 80)}
     paths = render(flat_wall(*scene, scan=scan, spp=30000, **keys), replicas=32)

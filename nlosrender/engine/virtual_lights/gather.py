@@ -33,16 +33,15 @@ def gather_third_bounce(
     transport: Transport,
     lights: Lights,
     histogram: DeviceHistogram,
-    first: mi.UInt32,
-    stride: mi.UInt32,
+    slice_of_lane: mi.UInt32,
     jitter: mi.UInt32,
 ) -> None:
-    """Deposit the third bounce: lane by lane over the patches ``first``, ``first + stride``, ...
+    """Deposit the third bounce: lane by lane over the patches of its slice.
 
     Parameters
     ----------
-    first, stride
-        Per lane: several lanes may share the patches of one sensor point, each into rows of its own.
+    slice_of_lane
+        Several lanes may share the patches of one sensor point, each into rows of its own.
     jitter
         Per lane: start of the sequence that places the visibility ray within each patch. A ray to a random point
         makes a partly hidden patch count by its visible share, on average.
@@ -55,13 +54,28 @@ def gather_third_bounce(
     n_lasers, count = transport.n_lasers, lights.count
     own_laser = transport.lasers.gather(transport.first_laser)
 
+    end = dr.gather(mi.UInt32, lights.first, slice_of_lane + 1)
+    start_u, start_v = mi.UInt32(jitter), mi.UInt32(jitter * 0x9E3779B1)
+
     # ---- State ---------------------------------------------------------------------------------------------------
-    patch = mi.UInt32(first)
-    seq_u, seq_v = mi.UInt32(jitter), mi.UInt32(jitter * 0x9E3779B1)
+    patch = dr.gather(mi.UInt32, lights.first, slice_of_lane)
 
     while dr.hint(
-        patch < count,
-        exclude=[settings, transport, lights, histogram, built, sensors, sensor, wall_bsdf, own_laser],
+        patch < end,
+        exclude=[
+            end,
+            start_u,
+            start_v,
+            settings,
+            transport,
+            lights,
+            histogram,
+            built,
+            sensors,
+            sensor,
+            wall_bsdf,
+            own_laser,
+        ],
     ):
         # ---- The patch as the sensor point sees it -----------------------------------------------------------------
         rows = [dr.gather(mi.Vector4f, lights.packed, patch * 4 + k) for k in range(4)]
@@ -85,8 +99,8 @@ def gather_third_bounce(
 
         # ---- Visibility --------------------------------------------------------------------------------------------
         if dr.hint(settings.needs_visibility, mode="scalar"):
-            seq_u += steps[0]
-            seq_v += steps[1]
+            number = dr.gather(mi.UInt32, lights.numbers, patch)
+            seq_u, seq_v = start_u + number * steps[0], start_v + number * steps[1]
             point = point_inside([a, b, c], mi.Float(seq_u >> 8) * 2.0**-24, mi.Float(seq_v >> 8) * 2.0**-24)
             point += areas * rows[3].w
             if dr.hint(lights.has_clusters, mode="scalar"):
@@ -121,7 +135,7 @@ def gather_third_bounce(
                 seen = _SeenPatch(patch, weight, delays, is_cluster, direction, active)
                 _deposit(settings, lights, histogram, sensors, points, lane, laser, laser * count + patch, seen)
                 laser += 1
-        patch += stride
+        patch += 1
 
 
 @dataclass(frozen=True, eq=False)

@@ -55,6 +55,8 @@ class Lights:
     members: mi.Float  # four a patch: ``DevicePatches.members``
     has_clusters: bool
     count: mi.UInt32  # of lit patches, opaque
+    numbers: mi.UInt32  # of the patches before those in the dark were left out
+    first: mi.UInt32  # of slice k: its patches are first[k] to first[k + 1]
 
 
 def upload_patches(built: BuiltScene, patches: Patches) -> DevicePatches:
@@ -116,8 +118,23 @@ def normal_reflectance(interaction: mi.SurfaceInteraction3f) -> mi.Spectrum:
     return interaction.bsdf().eval(mi.BSDFContext(), interaction, up) * dr.pi
 
 
-def light_patches(settings: GatherSettings, transport: Transport, patches: DevicePatches, n_lasers: int) -> Lights:
-    """Return the patches that some laser of the batch lights; confocal captures keep all and light them as they go."""
+def light_patches(
+    settings: GatherSettings, transport: Transport, patches: DevicePatches, n_lasers: int, slices: int
+) -> Lights:
+    """Return the patches that some laser of the batch lights; confocal captures keep all and light them as they go.
+
+    Parameters
+    ----------
+    settings, transport
+        What the gather does and reads.
+    patches
+        All patches of a resolution.
+    n_lasers
+        Lasers of the batch.
+    slices
+        Lanes that share the patches of a sensor point. A patch's number decides its slice and its visibility rays,
+        so what one laser sends does not depend on the batch's other lasers, whose patches may be others.
+    """
     count = dr.width(patches.areas)
     lit = dr.arange(mi.UInt32, count)
     arriving, delays = mi.Spectrum(0), mi.Float(0)
@@ -126,6 +143,8 @@ def light_patches(settings: GatherSettings, transport: Transport, patches: Devic
         lit = dr.compress(brightest > 0)
         if not dr.width(lit):
             lit = mi.UInt32(0)  # all is dark: one dark patch, since arrays of no length cannot be read
+    lit, first = _by_slice(lit, slices)
+    if not settings.is_confocal:
         index = dr.arange(mi.UInt32, dr.width(lit) * n_lasers)
         laser, patch = index // dr.width(lit), dr.gather(mi.UInt32, lit, index % dr.width(lit))
         arriving = dr.gather(mi.Spectrum, arriving, laser * count + patch)
@@ -156,7 +175,17 @@ def light_patches(settings: GatherSettings, transport: Transport, patches: Devic
         members,
         patches.has_clusters,
         dr.opaque(mi.UInt32, dr.width(lit)),
+        lit,
+        first,
     )
+
+
+def _by_slice(numbers: mi.UInt32, slices: int) -> tuple[mi.UInt32, mi.UInt32]:
+    """Sort patches by slice, within it by number; return them and where each slice begins."""
+    patch = np.array(numbers.numpy())
+    order = np.lexsort((patch, patch % slices))
+    first = np.searchsorted((patch % slices)[order], np.arange(slices + 1))
+    return mi.UInt32(patch[order]), mi.UInt32(first.astype(np.uint32))
 
 
 def _illuminate(

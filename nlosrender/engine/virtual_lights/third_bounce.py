@@ -72,10 +72,9 @@ class ThirdBounce:
             return Gathered(np.zeros(to_memory_order(np.zeros(shape.axes), shape).shape), 1)
         transport, slice_of_lane, jitter = self._transport(batch, shape)
         on_device = upload_patches(self.paths.built, patches)
-        lights = light_patches(self.settings, transport, on_device, shape.lasers)
+        lights = light_patches(self.settings, transport, on_device, shape.lasers, shape.replicas)
         histogram = DeviceHistogram(shape)
-        stride = dr.opaque(mi.UInt32, shape.replicas)
-        gather_third_bounce(self.settings, transport, lights, histogram, slice_of_lane, stride, jitter)
+        gather_third_bounce(self.settings, transport, lights, histogram, slice_of_lane, jitter)
         values = histogram.sums.numpy().reshape(shape.replicas, -1).sum(axis=0)
         return Gathered(to_memory_order(values, shape), len(patches))
 
@@ -84,7 +83,7 @@ class ThirdBounce:
         shape = self.shape(batch)
         transport, _, _ = self._transport(batch, shape)
         on_device = upload_patches(self.paths.built, self.tessellator.patches(coarseness))
-        surface = light_patches(self.settings, transport, on_device, shape.lasers).interaction
+        surface = light_patches(self.settings, transport, on_device, shape.lasers, shape.replicas).interaction
         return LitPatches(np.array(surface.p, np.float64).T, np.array(surface.n, np.float64).T)
 
     def pair(self, batch: Batch | Pilot, fineness: float) -> tuple[Gathered, Gathered]:
