@@ -11,7 +11,16 @@ from typing import Annotated
 import typer
 
 from nlosrender import __version__
-from nlosrender.cli import bench_command, config_commands, file_commands, machine_commands, plan_command, render_command
+from nlosrender.cli import (
+    bench_command,
+    config_commands,
+    export_command,
+    file_commands,
+    machine_commands,
+    plan_command,
+    reconstruct_command,
+    render_command,
+)
 from nlosrender.errors import EXIT_INTERRUPTED, NlosError
 
 app = typer.Typer(
@@ -26,6 +35,8 @@ render_command.register(app)
 plan_command.register(app)
 config_commands.register(app)
 file_commands.register(app)
+reconstruct_command.register(app)
+export_command.register(app)
 machine_commands.register(app)
 bench_command.register(app)
 

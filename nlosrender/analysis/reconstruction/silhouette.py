@@ -1,0 +1,138 @@
+"""The true front view of a hidden scene, from the configuration that a capture file carries; without a renderer."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from nlosrender.analysis.reconstruction.voxel_grid import VoxelGrid
+from nlosrender.config.load import parse_config
+from nlosrender.errors import ConfigError, FileError
+from nlosrender.files.layout import Float64
+from nlosrender.scene.hidden_geometry import MeshFile, Surface, hidden_surfaces
+from nlosrender.scene.mesh_file import read_mesh
+from nlosrender.scene.relay_wall import relay_wall_from_config
+from nlosrender.scene.triangle_mesh import TriangleMesh
+
+if TYPE_CHECKING:
+    from shapely.geometry.base import BaseGeometry
+
+UP = np.array([0.0, 0.0, 1.0])
+ROUND = 64  # corners of what stands in for a circle
+SUBPIXELS = 4  # per voxel edge, for the share of a front pixel that is covered
+
+
+def true_silhouette(source: Path, attributes: Mapping[str, object], grid: VoxelGrid) -> Float64:
+    """Return the share of each front pixel (y, x) that hidden geometry within the volume's depth covers.
+
+    Parameters
+    ----------
+    source
+        The capture file, for messages.
+    attributes
+        Of the capture file; ``config`` has the scene.
+    grid
+        Voxels of the reconstruction.
+
+    Raises
+    ------
+    FileError
+        The file has no configuration, it cannot be read, or a shape's outline is not known without a renderer.
+    """
+    import shapely
+
+    shapes = [outline(surface, grid) for surface in _surfaces(source, attributes)]
+    covered = shapely.union_all([shape for shape in shapes if not shape.is_empty])
+    shapely.prepare(covered)
+    offsets = ((np.arange(SUBPIXELS) + 0.5) / SUBPIXELS - 0.5) * grid.voxel_size
+    x, y = (np.add.outer(axis, offsets).ravel() for axis in (grid.x, grid.y))
+    inside = shapely.contains_xy(covered, x[None, :], y[:, None])
+    return inside.reshape(len(grid.y), SUBPIXELS, len(grid.x), SUBPIXELS).mean(axis=(1, 3))
+
+
+def outline(surface: Surface, grid: VoxelGrid) -> BaseGeometry:
+    """Return the projection along z of what lies in the volume's depth, as a shapely polygon.
+
+    Raises
+    ------
+    FileError
+        The surface is a mesh file that cannot be read, or a plugin whose shape is not known here.
+    """
+    import shapely
+
+    low, high = grid.z[0] - grid.voxel_size / 2, grid.z[-1] + grid.voxel_size / 2
+    shape = _read(surface, surface.shape) if isinstance(surface.shape, MeshFile) else surface.shape
+    if isinstance(shape, TriangleMesh):
+        corners = shape.vertices[shape.faces]  # (face, corner, 3)
+        depth = corners[..., 2].mean(axis=1)
+        flat = corners[(depth >= low) & (depth <= high), :, :2]
+        triangles = shapely.polygons(flat)
+        # seen edge on they have no area, and unions do not like them
+        return shapely.union_all(triangles[shapely.area(triangles) > 1e-12])
+    points = _round_points(shape.description)
+    if points is None:
+        raise FileError(
+            f"{surface.key} ({surface.name}): the silhouette of a Mitsuba {shape.description.get('type')!r} is not "
+            "known here, so there is nothing to score against. Leave --score away."
+        )
+    depth = float(points[:, 2].mean())
+    hull = shapely.convex_hull(shapely.multipoints(points[:, :2]))
+    return hull if low <= depth <= high else shapely.Polygon()
+
+
+def _read(surface: Surface, file: MeshFile) -> TriangleMesh:
+    try:
+        mesh = read_mesh(file.filename, Path(file.filename).suffix.lower().lstrip("."), face_normals=True)
+        return mesh.transformed(file.to_local)
+    except ValueError as error:
+        raise FileError(f"{surface.key}.filename: {file.filename}: {error}. Leave --score away.") from error
+
+
+def _surfaces(source: Path, attributes: Mapping[str, object]) -> tuple[Surface, ...]:
+    text = attributes.get("config")
+    if not isinstance(text, str):
+        raise FileError(f"{source}: does not carry the scene's configuration, so there is nothing to score against")
+    try:
+        config = parse_config(text, str(source), source.absolute().parent)
+        wall = relay_wall_from_config(config.scene.relay_wall)
+        return hidden_surfaces(config.scene.hidden_geometry, wall)
+    except (ConfigError, ValueError) as error:
+        raise FileError(f"{source}: the configuration it carries cannot be used: {error}") from error
+
+
+def _round_points(description: Mapping[str, object]) -> Float64 | None:
+    """Return points (n, 3) whose projections have the shape's as their convex hull; None for unknown shapes."""
+    angles = np.linspace(0, 2 * np.pi, ROUND, endpoint=False)
+    circle = np.stack([np.cos(angles), np.sin(angles), np.zeros(ROUND)], axis=-1)
+    square = np.array([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
+    kind, to_world = description.get("type"), np.asarray(description.get("to_world", np.eye(4)), dtype=np.float64)
+    if kind == "sphere":
+        latitudes = np.linspace(-np.pi / 2, np.pi / 2, ROUND // 2 + 1)[:, None, None]
+        ball = circle * np.cos(latitudes) + UP * np.sin(latitudes)
+        center = np.asarray(description.get("center", [0.0, 0, 0]), dtype=np.float64)
+        points = center + float(np.asarray(description.get("radius", 1.0))) * ball.reshape(-1, 3)
+    elif kind == "cylinder":
+        points = _cylinder(description, circle)
+    elif kind in ("rectangle", "disk", "cube"):
+        points = circle if kind == "disk" else square
+        if kind == "cube":
+            points = np.concatenate([square - UP, square + UP])
+    else:
+        return None
+    return points @ to_world[:3, :3].T + to_world[:3, 3]
+
+
+def _cylinder(description: Mapping[str, object], circle: Float64) -> Float64:
+    ends = [
+        np.asarray(description.get(key, place), dtype=np.float64)
+        for key, place in (("p0", [0, 0, 0]), ("p1", [0, 0, 1]))
+    ]
+    axis = (ends[1] - ends[0]) / np.linalg.norm(ends[1] - ends[0])
+    across = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
+    across /= np.linalg.norm(across)
+    radius = float(np.asarray(description.get("radius", 1.0)))
+    ring = radius * (circle[:, :1] * across + circle[:, 1:2] * np.cross(axis, across))
+    return np.concatenate([end + ring for end in ends])

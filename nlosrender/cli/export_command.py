@@ -1,0 +1,52 @@
+"""``nlosrender export``: captures for other programs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from nlosrender.cli.file_commands import CaptureFile
+
+
+def register(app: typer.Typer) -> None:
+    """Add ``export`` to ``app``."""
+    app.command()(export)
+
+
+def export(
+    file: CaptureFile,
+    file_format: Annotated[
+        str,
+        typer.Option(
+            "--format", metavar="NAME", help="tal (y-tal), fk (f-k migration), lct, or phasor_mat (diffraction)."
+        ),
+    ],
+    output: Annotated[
+        Path | None,
+        typer.Option("-o", "--output", metavar="OUT", help="File to write.", show_default="FILE-FORMAT.hdf5 or .mat"),
+    ] = None,
+    bounces: Annotated[str, typer.Option(metavar="3|all", help="Light to export; bounces are summed.")] = "all",
+    as_json: Annotated[bool, typer.Option("--json", help="Print the report as one JSON object.")] = False,
+) -> None:
+    """Write a capture in the format of another program; what that cannot hold is refused or reported.
+
+    Example: `nlosrender export scan.hdf5 --format fk --bounces 3` creates scan-fk.mat with `meas` and `tofgrid`, the
+    third bounce of a confocal capture for f-k migration.
+    """
+    import json
+
+    from nlosrender.errors import OptionError
+    from nlosrender.files.exports import SUFFIXES, export_capture
+
+    if bounces not in ("3", "all"):
+        raise OptionError(f"--bounces: got {bounces!r}, need 3 or all")
+    target = output or file.with_name(f"{file.stem}-{file_format}{SUFFIXES.get(file_format, '')}")
+    report = export_capture(file, target, file_format, bounces)
+    if as_json:
+        typer.echo(json.dumps({"written": str(report.path), "losses": report.losses}))
+        return
+    typer.echo(f"wrote {report.path}")
+    for loss in report.losses:
+        typer.echo(f"note: {loss}", err=True)
