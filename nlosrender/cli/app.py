@@ -13,6 +13,7 @@ import typer
 from nlosrender import __version__
 from nlosrender.cli import (
     bench_command,
+    compare_command,
     config_commands,
     export_command,
     file_commands,
@@ -38,6 +39,7 @@ file_commands.register(app)
 reconstruct_command.register(app)
 export_command.register(app)
 machine_commands.register(app)
+compare_command.register(app)
 bench_command.register(app)
 
 

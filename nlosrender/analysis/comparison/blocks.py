@@ -1,0 +1,187 @@
+"""The samples of two captures side by side, a bounded block at a time; what neither file stores is skipped."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from math import prod
+from pathlib import Path
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from nlosrender.errors import FileError
+from nlosrender.files import layout
+from nlosrender.files.reader import StoredCapture, explained_read, open_hdf5
+from nlosrender.files.stored_header import samples_of
+
+Float32 = NDArray[np.float32]
+BLOCK_SAMPLES = 2**21  # of one dataset at a time: 8 MiB as read, and about 20 times that in intermediate results
+LARGEST_CHUNK = 8  # blocks; larger ones, by other writers, are unpacked more than once
+MAX_POINTS = 2**24  # of one grid; 4096 x 4096 is beyond any scan
+MAX_PER_POINT = 2**26  # samples of one sensor point and laser: 11 million bins of six bounces
+LASER = 3  # where the laser axes begin among those after channel and bin
+
+
+@dataclass(frozen=True, eq=False)
+class Block:
+    """The same part of two captures: one laser, a tile of sensor points, the bounces that either file stores there.
+
+    Samples and variances have the axes (channel, bounce, sensor_y, sensor_x, bin).
+    """
+
+    laser: tuple[int, int]
+    rows: slice
+    columns: slice
+    bounces: tuple[int, ...]  # indices on the file's bounce axis
+    a: Float32
+    b: Float32
+    variance_a: Float32 | None  # None: not asked for, or not in the file
+    variance_b: Float32 | None
+
+
+class OpenCapture:
+    """A capture file and which of its chunks were ever written.
+
+    Raises
+    ------
+    FileError
+        The file is damaged, or claims grids that no capture has.
+    """
+
+    def __init__(self, file: h5py.File, path: Path):
+        self.capture = StoredCapture(file, path)
+        self.path, self.header = path, self.capture.header
+        sizes = self.header.sizes
+        grids_fit = max(prod(self.header.sensor_grid), prod(self.header.laser_grid)) <= MAX_POINTS
+        if not grids_fit or sizes["channel"] * sizes["bounce"] * sizes["bin"] > MAX_PER_POINT:
+            raise FileError(
+                f"{path}: data has shape {self.header.data_shape}, more than a comparison takes. "
+                "Check the file with `nlosrender info`."
+            )
+        samples = samples_of(file, path)
+        self._chunks = samples.chunks
+        self._written = set() if self._chunks is None else _written_chunks(samples)
+        self._lasers = {chunk[LASER:] for chunk in self._written}
+
+    @property
+    def tile(self) -> tuple[int, int]:
+        """Rows and columns of sensor points in one chunk; the whole grid for a file without chunks."""
+        return self.header.sensor_grid if self._chunks is None else (self._chunks[3], self._chunks[4])
+
+    def stores_laser(self, laser: tuple[int, int]) -> bool:
+        """Return whether any sample of a laser may differ from zero, without reading it."""
+        return self._chunks is None or self._laser_chunk(laser) in self._lasers
+
+    def stores(self, bounce: int, laser: tuple[int, int], rows: slice, columns: slice) -> bool:
+        """Return whether any sample of the part may differ from zero, without reading it."""
+        if self._chunks is None:
+            return True
+        _, _, per_bounce, height, width, *_ = self._chunks
+        at = self._laser_chunk(laser)
+        return any(
+            (bounce // per_bounce, y, x, *at) in self._written
+            for y in range(rows.start // height, -(-rows.stop // height))
+            for x in range(columns.start // width, -(-columns.stop // width))
+        )
+
+    def _laser_chunk(self, laser: tuple[int, int]) -> tuple[int, ...]:
+        per_laser = (self._chunks or ())[2 + LASER :]  # none in a confocal capture
+        return tuple(index // step for index, step in zip(laser, per_laser, strict=False))
+
+    def read(
+        self, dataset: str, bounces: tuple[int, ...], laser: tuple[int, int], rows: slice, columns: slice
+    ) -> Float32:
+        """Return samples (channel, bounce, sensor_y, sensor_x, bin) of one laser.
+
+        Raises
+        ------
+        FileError
+            The file is damaged, or holds a sample that is not finite or a negative variance.
+        """
+        block = self.capture.read_block(laser, (rows, columns), bounces, dataset)[:, :, 0, 0]
+        if not np.isfinite(block).all():
+            raise FileError(
+                f"{self.capture.path}: {dataset} holds a value that is not finite (laser {laser[0]}, {laser[1]}); "
+                "`nlosrender info --check` tells where. Render it again."
+            )
+        if dataset == layout.VARIANCE and (block < 0).any():
+            raise FileError(
+                f"{self.capture.path}: variance is negative (laser {laser[0]}, {laser[1]}). Render it again."
+            )
+        return block
+
+
+@contextmanager
+def open_for_comparison(path: Path) -> Iterator[OpenCapture]:
+    """Open a capture for :func:`blocks`.
+
+    Raises
+    ------
+    FileError
+        The file is missing, damaged or not a capture.
+    """
+    with open_hdf5(path) as file:
+        with explained_read(path):
+            capture = OpenCapture(file, path)
+        yield capture
+
+
+def blocks(a: OpenCapture, b: OpenCapture, with_variance: bool) -> Iterator[Block]:
+    """Yield all parts of two captures of the same structure that either of them stores, laser after laser.
+
+    Raises
+    ------
+    FileError
+        A file is damaged.
+    """
+    lasers = (1, 1) if a.header.confocal else a.header.laser_grid
+    read_variance = [with_variance and capture.header.has_variance for capture in (a, b)]
+    for row, column in np.ndindex(*lasers):
+        laser = (row, column)
+        if not (a.stores_laser(laser) or b.stores_laser(laser)):
+            continue
+        for rows, columns in _tiles(a):
+            stored = tuple(
+                bounce
+                for bounce in range(a.header.sizes["bounce"])
+                if a.stores(bounce, laser, rows, columns) or b.stores(bounce, laser, rows, columns)
+            )
+            if not stored:
+                continue
+            samples = [capture.read(layout.DATA, stored, laser, rows, columns) for capture in (a, b)]
+            variances = [
+                capture.read(layout.VARIANCE, stored, laser, rows, columns) if wanted else None
+                for capture, wanted in zip((a, b), read_variance, strict=True)
+            ]
+            yield Block(laser, rows, columns, stored, *samples, *variances)
+
+
+def _tiles(capture: OpenCapture) -> Iterator[tuple[slice, slice]]:
+    """Cut the sensor grid into tiles of about ``BLOCK_SAMPLES``, whole chunks unless these are far larger."""
+    header = capture.header
+    n_rows, n_columns = header.sensor_grid
+    points = max(BLOCK_SAMPLES // (header.sizes["channel"] * len(header.bounce_indices) * header.n_bins), 1)
+    height, width = capture.tile
+    if height * width > LARGEST_CHUNK * points:
+        height, width = 1, 1
+    chunks = max(points // (height * width), 1)
+    across = min(chunks, -(-n_columns // width))
+    rows, columns = height * (chunks // across), width * across
+    for y in range(0, n_rows, rows):
+        for x in range(0, n_columns, columns):
+            yield slice(y, min(y + rows, n_rows)), slice(x, min(x + columns, n_columns))
+
+
+def _written_chunks(samples: h5py.Dataset) -> set[tuple[int, ...]]:
+    """Return where, on the axes after channel and bin, a chunk was written: numbers of chunks, not of samples."""
+    written: set[tuple[int, ...]] = set()
+
+    def note(chunk: h5py.h5d.StoreInfo) -> None:
+        position = (at // step for at, step in zip(chunk.chunk_offset, samples.chunks, strict=True))
+        written.add(tuple(position)[2:])
+
+    samples.id.chunk_iter(note)
+    return written

@@ -1,0 +1,157 @@
+"""``compare_captures``: two files in, one verdict out, whatever their size."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from nlosrender.analysis.comparison.blocks import OpenCapture, blocks, open_for_comparison
+from nlosrender.analysis.comparison.differences import Differences
+from nlosrender.analysis.comparison.shift import TimeShift
+from nlosrender.analysis.comparison.structure import StructureDifference, structure_differences
+from nlosrender.analysis.comparison.z_test import ZTest
+from nlosrender.capture.bounces import BounceAxis
+from nlosrender.errors import FileError
+from nlosrender.files.stored_header import StoredHeader
+
+SAME = 1e-6  # relative L2: float32 leaves 6e-8 per sample
+SIGNIFICANCE = 0.01
+
+
+@dataclass(frozen=True)
+class Tolerances:
+    """What may differ, and by how much; None: anything goes.
+
+    Without any of them the samples have to be equal up to rounding (relative L2 at most 1e-6).
+
+    Raises
+    ------
+    ValueError
+        A tolerance is negative, or the significance not between 0 and 1.
+    """
+
+    max_rel_l2: float | None = None  # relative L2 of the difference over everything
+    max_energy: float | None = None  # relative difference of the energy, of every bounce and in total
+    max_shift: float | None = None  # bins, of every laser point and in total
+    significance: float | None = None  # of the Z-test: chance of an alarm where both show the same
+
+    def __post_init__(self) -> None:
+        for name in ("max_rel_l2", "max_energy", "max_shift"):
+            value = getattr(self, name)
+            if value is not None and not value >= 0:
+                raise ValueError(f"{name}: got {value}, need a number >= 0")
+        if self.significance is not None and not 0 < self.significance < 1:
+            raise ValueError(f"significance: got {self.significance}, need a number between 0 and 1")
+        if all(value is None for value in vars(self).values()):
+            object.__setattr__(self, "max_rel_l2", SAME)
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One number that was held against a tolerance."""
+
+    quantity: str  # in words, such as "energy of bounce 3"
+    value: float  # inf: something against nothing
+    limit: float
+    unit: str = ""
+
+    @property
+    def exceeds(self) -> bool:
+        """Whether the number is beyond its tolerance."""
+        return not abs(self.value) <= self.limit
+
+    def __str__(self) -> str:
+        return f"{self.quantity}: {self.value:.4g}{self.unit}, tolerance {self.limit:.4g}{self.unit}"
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """What came out of a comparison. When the structure differs, no sample has been looked at."""
+
+    path: Path
+    reference: Path
+    structure: tuple[StructureDifference, ...]
+    header: StoredHeader  # of the reference
+    differences: Differences
+    shift: TimeShift
+    test: ZTest | None
+    findings: tuple[Finding, ...]
+
+    @property
+    def failures(self) -> tuple[str, ...]:
+        """Everything that is beyond its tolerance, in words."""
+        exceeding = (str(finding) for finding in self.findings if finding.exceeds)
+        return (*(str(difference) for difference in self.structure), *exceeding)
+
+    def bounce_name(self, bounce: int) -> str:
+        """Return what an index of the bounce axis holds: a bounce number, "7 and above" or "all"."""
+        return bounce_name(self.header, bounce)
+
+
+def bounce_name(header: StoredHeader, bounce: int) -> str:
+    """Return what an index of a file's bounce axis holds: a bounce number, "7 and above" or "all"."""
+    limit = header.attributes.get("max_bounces")
+    highest = limit if isinstance(limit, int) else None
+    return BounceAxis(highest, header.split_bounces is not False).name(bounce)
+
+
+def compare_captures(path: str | Path, reference: str | Path, tolerances: Tolerances) -> Comparison:
+    """Compare a capture with a reference, a block of samples at a time.
+
+    Raises
+    ------
+    FileError
+        One of them is missing, damaged or not a capture, or the Z-test finds no variance in either.
+    """
+    with open_for_comparison(Path(path)) as a, open_for_comparison(Path(reference)) as b:
+        structure = structure_differences(a.capture, b.capture)
+        differences, shift = Differences(b.header), TimeShift(b.header)
+        test, findings = None, ()  # type: ZTest | None, tuple[Finding, ...]
+        if not structure:
+            test = None if tolerances.significance is None else _z_test(a, b, tolerances.significance)
+            _look_at_samples(a, b, differences, shift, test)
+            findings = tuple(_findings(b.header, differences, shift, test, tolerances))
+        return Comparison(a.path, b.path, structure, b.header, differences, shift, test, findings)
+
+
+def _look_at_samples(
+    a: OpenCapture, b: OpenCapture, differences: Differences, shift: TimeShift, test: ZTest | None
+) -> None:
+    for block in blocks(a, b, with_variance=test is not None):
+        differences.add(block)
+        shift.add(block)
+        if test is not None:
+            test.add(block)
+    if test is not None:
+        test.finish()
+
+
+def _z_test(a: OpenCapture, b: OpenCapture, significance: float) -> ZTest:
+    if not (a.header.has_variance or b.header.has_variance):
+        raise FileError(
+            f"{a.path}: neither it nor {b.path} has a dataset variance, which the Z-test needs. "
+            "Render with output.variance: true (the default)."
+        )
+    return ZTest(a.header, b.header, significance)
+
+
+def _findings(
+    header: StoredHeader, differences: Differences, shift: TimeShift, test: ZTest | None, tolerances: Tolerances
+) -> Iterator[Finding]:
+    """Hold every number that has a tolerance against it."""
+    if tolerances.max_rel_l2 is not None:
+        yield Finding("relative L2", differences.relative_l2, tolerances.max_rel_l2)
+    if tolerances.max_energy is not None:
+        for bounce in differences.lit_bounces:
+            energy = differences.relative_energy_of(bounce)
+            yield Finding(f"energy of bounce {bounce_name(header, bounce)}", energy, tolerances.max_energy)
+        yield Finding("energy", differences.relative_energy, tolerances.max_energy)
+    if tolerances.max_shift is not None:
+        worst = shift.worst()
+        if worst is not None:
+            name = f"shift of laser ({worst[1][0]}, {worst[1][1]})"
+            yield Finding(name, worst[0], tolerances.max_shift, " bins")
+        yield Finding("shift", shift.whole() or 0.0, tolerances.max_shift, " bins")
+    if test is not None:
+        yield Finding("largest deviation", test.z, test.limit, " sigma")

@@ -1,0 +1,153 @@
+"""``nlosrender compare`` and ``nlosrender check``: has anything changed?"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+if TYPE_CHECKING:
+    from nlosrender.analysis.comparison.captures import Tolerances
+    from nlosrender.analysis.comparison.dataset import CheckedFile
+
+MaxRelL2 = Annotated[
+    float | None,
+    typer.Option(
+        "--max-rel-l2",
+        metavar="X",
+        min=0,
+        help="Largest relative L2 of the difference, such as 0.01.",
+        show_default=False,
+    ),
+]
+MaxEnergy = Annotated[
+    float | None,
+    typer.Option(
+        metavar="X",
+        min=0,
+        help="Largest relative difference of the energy, in total and of every bounce.",
+        show_default=False,
+    ),
+]
+MaxShift = Annotated[
+    float | None,
+    typer.Option(
+        metavar="BINS",
+        min=0,
+        help="Largest shift in time, in total and of every laser point, such as 0.1.",
+        show_default=False,
+    ),
+]
+ZTestWanted = Annotated[
+    bool,
+    typer.Option("--z-test", help="Allow what noise explains, by the stored variances (of one file or of both)."),
+]
+Significance = Annotated[
+    float,
+    typer.Option(metavar="P", help="Chance that the Z-test raises an alarm where both files show the same."),
+]
+AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
+
+EXIT_CODES = (
+    "Exit code 0: within all tolerances; 4: beyond one, or made of other grids, bins, frame; 3: a file that is "
+    "damaged or no capture."
+)
+
+
+def register(app: typer.Typer) -> None:
+    """Add this module's commands to ``app``."""
+    app.command(
+        "compare",
+        epilog=f"{EXIT_CODES}\n\nExample: nlosrender compare new.hdf5 old.hdf5 --max-rel-l2 0.02 --max-shift 0.1   "
+        "(creates nothing; prints what differs and where most)",
+    )(compare)
+    app.command(
+        "check",
+        epilog=f"{EXIT_CODES} A file missing from DATASET_DIR fails the check, one missing from the reference does "
+        "not.\n\nExample: nlosrender check out/ --reference tests/reference/ --z-test   "
+        "(creates nothing; prints one line per capture)",
+    )(check)
+
+
+def compare(
+    capture: Annotated[Path, typer.Argument(metavar="A", help="Capture to judge.")],
+    reference: Annotated[Path, typer.Argument(metavar="B", help="Capture to judge it by.")],
+    max_rel_l2: MaxRelL2 = None,
+    max_energy: MaxEnergy = None,
+    max_shift: MaxShift = None,
+    z_test: ZTestWanted = False,
+    significance: Significance = 0.01,
+    as_json: AsJson = False,
+) -> None:
+    """Compare two captures; fail when they differ by more than the tolerances allow.
+
+    Without any tolerance they have to be equal up to rounding (relative L2 at most 1e-6), as two renders with the
+    same seed, version and machine are. Relative numbers are relative to B.
+    """
+    import json
+
+    from nlosrender.analysis.comparison.captures import compare_captures
+    from nlosrender.analysis.comparison.report import comparison_report
+    from nlosrender.cli.comparison_table import comparison_table
+    from nlosrender.errors import ComparisonError
+
+    tolerances = _tolerances(max_rel_l2, max_energy, max_shift, z_test, significance)
+    comparison = compare_captures(capture, reference, tolerances)
+    report = comparison_report(comparison)
+    typer.echo(json.dumps(report, allow_nan=False) if as_json else comparison_table(report))
+    if comparison.failures:
+        listed = "\n".join(f"{capture}: {failure}" for failure in comparison.failures)
+        raise ComparisonError(listed)
+
+
+def check(
+    folder: Annotated[Path, typer.Argument(metavar="DATASET_DIR", help="Folder with the captures to judge.")],
+    reference: Annotated[
+        Path,
+        typer.Option("--reference", metavar="DIR", help="Folder with captures of the same names to judge them by."),
+    ],
+    max_rel_l2: MaxRelL2 = None,
+    max_energy: MaxEnergy = None,
+    max_shift: MaxShift = None,
+    z_test: ZTestWanted = False,
+    significance: Significance = 0.01,
+    as_json: AsJson = False,
+) -> None:
+    """Compare every capture of a reference folder with its namesake, as `nlosrender compare` does."""
+    import json
+    from dataclasses import asdict
+
+    from nlosrender.analysis.comparison.dataset import check_dataset
+    from nlosrender.cli.comparison_table import check_line
+    from nlosrender.errors import ComparisonError, FileError
+
+    def say(file: CheckedFile) -> None:
+        if not as_json:
+            typer.echo(check_line(file))
+
+    found = check_dataset(folder, reference, _tolerances(max_rel_l2, max_energy, max_shift, z_test, significance), say)
+    failed = [file for file in found.files if file.status != "ok"]
+    if as_json:
+        files = [asdict(file) for file in found.files]
+        typer.echo(json.dumps({"agrees": not failed, "files": files, "extra": found.extra}, allow_nan=False))
+    else:
+        for name in found.extra:
+            typer.echo(f"extra       {name}: not in the reference")
+        typer.echo(f"{len(found.files) - len(failed)} of {len(found.files)} captures agree with {reference}")
+    if failed:
+        listed = "\n".join(f"{file.name}: {file.message}" for file in failed)
+        raise (FileError if found.with_status("unreadable") else ComparisonError)(listed)
+
+
+def _tolerances(
+    max_rel_l2: float | None, max_energy: float | None, max_shift: float | None, z_test: bool, significance: float
+) -> Tolerances:
+    from nlosrender.analysis.comparison.captures import Tolerances
+
+    try:
+        # the significance is checked even where it is not used: a typing error in it is one all the same
+        Tolerances(significance=significance)
+        return Tolerances(max_rel_l2, max_energy, max_shift, significance if z_test else None)
+    except ValueError as error:
+        raise typer.BadParameter(str(error)) from error
