@@ -1,16 +1,14 @@
 """THE MAP: a capture from its configuration to its file, as one list of stages. Read this first.
 
-Stages: configuration -> scene -> capture and plan -> engine -> file. Mitsuba and Dr.Jit are imported only when a
-render starts, after the backend has been chosen.
+Stages: configuration -> scene -> capture and plan -> engine -> file, the last two unit after unit (``rendering/``).
+Mitsuba and Dr.Jit are imported only when a render starts, after the backend has been chosen.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass, field
-from functools import partial
+from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -18,7 +16,8 @@ from nlosrender.analysis.forecast import Forecast, forecast_file, forecast_rende
 from nlosrender.capture.bounces import BounceAxis
 from nlosrender.capture.grids import Capture, build_capture
 from nlosrender.capture.limits import refuse_impossible_grids, refuse_impossible_samples
-from nlosrender.capture.plan import Plan, plan_capture
+from nlosrender.capture.part import WHOLE, Selection
+from nlosrender.capture.plan import Plan, plan_capture, remaining_units, replicas_for
 from nlosrender.capture.time_axis import TimeAxis, resolve_time_axis
 from nlosrender.config.document import Config
 from nlosrender.config.load import config_hash, config_to_dict
@@ -26,84 +25,34 @@ from nlosrender.config.warnings import config_warnings
 from nlosrender.engine.backend import Backend, batch_memory, physical_memory, start_backend
 from nlosrender.errors import ConfigError, Problem
 from nlosrender.files.capture_file import CaptureHeader
-from nlosrender.files.provenance import provenance_attributes, result_attributes
+from nlosrender.files.chunks import sensor_tile
+from nlosrender.files.identity import capture_identity, identity_attributes
+from nlosrender.files.interruption import uninterrupted
+from nlosrender.files.part_attributes import part_attributes, summed_attributes
+from nlosrender.files.partial_capture import PartialCapture
+from nlosrender.files.provenance import provenance_attributes
 from nlosrender.files.replacement import check_writable
 from nlosrender.files.size import disk_warnings
-from nlosrender.files.writer import CaptureWriter
+from nlosrender.rendering.local import render_units, resumable
+from nlosrender.rendering.report import Progress, RenderReport, Stopwatch, Warn, Warnings
 from nlosrender.scene.hidden_geometry import Surface, hidden_surfaces
 from nlosrender.scene.relay_wall import RelayWall, relay_wall_from_config
 
 if TYPE_CHECKING:
-    from nlosrender.engine.path_engine import PathEngine
-    from nlosrender.engine.virtual_lights.engine import VirtualLightEngine
+    from nlosrender.engine.path_engine import Budget
+    from nlosrender.rendering.units import Engine
     from nlosrender.scene.build import BuiltScene
-
-    Engine = PathEngine | VirtualLightEngine
-
-Progress = Callable[[float], None]  # told the share of the work that is done, in [0, 1]
-Warn = Callable[[str], None]  # told one warning
-
-
-@dataclass
-class Stopwatch:
-    """Seconds spent per stage."""
-
-    seconds: dict[str, float] = field(
-        default_factory=lambda: dict.fromkeys(("scene", "compile", "render", "write"), 0.0)
-    )
-    begun: float = field(default_factory=time.perf_counter)
-
-    @contextmanager
-    def stage(self, name: str) -> Iterator[None]:
-        """Add the time spent inside to stage ``name``."""
-        start = time.perf_counter()
-        try:
-            yield
-        finally:
-            self.seconds[name] += time.perf_counter() - start
-
-    def report(self) -> dict[str, float]:
-        """Return seconds per stage and ``total`` since the stopwatch was made."""
-        return self.seconds | {"total": time.perf_counter() - self.begun}
-
-
-@dataclass(frozen=True)
-class RenderReport:
-    """What a finished render has to say for itself."""
-
-    output: Path
-    engine: str
-    reason: str  # why this engine
-    variant: str  # Mitsuba variant
-    samples: int  # paths per sensor point, the least of all batches
-    error_estimate: float  # relative L2 error of H over the whole capture
-    energy: dict[str, float]  # H summed over the capture, per bounce [J m^-2 sr^-1]
-    out_of_window: float  # the same outside the time window
-    n_bins: int
-    n_triangles: int
-    seconds: dict[str, float]
-    warnings: tuple[str, ...]
-
-
-@dataclass(frozen=True)
-class Warnings:
-    """Warnings, each said once."""
-
-    warn: Warn
-    said: dict[str, None] = field(default_factory=dict)  # in the order they were said
-
-    def say(self, texts: Iterable[str]) -> None:
-        """Pass on those that are new."""
-        for text in texts:
-            if text not in self.said:
-                self.said[text] = None
-                self.warn(text)
 
 
 def render_capture(
-    config: Config, progress: Progress = lambda fraction: None, warn: Warn = lambda text: None
+    config: Config,
+    progress: Progress = lambda fraction: None,
+    warn: Warn = lambda text: None,
+    *,
+    selection: Selection = WHOLE,
+    resume: bool | None = None,
 ) -> RenderReport:
-    """Render one capture and write its file.
+    """Render one capture, or a part of it, and write its file.
 
     Parameters
     ----------
@@ -112,54 +61,77 @@ def render_capture(
     progress
         Called now and then with the share of the work done.
     warn
-        Called with every warning, before the first batch.
+        Called with every warning, before the first unit.
+    selection
+        The part that is rendered.
+    resume
+        None: go on with an unfinished render of the same capture where there is one; True: there has to be one;
+        False: start anew.
 
     Raises
     ------
     ConfigError
-        Something only the renderer could find wrong: a mesh that cannot be read, a BSDF that Mitsuba rejects.
+        Something only the renderer could find wrong: a mesh that cannot be read, a BSDF that Mitsuba rejects, a part
+        that the capture does not have.
     BackendError
         There is no usable LLVM or GPU.
     FileError
-        The output cannot be written.
+        The output cannot be written, or there is an unfinished render of something else.
     RenderError
         The capture does not fit the memory limit, or the result is not finite.
+    IncompleteRender, InterruptedRender
+        The render stopped half-way; the same call goes on from there.
     """
     stopwatch, warnings = Stopwatch(), Warnings(warn)
     warnings.say(config_warnings(config))
     with stopwatch.stage("scene"):
         check_writable(config.output.path)
-        backend, plan, engine, header = set_up(config, warnings)
-    provenance = provenance_attributes(
-        config_to_dict(config), config_hash(config), engine=engine.name, seed=config.render.seed
-    )
-    with CaptureWriter(
-        config.output.path,
-        header,
-        attributes=provenance,
-        compression=config.output.compression,
-        store_variance=config.output.variance,
-    ) as writer:
-        totals = render_batches(config, plan, engine, writer, stopwatch, progress)
-        seconds = stopwatch.report()
-        writer.set_attributes(
-            result_attributes(
-                samples=totals.samples,
-                error_estimate=totals.error_estimate,
-                seconds=seconds,
-                out_of_window_energy=totals.outside,
+        with uninterrupted():  # an import that Ctrl-C cuts off ends in errors of its own
+            backend = start_backend(config.render.backend, colored=config.is_colored)
+    resolved, output = config_to_dict(config), config.output
+    replicas = replicas_for(backend.lanes, config.capture.sensor_grid.n_points)
+    identity = capture_identity(resolved, str(selection), backend.variant, replicas)
+    with PartialCapture.claim(output.path, identity, resume) as partial:
+        with stopwatch.stage("scene"):
+            plan, engine, header = set_up(config, backend, warnings, selection)
+        with stopwatch.stage("render"):
+            budget = settled_budget(config, engine)
+        with resumable(partial) as stop:
+            provenance = provenance_attributes(
+                resolved, config_hash(config), engine=engine.name, seed=config.render.seed
             )
-            | {"variant": backend.variant}
-        )
+            partial.open(header, provenance | identity_attributes(identity), output.compression, output.variance)
+            earlier = len(partial.tally.units)
+            units = remaining_units(plan, header.confocal, partial.tally.units)
+            render_units(
+                units,
+                engine,
+                budget,
+                partial,
+                stop,
+                store_variance=output.variance,
+                stopwatch=stopwatch,
+                progress=progress,
+                warn=lambda text: warnings.say([text]),
+            )
+            tally = partial.tally
+            bounces = engine.options.bounces
+            results = summed_attributes(tally.sums, bounces, stopwatch.report())
+            if selection != WHOLE:
+                results |= part_attributes(plan.part, plan.tiling, tally)
+            partial.publish(results)
     return RenderReport(
-        output=Path(config.output.path),
+        output=Path(output.path),
         engine=engine.name,
         reason=engine_reason(config, engine),
         variant=backend.variant,
-        samples=totals.samples or 0,
-        error_estimate=totals.error_estimate,
-        energy=totals.energy_per_bounce(engine.options.bounces),
-        out_of_window=totals.outside,
+        part=None if selection == WHOLE else str(plan.part),
+        units=earlier + len(units),
+        resumed_units=earlier,
+        samples=tally.sums.samples or 0,
+        error_estimate=tally.sums.error_estimate,
+        energy=tally.sums.energy_per_bounce(bounces),
+        out_of_window=float(tally.sums.outside),
         n_bins=header.n_bins,
         n_triangles=engine.built.n_triangles,
         seconds=stopwatch.report(),
@@ -167,15 +139,23 @@ def render_capture(
     )
 
 
-def set_up(config: Config, warnings: Warnings) -> tuple[Backend, Plan, Engine, CaptureHeader]:
+def set_up(
+    config: Config, backend: Backend, warnings: Warnings, selection: Selection = WHOLE
+) -> tuple[Plan, Engine, CaptureHeader]:
     """Stages 2 to 4 up to the first ray: scene, capture, plan, engine, and what the file will say of them."""
-    backend = start_backend(config.render.backend, colored=config.is_colored)
     built = load_scene(config)
     capture, time_axis = describe_capture(config, built.wall, built)
-    plan, engine = prepare(config, backend, built, capture, time_axis)
+    plan, engine = prepare(config, backend, built, capture, time_axis, selection)
     header = describe_file(config, built, capture, time_axis)
     warnings.say(late_warnings(config, backend, plan, engine, header))
-    return backend, plan, engine, header
+    return plan, engine, header
+
+
+def settled_budget(config: Config, engine: Engine) -> Budget:
+    """Return when to stop, settled for the whole capture at once: no unit's result depends on how the work is cut."""
+    from nlosrender.engine.path_engine import Budget
+
+    return engine.settle(Budget(config.render.spp, config.render.target_error, config.render.time_limit_s))
 
 
 def forecast_capture(config: Config) -> Forecast:
@@ -189,7 +169,8 @@ def forecast_capture(config: Config) -> Forecast:
     warnings = Warnings(lambda text: None)
     begun = time.perf_counter()
     warnings.say(config_warnings(config))
-    backend, plan, engine, header = set_up(config, warnings)
+    backend = start_backend(config.render.backend, colored=config.is_colored)
+    plan, engine, header = set_up(config, backend, warnings)
     spent = time.perf_counter() - begun
     reason = engine_reason(config, engine)
     return forecast_render(config, backend, plan, engine, reason, header, tuple(warnings.said), spent)
@@ -202,7 +183,11 @@ def late_warnings(config: Config, backend: Backend, plan: Plan, engine: Engine, 
 
     yield from scene_warnings(engine)
     yield from memory_warnings(engine, plan, config.render.memory_limit_bytes, backend.lanes)
-    yield from disk_warnings(Path(config.output.path), forecast_file(config, header, engine))
+    share = plan.part.share_of(plan.tiling.everything(header.sizes["laser_y"] * header.sizes["laser_x"]))
+    size = forecast_file(config, header, engine)
+    yield from disk_warnings(
+        Path(config.output.path), replace(size, disk_bytes_estimate=int(size.disk_bytes_estimate * share))
+    )
 
 
 def engine_reason(config: Config, engine: Engine) -> str:
@@ -245,9 +230,14 @@ def describe_capture(config: Config, wall: RelayWall, built: BuiltScene) -> tupl
 
 
 def prepare(
-    config: Config, backend: Backend, built: BuiltScene, capture: Capture, time_axis: TimeAxis
+    config: Config,
+    backend: Backend,
+    built: BuiltScene,
+    capture: Capture,
+    time_axis: TimeAxis,
+    selection: Selection = WHOLE,
 ) -> tuple[Plan, Engine]:
-    """Stages 3 and 4: cut the work into batches and set up the engine."""
+    """Stages 3 and 4: cut the work into units and set up the engine."""
     from nlosrender.engine.path_engine import PathEngine, PathOptions
     from nlosrender.engine.planner import choose_engine
     from nlosrender.engine.virtual_lights.engine import VirtualLightEngine
@@ -257,7 +247,16 @@ def prepare(
     channels = 3 if config.is_colored else 1
     memory, rows = batch_memory(render.memory_limit_bytes), bounces.n_slots * channels
     refuse_impossible_samples(config.capture, rows_per_pair=rows, n_bins=time_axis.n_bins, memory_limit=memory)
-    plan = plan_capture(capture, rows_per_pair=rows, n_bins=time_axis.n_bins, lanes=backend.lanes, memory_limit=memory)
+    _, *storage_tile = sensor_tile(time_axis.n_bins, capture.sensor_grid.ny, capture.sensor_grid.nx)
+    plan = plan_capture(
+        capture,
+        rows_per_pair=rows,
+        n_bins=time_axis.n_bins,
+        lanes=backend.lanes,
+        memory_limit=memory,
+        storage_tile=(storage_tile[0], storage_tile[1]),
+        selection=selection,
+    )
     options = PathOptions(
         bounces=bounces,
         laser_sampling=render.laser_sampling,
@@ -270,73 +269,6 @@ def prepare(
     if choose_engine(render, capture, built).name == "path":
         return plan, PathEngine(built, capture, time_axis, options)
     return plan, VirtualLightEngine(built, capture, time_axis, options, backend.lanes)
-
-
-@dataclass
-class Totals:
-    """Sums over all batches."""
-
-    noise: float = 0.0  # sum of variances
-    squares: float = 0.0  # sum of squared estimates
-    energy: dict[int, float] = field(default_factory=dict)  # per bounce slot
-    outside: float = 0.0
-    samples: int | None = None
-
-    @property
-    def error_estimate(self) -> float:
-        """Relative L2 error of H over everything rendered so far."""
-        from nlosrender.engine.histogram import relative_l2_error
-
-        return relative_l2_error(self.noise, self.squares)
-
-    def energy_per_bounce(self, bounces: BounceAxis) -> dict[str, float]:
-        """Return the energy by bounce number, or under ``all`` when bounces are not split."""
-        return {bounces.name(slot): energy for slot, energy in sorted(self.energy.items())}
-
-
-def render_batches(
-    config: Config, plan: Plan, engine: Engine, writer: CaptureWriter, stopwatch: Stopwatch, progress: Progress
-) -> Totals:
-    """Stages 4 and 6: render batch after batch, write each as it is done."""
-    from nlosrender.engine.path_engine import Budget
-
-    totals = Totals()
-    render = config.render
-    confocal = config.capture.scan_type == "confocal"
-    rendering_since = time.perf_counter()
-    for number, batch in enumerate(plan.batches):
-        limit = render.time_limit_s
-        if limit is not None:  # what is left of the time, shared by the batches that are left
-            limit = max(0.0, limit - (time.perf_counter() - rendering_since)) / (len(plan.batches) - number)
-        budget = Budget(render.spp, render.target_error, limit)
-        compiled = engine.compile_seconds
-        with stopwatch.stage("render"):
-            histogram = engine.render(batch, budget, partial(_progress_within, progress, number, len(plan.batches)))
-        compiled = engine.compile_seconds - compiled
-        stopwatch.seconds["compile"] += compiled
-        stopwatch.seconds["render"] -= compiled
-        totals.noise += float(histogram.variance.sum())
-        totals.squares += float((histogram.mean**2).sum())
-        totals.outside += float(histogram.outside.sum())
-        totals.samples = min(histogram.samples, totals.samples if totals.samples is not None else histogram.samples)
-        for slot in range(histogram.mean.shape[1]):
-            totals.energy[slot] = totals.energy.get(slot, 0.0) + float(histogram.mean[:, slot].sum())
-        with stopwatch.stage("write"):
-            lasers = (1, 1) if confocal else batch.lasers.shape
-            channels, slots, _, _, n_bins = histogram.mean.shape
-            axes = (channels, slots, *lasers, *batch.sensors.shape, n_bins)
-            writer.write(
-                histogram.mean.reshape(axes),
-                laser_at=(0, 0) if confocal else (batch.lasers.y0, batch.lasers.x0),
-                sensor_at=(batch.sensors.y0, batch.sensors.x0),
-                variance=histogram.variance.reshape(axes) if config.output.variance else None,
-            )
-        progress((number + 1) / len(plan.batches))
-    return totals
-
-
-def _progress_within(progress: Progress, number: int, n_batches: int, share: float) -> None:
-    progress((number + share) / n_batches)
 
 
 def describe_file(config: Config, built: BuiltScene, capture: Capture, time_axis: TimeAxis) -> CaptureHeader:

@@ -96,6 +96,7 @@ def _provenance(attributes: Mapping[str, object]) -> dict[str, object]:
         "seconds": _json(attributes.get("seconds")),
         "created": attributes.get("created"),
         "config_hash": attributes.get("config_hash"),
+        "part": _json(attributes.get("part")),
         "written_by": attributes.get("engine"),
         "versions": _json(attributes.get("versions")),
     }

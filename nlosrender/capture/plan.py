@@ -1,49 +1,32 @@
-"""The order of work: batches of sensor and laser points that fit the memory at hand.
+"""The order of work: units of sensor and laser points, in batches that fit the memory at hand.
 
-What a lane computes depends on its sensor point alone, so how a capture is cut changes no bit of it.
+A unit is rendered, written and noted as finished at once. What a lane computes depends on its sensor point alone, so
+how a capture is cut changes no bit of it.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 from nlosrender.capture.grids import Capture
+from nlosrender.capture.part import WHOLE, Part, Selection, Tiling
+from nlosrender.capture.tile import Tile, joined, runs
 from nlosrender.errors import RenderError
 
 BYTES_PER_SUM = 8  # a float64 sum per replica and bin
 MOST_SUMS = 2**32 - 1  # of a batch: Dr.Jit indexes with 32 bits
-BYTES_OF_STATISTICS = 56  # mean and variance on the device and their host copies in memory and file order
-
-
-@dataclass(frozen=True)
-class Tile:
-    """A rectangle of grid points: rows [y0, y1), columns [x0, x1)."""
-
-    y0: int
-    y1: int
-    x0: int
-    x1: int
-
-    @property
-    def shape(self) -> tuple[int, int]:
-        """Rows and columns."""
-        return self.y1 - self.y0, self.x1 - self.x0
-
-    @property
-    def size(self) -> int:
-        """Number of points."""
-        return (self.y1 - self.y0) * (self.x1 - self.x0)
-
-    def flat_indices(self, nx: int) -> list[int]:
-        """Return the points' indices in a row-major grid with ``nx`` columns."""
-        return [y * nx + x for y in range(self.y0, self.y1) for x in range(self.x0, self.x1)]
+# mean and variance on the device and their host copies in memory and file order (56), and the float32 copies of the
+# unit before, which is being written (8)
+BYTES_OF_STATISTICS = 64
+BYTES_OF_ASSEMBLY = 24  # mean and variance of a unit that is put together from batches, and its float32 copies
+UNIT_SAMPLES = 2**26  # of a unit at most, whatever the memory: what an interruption can cost stays bounded
 
 
 @dataclass(frozen=True)
 class Batch:
-    """One unit of work: every laser of ``lasers`` for every sensor point of ``sensors``.
+    """What the engine renders at once: every laser of ``lasers`` for every sensor point of ``sensors``.
 
     Confocal captures have ``lasers`` equal to ``sensors``, one laser per sensor point.
     """
@@ -53,16 +36,44 @@ class Batch:
 
 
 @dataclass(frozen=True)
-class Plan:
-    """How a capture is cut into batches."""
+class Unit:
+    """What is written at once: whole storage tiles (as far as the part has them) for ``lasers``.
 
+    It is one batch, unless a single storage tile with a single laser takes more memory than there is.
+    """
+
+    sensors: Tile
+    lasers: Tile  # confocal: equal to ``sensors``
     batches: tuple[Batch, ...]
+
+
+@dataclass(frozen=True)
+class Plan:
+    """How a capture, or a part of it, is cut into units."""
+
+    units: tuple[Unit, ...]
     replicas: int  # independent copies of every sensor point's estimate, >= 2
     bytes_per_batch: int  # of the largest batch
+    tiling: Tiling
+    part: Part
+
+    @property
+    def batches(self) -> tuple[Batch, ...]:
+        """The batches of all units."""
+        return tuple(batch for unit in self.units for batch in unit.batches)
 
 
-def plan_capture(capture: Capture, *, rows_per_pair: int, n_bins: int, lanes: int, memory_limit: int) -> Plan:
-    """Cut a capture into batches.
+def plan_capture(
+    capture: Capture,
+    *,
+    rows_per_pair: int,
+    n_bins: int,
+    lanes: int,
+    memory_limit: int,
+    storage_tile: tuple[int, int] = (1, 1),
+    selection: Selection = WHOLE,
+) -> Plan:
+    """Cut a capture into units.
 
     Parameters
     ----------
@@ -76,45 +87,103 @@ def plan_capture(capture: Capture, *, rows_per_pair: int, n_bins: int, lanes: in
         Number of lanes that keeps the backend busy; small grids get more replicas per sensor point.
     memory_limit
         Bytes a batch may take.
+    storage_tile
+        Rows and columns of sensor points that share a chunk of the file.
+    selection
+        The part that is rendered.
 
     Raises
     ------
+    ConfigError
+        There is no such part.
     RenderError
         Not even one sensor point with one laser fits.
     """
-    # Replicas depend on the capture, not on the batch: the result must not depend on the memory limit.
-    replicas = max(2, math.ceil(lanes / capture.n_sensors))
-    replicas += replicas % 2
-    pair = rows_per_pair * (n_bins + 1) * (BYTES_PER_SUM * replicas + BYTES_OF_STATISTICS)
-    pairs = min(memory_limit // pair, MOST_SUMS // (replicas * rows_per_pair * (n_bins + 1)))
+    replicas = replicas_for(lanes, capture.n_sensors)
+    row = rows_per_pair * (n_bins + 1)
+    pair = row * (BYTES_PER_SUM * replicas + BYTES_OF_STATISTICS)
+    tiling = Tiling(capture.sensor_grid.ny, capture.sensor_grid.nx, *storage_tile)
+    part = selection.part(capture.n_lasers if capture.scan_type == "exhaustive" else 1, tiling)
+    cell = storage_tile[0] * storage_tile[1]
+    pairs = min(memory_limit // pair, MOST_SUMS // (replicas * row))
+    if pairs < cell:  # units of several batches
+        pairs = min(pairs, (memory_limit - cell * row * BYTES_OF_ASSEMBLY) // pair)
     if pairs < 1:
+        needed = pair + (cell * row * BYTES_OF_ASSEMBLY if cell > 1 else 0)
         raise RenderError(
-            f"one sensor point with one laser needs {pair / 1e6:.0f} MB but render.memory_limit leaves "
+            f"one sensor point with one laser needs {needed / 1e6:.0f} MB but render.memory_limit leaves "
             f"{memory_limit / 1e6:.0f} MB. Raise it, or use fewer bins ({n_bins}) or bounces."
         )
-    lasers_per_sensor = capture.n_lasers if capture.scan_type == "exhaustive" else 1
-    ny, nx = capture.sensor_grid.ny, capture.sensor_grid.nx
-    sensors_at_once = max(1, pairs // lasers_per_sensor)
-    lasers_at_once = max(1, min(lasers_per_sensor, pairs // sensors_at_once))
-    batches = []
-    for sensors in tiles(ny, nx, sensors_at_once):
+    units = tuple(_units(capture, tiling, part, pairs, max(1, UNIT_SAMPLES // row), math.ceil(lanes / replicas)))
+    confocal = capture.scan_type == "confocal"
+    largest = max(b.sensors.size * (1 if confocal else b.lasers.size) for unit in units for b in unit.batches)
+    return Plan(units, replicas, largest * pair, tiling, part)
+
+
+def replicas_for(lanes: int, n_sensors: int) -> int:
+    """Return how many independent estimates stand behind each sensor point: enough of them to keep the lanes busy.
+
+    They depend on the capture, not on the batch: the result must not depend on the memory limit.
+    """
+    replicas = max(2, math.ceil(lanes / n_sensors))
+    return replicas + replicas % 2
+
+
+def _units(capture: Capture, tiling: Tiling, part: Part, fitting: int, enough: int, busy: int) -> Iterator[Unit]:
+    """Yield the units: first sensor points to keep ``busy`` lanes, then lasers, then more sensor points.
+
+    ``fitting`` pairs of a sensor and a laser point fit the memory; more than ``enough`` are not asked for.
+    """
+    pairs, n_lasers = min(fitting, enough), part.lasers[1] - part.lasers[0]
+    for sensors in joined(tiling.cells(part.strips), max(pairs // n_lasers, min(busy, pairs))):
         if capture.scan_type == "confocal":
-            batches.append(Batch(sensors, sensors))
+            yield Unit(sensors, sensors, tuple(Batch(tile, tile) for tile in _cut(sensors, fitting)))
             continue
-        batches += [
-            Batch(sensors, lasers) for lasers in tiles(capture.laser_grid.ny, capture.laser_grid.nx, lasers_at_once)
-        ]
-    largest = max(b.sensors.size * (1 if capture.scan_type == "confocal" else b.lasers.size) for b in batches)
-    return Plan(tuple(batches), replicas, largest * pair)
+        for lasers in runs(*part.lasers, capture.laser_grid.nx, max(1, pairs // sensors.size)):
+            pieces = _cut(sensors, fitting // lasers.size)
+            yield Unit(sensors, lasers, tuple(Batch(tile, lasers) for tile in pieces))
+
+
+def _cut(sensors: Tile, most: int) -> Iterator[Tile]:
+    """Yield a tile whole, or in pieces of at most ``most`` points where it has more."""
+    rows, columns = sensors.shape
+    for tile in tiles(rows, columns, most):
+        yield Tile(sensors.y0 + tile.y0, sensors.y0 + tile.y1, sensors.x0 + tile.x0, sensors.x0 + tile.x1)
 
 
 def tiles(ny: int, nx: int, most: int) -> Iterator[Tile]:
     """Cut a grid of ``ny`` x ``nx`` points into tiles of at most ``most`` points: whole rows, or parts of one row."""
-    if most >= nx:
-        rows = min(ny, most // nx)
-        for y0 in range(0, ny, rows):
-            yield Tile(y0, min(y0 + rows, ny), 0, nx)
-        return
-    for y in range(ny):
-        for x0 in range(0, nx, most):
-            yield Tile(y, y + 1, x0, min(x0 + most, nx))
+    return runs(0, ny * nx, nx, most)
+
+
+def remaining_units(plan: Plan, confocal: bool, finished: Iterable[tuple[Tile, Tile]]) -> list[Unit]:
+    """Return what is left to do when the (sensors, lasers) of ``finished`` are done.
+
+    The units of an earlier run may have been cut otherwise, for another memory; a unit that is done in part is taken
+    apart into storage tiles and single lasers, which never are.
+    """
+    done = set(finished)
+    left: list[Unit] = []
+    for unit in plan.units:
+        if (unit.sensors, unit.lasers) in done:
+            continue
+        touching = [pair for pair in done if pair[0].overlaps(unit.sensors) and pair[1].overlaps(unit.lasers)]
+        if not touching:
+            left.append(unit)
+            continue
+        for small in _apart(plan, unit, confocal):
+            if not any(s.contains(small.sensors) and b.contains(small.lasers) for s, b in touching):
+                left.append(small)
+    return left
+
+
+def _apart(plan: Plan, unit: Unit, confocal: bool) -> Iterator[Unit]:
+    """Yield a unit's storage tiles with one laser each."""
+    most = max(batch.sensors.size for batch in unit.batches)
+    for cell in plan.tiling.cells(plan.part.strips):
+        if not unit.sensors.contains(cell):
+            continue
+        y_range, x_range = range(unit.lasers.y0, unit.lasers.y1), range(unit.lasers.x0, unit.lasers.x1)
+        for laser in [cell] if confocal else [Tile(y, y + 1, x, x + 1) for y in y_range for x in x_range]:
+            pieces = _cut(cell, most)
+            yield Unit(cell, laser, tuple(Batch(tile, tile if confocal else laser) for tile in pieces))

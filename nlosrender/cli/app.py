@@ -18,6 +18,7 @@ from nlosrender.cli import (
     export_command,
     file_commands,
     machine_commands,
+    merge_command,
     plan_command,
     reconstruct_command,
     render_command,
@@ -33,6 +34,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 render_command.register(app)
+merge_command.register(app)
 plan_command.register(app)
 config_commands.register(app)
 file_commands.register(app)

@@ -21,6 +21,7 @@ def _rows(summary: dict[str, object]) -> list[tuple[str, str]]:
     verdict = "matches the Z-NLOS layout, all samples finite" if checked == [] else "FAILED, see below"
     return [
         ("file", f"{summary['file']} ({_bytes(summary['size_on_disk'])})"),
+        ("PART ONLY", _part(summary["part"])),
         ("scan type", _text(summary["scan_type"])),
         ("sensor points", _grid(summary["sensor_grid"], summary["sensor_grid_size"])),
         ("laser points", _grid(summary["laser_grid"], summary["laser_grid_size"])),
@@ -45,6 +46,15 @@ def _rows(summary: dict[str, object]) -> list[tuple[str, str]]:
         ("versions", _named(summary["versions"])),
         ("check", "" if checked is None else verdict),
     ]
+
+
+def _part(part: object) -> str:
+    """Return which part of a capture the file holds; empty for a whole one."""
+    if not isinstance(part, dict):
+        return ""
+    lasers, tiles = _sequence(part.get("lasers")), _sequence(part.get("sensor_tiles"))
+    shown = "; ".join(f"rows {t[0]}:{t[1]} columns {t[2]}:{t[3]}" for t in tiles if isinstance(t, list) and len(t) == 4)
+    return f"lasers {':'.join(str(bound) for bound in lasers)}, sensor {shown}; nlosrender merge puts parts together"
 
 
 def _time_axis(summary: dict[str, object]) -> str:

@@ -72,20 +72,23 @@ def validate(
 ) -> None:
     """Check config files and print every mistake with its place; nothing is rendered."""
     from nlosrender.config.load import load_config
+    from nlosrender.config.sweep_load import load_sweep
     from nlosrender.config.warnings import config_warnings
 
     problems: list[Problem] = []
     warnings: list[str] = []
     for path in configs:
         try:
-            config = load_config(path, overrides or ())
+            sweep = load_sweep(path, overrides or ())
+            config = load_config(path, overrides or ()) if sweep is None else sweep.config(0)
         except ConfigError as error:
             problems += error.problems
             continue
         found = [f"{path}: {warning}" for warning in config_warnings(config)]
         warnings += found
         if not as_json:
-            typer.echo(f"{path}: ok ({_summary(config)})")
+            captures = "" if sweep is None else f"a sweep of {len(sweep)} captures in {sweep.output_folder}, such as "
+            typer.echo(f"{path}: ok ({captures}{_summary(config)})")
             for warning in found:
                 typer.echo(f"warning: {warning}", err=True)
     if as_json:

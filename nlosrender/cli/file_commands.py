@@ -33,8 +33,14 @@ def info(
     import json
 
     from nlosrender.analysis.summary import summarise
+    from nlosrender.analysis.unfinished import is_unfinished, summarise_unfinished
     from nlosrender.errors import FileError
 
+    if is_unfinished(file):
+        found = summarise_unfinished(file)
+        lines = (f"{label.replace('_', ' '):<16}{printable(value)}" for label, value in found.items())
+        typer.echo(json.dumps(found, allow_nan=False) if json_output else "\n".join(lines))
+        return
     summary = summarise(file)
     if check:
         from nlosrender.files.validation import validate_file

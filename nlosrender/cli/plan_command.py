@@ -29,12 +29,18 @@ def plan(
     as_json: Annotated[bool, typer.Option("--json", help="Print the plan as one JSON object.")] = False,
 ) -> None:
     """Say what a render will do, what it skips and why, and what it costs; a short pilot measures the speed."""
+    from nlosrender.cli.sweep_command import plan_all
     from nlosrender.config.load import load_config
     from nlosrender.config.places import with_places
+    from nlosrender.config.sweep_load import load_sweep
     from nlosrender.errors import ConfigError
     from nlosrender.pipeline import forecast_capture
 
     changes = list(overrides or [])
+    sweep = load_sweep(config, changes)
+    if sweep is not None:
+        plan_all(sweep, changes, as_json)
+        return
     loaded = load_config(config, changes)
     try:
         forecast = forecast_capture(loaded)

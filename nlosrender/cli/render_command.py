@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
+import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 if TYPE_CHECKING:
-    from nlosrender.pipeline import Progress, RenderReport
+    from nlosrender.capture.part import Selection
+    from nlosrender.rendering.report import RenderReport
 
 
 def register(app: typer.Typer) -> None:
@@ -27,26 +26,54 @@ def render(
     overrides: Annotated[
         list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Override one key; may be repeated.")
     ] = None,
+    lasers: Annotated[
+        str | None, typer.Option(metavar="A:B", help="Render laser points A to B - 1 only, counted row by row from 0.")
+    ] = None,
+    shard: Annotated[
+        str | None, typer.Option(metavar="I/N", help="Render the I-th of N parts, counted from 1; see merge.")
+    ] = None,
+    resume: Annotated[
+        bool | None,
+        typer.Option(
+            "--resume/--overwrite",
+            help="Demand an unfinished render to go on with / throw it away.",
+            show_default="go on with one if there is one",
+        ),
+    ] = None,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress bar, no report.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print the report as one JSON object.")] = False,
 ) -> None:
     """Render a capture and write it as one HDF5 file.
 
+    What is finished survives Ctrl-C and kill: the same command goes on from there. A configuration with a sweep makes
+    a folder of captures and an index.json; --shard then deals whole captures.
+
     Example: nlosrender render configs/z-letter.yaml -o out/z-letter.hdf5
     creates out/z-letter.hdf5, a capture of a hidden letter Z.
     """
+    selection = _selection(shard, lasers)
+
+    from nlosrender.cli.progress import progress_bar
+    from nlosrender.cli.sweep_command import render_all
     from nlosrender.config.load import load_config
     from nlosrender.config.places import with_places
+    from nlosrender.config.sweep_load import load_sweep
     from nlosrender.errors import ConfigError
     from nlosrender.pipeline import render_capture
 
     changes = list(overrides or [])
     if output is not None:
         changes.append(f"output.path={_quoted(output)}")
+    sweep = load_sweep(config, changes)
+    if sweep is not None:
+        if lasers is not None:
+            raise typer.BadParameter("cuts one capture, not a sweep; use --shard", param_hint="--lasers")
+        render_all(sweep, changes, shard=selection.shard, resume=resume, quiet=quiet, as_json=as_json)
+        return
     loaded = load_config(config, changes)
     try:
-        with _progress_bar(hidden=quiet) as progress:
-            report = render_capture(loaded, progress, _ignore if quiet else _print_warning)
+        with progress_bar("render", hidden=quiet) as (progress, warn):
+            report = render_capture(loaded, progress, warn, selection=selection, resume=resume)
     except ConfigError as error:
         raise with_places(error, config, changes) from error
     if as_json:
@@ -55,33 +82,30 @@ def render(
         _print_report(report)
 
 
+def _selection(shard: str | None, lasers: str | None) -> Selection:
+    from nlosrender.capture.part import Selection
+
+    if shard is not None and lasers is not None:
+        raise typer.BadParameter("takes no --shard beside it", param_hint="--lasers")
+    return Selection(
+        shard=_two_numbers(shard, "/", "--shard", "I/N with 1 <= I <= N, such as 2/8"),
+        lasers=_two_numbers(lasers, ":", "--lasers", "A:B with A < B, such as 0:8"),
+    )
+
+
+def _two_numbers(text: str | None, separator: str, option: str, need: str) -> tuple[int, int] | None:
+    if text is None:
+        return None
+    match = re.fullmatch(rf"([0-9]{{1,9}}){separator}([0-9]{{1,9}})", text.strip(), re.ASCII)
+    if match is None:
+        raise typer.BadParameter(f"got {text!r}, need {need}", param_hint=option)
+    return int(match[1]), int(match[2])
+
+
 def _quoted(path: Path) -> str:
     import json
 
     return json.dumps(str(path))  # a JSON string is a YAML string: names such as "1e3" or "yes" stay text
-
-
-def _ignore(text: str) -> None:
-    pass
-
-
-def _print_warning(text: str) -> None:
-    from tqdm import tqdm
-
-    tqdm.write(f"warning: {text}", file=sys.stderr)  # above the progress bar, not into it
-
-
-@contextmanager
-def _progress_bar(hidden: bool) -> Iterator[Progress]:
-    from tqdm import tqdm
-
-    layout = "{l_bar}{bar}| {elapsed}<{remaining}"
-    with tqdm(total=1.0, disable=True if hidden else None, desc="render", bar_format=layout, leave=False) as bar:
-
-        def progress(share: float) -> None:
-            bar.update(max(0.0, min(share, 1.0) - bar.n))
-
-        yield progress
 
 
 def _print_json(report: RenderReport) -> None:
@@ -97,7 +121,9 @@ def _print_json(report: RenderReport) -> None:
 
 def _print_report(report: RenderReport) -> None:
     seconds = report.seconds
-    typer.echo(f"wrote {report.output}")
+    typer.echo(f"wrote {report.output}" + (f", {report.part} of the capture" if report.part else ""))
+    if report.resumed_units:
+        typer.echo(f"  resumed         {report.resumed_units} of {report.units} units were finished by an earlier run")
     typer.echo(f"  engine          {report.engine}: {report.reason}")
     paths = f", {report.samples} paths per sensor point" if report.samples else ""
     typer.echo(f"  error estimate  {report.error_estimate:.2%} (relative L2){paths}")

@@ -14,6 +14,7 @@ from nlosrender.config.relay_wall import EDGE_TOLERANCE
 from nlosrender.config.render import OutputConfig, RenderConfig
 from nlosrender.config.scene import SceneConfig
 from nlosrender.config.section import Section
+from nlosrender.config.sweep import SweepConfig
 
 MAX_BINS = 2**40  # 4 TiB of float32: beyond it a grid or bin count is a slip of the pen
 _WALL: KeyPath = ("scene", "relay_wall")
@@ -36,6 +37,9 @@ class Config(Section):
     """how it is computed"""
     output: OutputConfig = Field(default_factory=OutputConfig)
     """the file that is written"""
+    # never set here: sweep_load makes many configs of it. No part of the capture, so no part of its hash either.
+    sweep: SweepConfig | None = Field(default=None, exclude=True)
+    """many captures from this file: which keys take which values"""
 
     @model_validator(mode="before")
     @classmethod

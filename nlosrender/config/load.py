@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import hashlib
 import itertools
 import json
 import re
@@ -14,6 +13,7 @@ from typing import Any
 from pydantic import ValidationError
 from pydantic_core import ErrorDetails
 
+from nlosrender.config.canonical import tree_hash
 from nlosrender.config.document import Config
 from nlosrender.config.overrides import apply_overrides
 from nlosrender.config.refusal import FAULT, KeyPath, shown
@@ -28,6 +28,7 @@ _STAND_INS: dict[KeyPath, Any] = {
     ("capture", "sensor_grid"): {"nx": 1, "ny": 1},
     ("capture", "laser_grid"): {"nx": 1, "ny": 1},
 }
+MOST_PROBLEMS = 100  # told at once; finding the nearest known key for each takes a while
 _MAX_PASSES = 20  # each one removes something from the tree; a tree of this schema is used up long before
 
 
@@ -47,10 +48,21 @@ def load_config(path: Path, overrides: Sequence[str] = ()) -> Config:
         With every problem found: the file cannot be read, is no YAML, or breaks a rule.
     """
     path = Path(path)
+    return parse_config(read_text(path), str(path), path.absolute().parent, overrides)
+
+
+def read_text(path: Path) -> str:
+    """Return the text of a config file.
+
+    Raises
+    ------
+    ConfigError
+        It cannot be read, is no text or far too long.
+    """
     try:
         with path.open("rb") as file:
             content = file.read(MAX_BYTES + 1)
-        text = content.decode("utf-8-sig")
+        return content.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         message = f"no UTF-8 text: byte 0x{content[error.start]:02x} at offset {error.start}. Save it as UTF-8."
         if len(content) > MAX_BYTES:  # the cut may have split a character; size is the real mistake
@@ -63,7 +75,6 @@ def load_config(path: Path, overrides: Sequence[str] = ()) -> Config:
         raise ConfigError(Problem(str(path), "", "this is a folder, need a YAML file.")) from error
     except (OSError, ValueError) as error:
         raise ConfigError(Problem(str(path), "", f"cannot be read: {getattr(error, 'strerror', error)}.")) from error
-    return parse_config(text, str(path), path.absolute().parent, overrides)
 
 
 def parse_config(text: str, source: str, folder: Path, overrides: Sequence[str] = ()) -> Config:
@@ -85,6 +96,22 @@ def parse_config(text: str, source: str, folder: Path, overrides: Sequence[str] 
     ConfigError
         With every problem found.
     """
+    document = overridden_document(text, source, overrides)
+    if document.tree.get("sweep") is not None:
+        message = "this makes many captures, and a single one is needed here; remove it, or --set sweep=null."
+        document.problems.append(Problem(document.place(("sweep",), "key"), "sweep", message))
+        document.tree = {key: value for key, value in document.tree.items() if key != "sweep"}
+    return validate_document(document, folder)
+
+
+def overridden_document(text: str, source: str, overrides: Sequence[str] = ()) -> Document:
+    """Return the values of a config's text with the overrides put over them; the root is a mapping.
+
+    Raises
+    ------
+    ConfigError
+        The text is no YAML or no mapping. Other problems are those of the document.
+    """
     document = read_document(text, source)
     if document.tree is None and not document.problems and overrides:
         document.tree = {}
@@ -94,7 +121,18 @@ def parse_config(text: str, source: str, folder: Path, overrides: Sequence[str] 
         place = document.place(()) if document.tree is not None else source
         raise ConfigError(document.problems or Problem(place, "", message))
     apply_overrides(document, overrides)
-    return _validate(document, {"folder": Path(folder).absolute(), "stem": Path(source).stem or "capture"})
+    return document
+
+
+def validate_document(document: Document, folder: Path) -> Config:
+    """Validate the values of one capture; relative file names in them start at ``folder``.
+
+    Raises
+    ------
+    ConfigError
+        With every problem found, the document's own included.
+    """
+    return _validate(document, {"folder": Path(folder).absolute(), "stem": Path(document.source).stem or "capture"})
 
 
 def config_to_dict(config: Config) -> dict[str, Any]:
@@ -105,14 +143,13 @@ def config_to_dict(config: Config) -> dict[str, Any]:
 
 def config_hash(config: Config) -> str:
     """Return the SHA-256 (hex) of the config's canonical JSON: equal for configs that differ only in writing."""
-    canonical = json.dumps(config_to_dict(config), sort_keys=True, separators=(",", ":"), ensure_ascii=True)
-    return hashlib.sha256(canonical.encode("ascii")).hexdigest()
+    return tree_hash(config_to_dict(config))
 
 
 def _validate(document: Document, context: dict[str, Any]) -> Config:
     """Validate; after mistakes, take them out and look again, so that rules over sound values still speak up."""
     problems = list(document.problems)
-    broken = set(document.unread)
+    broken, n_untold = set(document.unread), 0
     tree = copy.deepcopy(document.tree)
     for _ in range(_MAX_PASSES):
         try:
@@ -123,11 +160,17 @@ def _validate(document: Document, context: dict[str, Any]) -> Config:
             if problems:
                 break
             return config
-        problems += [problem_from(detail, document) for detail in details if not _is_echo(detail, broken)]
+        fresh = [detail for detail in details if not _is_echo(detail, broken)]
+        problems += [problem_from(detail, document) for detail in fresh[:MOST_PROBLEMS]]
+        n_untold += len(fresh[MOST_PROBLEMS:])
         culprits = {_culprit(detail, broken) for detail in details}
         if not sum(_take_out(tree, culprit, broken) for culprit in sorted(culprits, key=str)):
             break
-    raise ConfigError(sorted(dict.fromkeys(problems), key=_reading_order))
+    told = sorted(dict.fromkeys(problems), key=_reading_order)
+    if n_untold or len(told) > MOST_PROBLEMS:
+        n_untold += len(told[MOST_PROBLEMS:])
+        told = [*told[:MOST_PROBLEMS], Problem(document.source, "", f"{n_untold} more mistakes are not listed.")]
+    raise ConfigError(told)
 
 
 def _reading_order(problem: Problem) -> tuple[int, int]:

@@ -6,8 +6,10 @@ from collections.abc import Sequence
 from typing import Any
 
 from nlosrender.config.refusal import KeyPath, shown
-from nlosrender.config.yaml_tree import Document, Place, read_document
+from nlosrender.config.yaml_tree import MAX_DEPTH, Document, Place, read_document
 from nlosrender.errors import ConfigError, Problem
+
+_LONGEST_PLACE = 80  # characters of an absurd override that still help
 
 
 def apply_overrides(document: Document, overrides: Sequence[str]) -> None:
@@ -28,9 +30,13 @@ def apply_overrides(document: Document, overrides: Sequence[str]) -> None:
             message = "need KEY=VALUE with dots between keys, such as --set capture.sensor_grid.nx=16."
             document.problems.append(Problem(place, "", message))
             continue
+        if len(parts) > MAX_DEPTH:
+            message = f"got {len(parts)} keys, one inside the other; need at most {MAX_DEPTH}."
+            document.problems.append(Problem(place[:_LONGEST_PLACE], "", message))
+            continue
         try:
             value = _value(document, key, text, place)
-            _put(document, parts, value, place)
+            put(document, parts, value, Place(place, place))
         except ConfigError as error:
             document.problems.extend(error.problems)
 
@@ -46,11 +52,26 @@ def _value(document: Document, key: str, text: str, place: str) -> Any:
     return read.tree
 
 
-def _put(document: Document, parts: list[str], value: Any, place: str) -> None:
-    """Set the value, creating mappings on the way; from there on its places are the override's."""
+def put(document: Document, parts: Sequence[str], value: Any, place: Place) -> None:
+    """Set one value of the document, creating mappings on the way; from there on its places are ``place``.
+
+    Parameters
+    ----------
+    document
+        Changed in place; its tree must be a mapping.
+    parts
+        Keys from the root down; numbers index lists.
+    value, place
+        What to put there, and where that stands.
+
+    Raises
+    ------
+    ConfigError
+        There is something else than a mapping or a list on the way, or a list is too short.
+    """
     container, path = document.tree, ()  # type: tuple[Any, KeyPath]
     for depth, part in enumerate(parts):
-        step = _step(container, part, path, place)
+        step = _step(container, part, path, place.value)
         path = (*path, step)
         if depth == len(parts) - 1:
             container[step] = value
@@ -64,10 +85,10 @@ def _put(document: Document, parts: list[str], value: Any, place: str) -> None:
     _own(document, path, place)
 
 
-def _own(document: Document, path: KeyPath, place: str) -> None:
+def _own(document: Document, path: KeyPath, place: Place) -> None:
     for known in [known for known in document.places if known[: len(path)] == path]:
         del document.places[known]
-    document.places[path] = Place(place, place)
+    document.places[path] = place
 
 
 def _step(container: Any, part: str, path: KeyPath, place: str) -> str | int:

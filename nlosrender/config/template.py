@@ -96,6 +96,19 @@ output:
   frame: znlos                   # znlos (wall in y = 0) | scene (coordinates as above); default znlos
   compression: gzip              # gzip | none; default gzip
   variance: true                 # store the variance of the estimate per bin; default true
+
+# Many captures from this file: each key below, by its dotted name, takes all of its values. output.path then needs
+# {{index}} or {{index:05d}} in it and may have {{name}}; default {{name}}/{{index:05d}}.hdf5. An index.json lists them.
+# sweep:
+#   mode: product                # product: every combination | zip: the first values together, the second ones, ...
+#   keys:                        # a list of values, or from start to stop, both included: range | log_range
+#     capture.sensor_grid.nx: [16, 32]
+#     scene.hidden_geometry.0.center.2: {{range: {{start: 0.5, stop: 1.5, n: 5}}}}  # or step: 0.25
+#   random:                      # draws, the same for every combination of the keys above
+#     count: 20
+#     seed: 0                    # 0..4294967295; default 0
+#     keys:                      # uniform: [a, b] | log_uniform: [a, b] | integers: [a, b] | choice: [...]
+#       scene.hidden_geometry.0.bsdf.reflectance: {{uniform: [0.2, 0.9]}}
 """
 
 

@@ -15,6 +15,7 @@ import numpy as np
 
 # An object header holds an attribute of at most 64 KiB. Variable-length text lies in the heap and is not bound by
 # it; arrays are, and go there as JSON text when they are larger.
+MAX_STORED_BYTES = 2**24  # of an attribute by anyone: larger ones are not read
 MAX_ARRAY_BYTES = 60_000
 
 
@@ -49,14 +50,26 @@ def set_attributes(target: h5py.Group | h5py.Dataset, values: Mapping[str, objec
 
 
 def get_attributes(source: h5py.Group | h5py.Dataset) -> dict[str, object]:
-    """Return the attributes of ``source`` as Python text, numbers and lists; those h5py cannot read are left out."""
+    """Return the attributes of ``source`` as Python text, numbers and lists; those h5py cannot read,
+    of more than 16 MiB, or of ragged arrays, are left out."""
     found: dict[str, object] = {}
     for name in source.attrs:
         try:
-            found[str(name)] = _native(source.attrs[name])
+            stored = source.attrs.get_id(name)
+            if not _is_ragged(stored.get_type()) and stored.get_storage_size() <= MAX_STORED_BYTES:
+                found[str(name)] = _native(source.attrs[name])
         except (OSError, TypeError, ValueError, RuntimeError, KeyError):
             continue  # written by someone else in a type that has no meaning here
     return found
+
+
+def _is_ragged(kind: h5py.h5t.TypeID) -> bool:
+    """Return whether a type has arrays of variable length, which end the process when they are damaged text."""
+    if isinstance(kind, h5py.h5t.TypeCompoundID):
+        return any(_is_ragged(kind.get_member_type(index)) for index in range(kind.get_nmembers()))
+    if isinstance(kind, h5py.h5t.TypeArrayID):
+        return _is_ragged(kind.get_super())
+    return isinstance(kind, h5py.h5t.TypeVlenID)
 
 
 def _array(values: object) -> str | np.ndarray:

@@ -1,14 +1,62 @@
-"""Ctrl-C waits while HDF5 works: an exception raised inside its callbacks leaves its objects in ruins."""
+"""Ctrl-C waits: while HDF5 works, whose objects an exception would leave in ruins, and for a unit to be finished."""
 
 from __future__ import annotations
 
 import signal
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from types import FrameType
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
+
+
+@dataclass
+class StopRequest:
+    """Whether the user, or the system, wants the program to end."""
+
+    signal_name: str | None = None  # of the first signal that came
+
+    @property
+    def came(self) -> bool:
+        """Whether there was one."""
+        return self.signal_name is not None
+
+
+class _Noting:
+    """A signal handler that notes the first signal and lets the second one interrupt."""
+
+    def __init__(self) -> None:
+        self.request = StopRequest()
+
+    def __call__(self, number: int, frame: FrameType | None) -> None:
+        if self.request.came:
+            raise KeyboardInterrupt
+        self.request.signal_name = signal.Signals(number).name
+
+
+@contextmanager
+def stop_request() -> Iterator[StopRequest]:
+    """Note the first SIGINT or SIGTERM inside the block instead of acting on it; the second one interrupts.
+
+    A block inside another one shares its request. Outside the main thread no signal ever comes.
+
+    Raises
+    ------
+    KeyboardInterrupt
+        A second signal came inside the block.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield StopRequest()
+        return
+    outer = signal.getsignal(signal.SIGINT)
+    if isinstance(outer, _Noting):
+        yield outer.request
+        return
+    noting = _Noting()
+    with _handled_by(noting):
+        yield noting.request
 
 
 @contextmanager
@@ -31,15 +79,22 @@ def uninterrupted() -> Iterator[None]:
     def hold(number: int, frame: FrameType | None) -> None:
         held.append(number)
 
-    # None: installed by something other than Python, and not to be restored by it
+    with _handled_by(hold):
+        yield
+    if held:
+        signal.raise_signal(held[-1])
+
+
+@contextmanager
+def _handled_by(handler: Callable[[int, FrameType | None], None]) -> Iterator[None]:
     handlers = {number: signal.getsignal(number) for number in SIGNALS}
-    mine = [number for number in SIGNALS if handlers[number] is not None]
+    # None: installed by something other than Python, and not to be restored by it. Ignored: as shells do for jobs in
+    # the background, which a Ctrl-C is not meant for.
+    mine = [number for number in SIGNALS if handlers[number] not in (None, signal.SIG_IGN)]
     for number in mine:
-        signal.signal(number, hold)
+        signal.signal(number, handler)
     try:
         yield
     finally:
         for number in mine:
             signal.signal(number, handlers[number])
-    if held:
-        signal.raise_signal(held[-1])

@@ -76,6 +76,7 @@ def result_attributes(
     error_estimate: float | None = None,
     seconds: Mapping[str, float] | None = None,
     out_of_window_energy: float | Sequence[float] | None = None,
+    energy: Mapping[str, float] | None = None,
 ) -> dict[str, object]:
     """Return what is known when a render ends, for ``CaptureWriter.set_attributes``; None is left out.
 
@@ -90,12 +91,15 @@ def result_attributes(
     out_of_window_energy
         Light that arrived before the first or after the last bin, summed over all points: one number or one per
         bounce [J m^-2 sr^-1].
+    energy
+        H summed over all samples, by bounce number [J m^-2 sr^-1].
     """
     known = {
         "samples": samples,
         "error_estimate": error_estimate,
         "seconds": None if seconds is None else json.dumps({stage: float(spent) for stage, spent in seconds.items()}),
         "out_of_window_energy": out_of_window_energy,
+        "energy": None if energy is None else json.dumps(dict(energy)),
     }
     return {name: value for name, value in known.items() if value is not None}
 

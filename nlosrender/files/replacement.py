@@ -58,6 +58,11 @@ def partial_path(target: Path) -> Path:
     return target.with_name(f".{target.name}.{os.getpid()}.partial")
 
 
+def partial_folder(target: Path) -> Path:
+    """Return the folder that holds a capture until it is complete; found again by a later render."""
+    return target.with_name(f".{target.name}.partial")
+
+
 def publish(partial: Path, target: Path) -> None:
     """Rename the complete ``partial`` onto ``target`` once its content has reached the disk.
 
@@ -66,18 +71,25 @@ def publish(partial: Path, target: Path) -> None:
     OSError
         The disk is full or the folder has become unusable.
     """
-    descriptor = os.open(partial, os.O_RDONLY)
+    synchronise(partial)
+    os.replace(partial, target)
+    with suppress(OSError):  # the new name itself; some network file systems cannot sync a folder
+        synchronise(target.parent)
+
+
+def synchronise(path: Path) -> None:
+    """Wait until a file, or a folder's list of names, has reached the disk.
+
+    Raises
+    ------
+    OSError
+        The disk is full or gone.
+    """
+    descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)
     finally:
         os.close(descriptor)
-    os.replace(partial, target)
-    with suppress(OSError):  # the new name itself; some network file systems cannot sync a folder
-        descriptor = os.open(target.parent, os.O_RDONLY)
-        try:
-            os.fsync(descriptor)
-        finally:
-            os.close(descriptor)
 
 
 @contextmanager

@@ -19,18 +19,22 @@ class ShieldedFile:
     ----------
     path
         File to create; an existing one is emptied.
+    keep
+        Open an existing file as it is instead.
 
     Raises
     ------
     OSError
-        It cannot be created.
+        It cannot be created or opened.
     """
 
-    def __init__(self, path: Path):
+    def __init__(self, path: Path, keep: bool = False):
         self.error: OSError | None = None
+        self.writes: list[tuple[int, int]] = []  # position and length of all writes, until someone clears it
         self._held: list[tuple[int, bytes]] = []  # position and content of what the disk did not take, oldest first
         self._position = 0
-        self._descriptor: int | None = os.open(path, os.O_RDWR | os.O_CREAT | os.O_TRUNC, 0o666)
+        flags = os.O_RDWR if keep else os.O_RDWR | os.O_CREAT | os.O_TRUNC
+        self._descriptor: int | None = os.open(path, flags, 0o666)
 
     def raise_error(self) -> None:
         """Raise what went wrong, if anything did.
@@ -63,6 +67,7 @@ class ShieldedFile:
         """Write all of ``content``; keep it in memory if the disk fails."""
         start = self._position
         self._position += len(content)
+        self.writes.append((start, len(content)))
         try:
             if self.error is None:
                 self._write_to_disk(content, start)

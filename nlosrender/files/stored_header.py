@@ -16,6 +16,7 @@ from nlosrender.files import layout
 from nlosrender.files.attributes import get_attributes
 
 Numbers = tuple[float, ...]
+MAX_CHUNK_BYTES = 2**30  # unpacked; a few kilobytes in a file may claim 4 GiB
 
 
 @dataclass(frozen=True)
@@ -110,10 +111,31 @@ def header_of(file: h5py.File, path: Path) -> StoredHeader:
         itemsize=samples.dtype.itemsize,
         chunks=samples.chunks,
         compression=samples.compression or "none",
-        has_variance=isinstance(file.get(layout.VARIANCE), h5py.Dataset),
+        has_variance=dataset_in(file, path, layout.VARIANCE) is not None,
         attributes=attributes,
         data_attributes=data_attributes,
     )
+
+
+def dataset_in(file: h5py.File, path: Path, name: str) -> h5py.Dataset | None:
+    """Return the dataset ``name`` at the root of a file, or None when there is none.
+
+    Raises
+    ------
+    FileError
+        Its numbers lie in another file: a capture must not make this program open whatever it names.
+    """
+    link = file.get(name, getlink=True)
+    if link is None:
+        return None
+    dataset = file.get(name) if isinstance(link, h5py.HardLink) else None
+    if not isinstance(link, h5py.HardLink) or (
+        isinstance(dataset, h5py.Dataset) and (dataset.external or dataset.is_virtual)
+    ):
+        raise FileError(
+            f"{path}: {name} lies in another place or file. Copy it into the file itself, as with h5repack."
+        )
+    return dataset if isinstance(dataset, h5py.Dataset) else None
 
 
 def samples_of(file: h5py.File, path: Path, name: str = layout.DATA) -> h5py.Dataset:
@@ -124,8 +146,8 @@ def samples_of(file: h5py.File, path: Path, name: str = layout.DATA) -> h5py.Dat
     FileError
         It is missing, not numeric, of the wrong rank, or empty.
     """
-    samples = file.get(name)
-    if not isinstance(samples, h5py.Dataset):
+    samples = dataset_in(file, path, name)
+    if samples is None:
         found = ", ".join(sorted(file)[:8]) or "nothing"
         raise FileError(f"{path}: has no dataset {name} (found: {found}). {_NOT_ZNLOS}")
     if samples.dtype.kind not in "iuf":
@@ -138,6 +160,8 @@ def samples_of(file: h5py.File, path: Path, name: str = layout.DATA) -> h5py.Dat
         )
     if 0 in samples.shape:
         raise FileError(f"{path}: {name} is empty: its shape is {samples.shape}")
+    if samples.chunks is not None and prod(samples.chunks) * samples.dtype.itemsize > MAX_CHUNK_BYTES:
+        raise FileError(f"{path}: {name} has chunks of shape {samples.chunks}, need at most 1 GiB each. Use h5repack.")
     return samples
 
 
@@ -158,11 +182,11 @@ def small_numbers(file: h5py.File, path: Path, name: str, exact: bool = False) -
     FileError
         The dataset holds something else.
     """
-    dataset = file.get(name)
-    if dataset is None:
+    if name not in file:
         return None
+    dataset = dataset_in(file, path, name)
     # checked before reading: a dataset may claim any size without taking any
-    if not isinstance(dataset, h5py.Dataset) or dataset.dtype.kind not in "biuf" or not 0 < (dataset.size or 0) <= 16:
+    if dataset is None or dataset.dtype.kind not in "biuf" or not 0 < (dataset.size or 0) <= 16:
         raise FileError(f"{path}: {name} is not what a capture has there. {_NOT_ZNLOS}")
     values = dataset[()]
     if exact and "exact" in dataset.attrs and np.asarray(dataset.attrs["exact"]).dtype.kind in "iuf":
@@ -178,9 +202,9 @@ def stored_points(file: h5py.File, path: Path, name: str, sizes: Mapping[str, in
     FileError
         The dataset is missing, not numeric, or does not have one entry per point.
     """
-    dataset = file.get(name)
+    dataset = dataset_in(file, path, name)
     need = layout.resolve_shape(layout.SPECS[name], sizes)
-    if not isinstance(dataset, h5py.Dataset):
+    if dataset is None:
         raise FileError(f"{path}: has no dataset {name}. {_NOT_ZNLOS}")
     if dataset.dtype.kind not in "iuf" or dataset.size != prod(need):
         raise FileError(f"{path}: {name} is {dataset.dtype} {dataset.shape}, need numbers of shape {need}")

@@ -13,7 +13,7 @@ from nlosrender.capture.bounces import FIRST_BOUNCE as FIRST
 from nlosrender.files import layout
 from nlosrender.files.attributes import get_attributes
 from nlosrender.files.reader import explained_read, open_hdf5
-from nlosrender.files.stored_header import samples_of, small_numbers, stored_points
+from nlosrender.files.stored_header import dataset_in, samples_of, small_numbers, stored_points
 
 CLASSES = {layout.FLOAT: h5py.h5t.FLOAT, layout.INTEGER: h5py.h5t.INTEGER}
 WORDS = {h5py.h5t.FLOAT: "floating point", h5py.h5t.INTEGER: "integer"}
@@ -41,7 +41,7 @@ def validate_file(path: str | Path) -> list[str]:
         found += _samples(samples, sizes)
         for spec in layout.DATASETS:
             if spec.name not in missing:
-                found += _dataset(file[spec.name], spec, sizes)
+                found += _dataset(dataset_in(file, path, spec.name), spec, sizes)
         if not found:  # values mean something only where types and shapes are right
             found += _values(file, path, sizes, confocal) + _points(file, path, sizes, confocal)
         found += _attributes(file, samples)
@@ -63,8 +63,8 @@ def _samples(samples: h5py.Dataset, sizes: Mapping[str, int]) -> list[str]:
     return found
 
 
-def _dataset(dataset: object, spec: layout.DatasetSpec, sizes: Mapping[str, int]) -> list[str]:
-    if not isinstance(dataset, h5py.Dataset):
+def _dataset(dataset: h5py.Dataset | None, spec: layout.DatasetSpec, sizes: Mapping[str, int]) -> list[str]:
+    if dataset is None:
         return [f"{spec.name}: is not a dataset"]
     found = _number(dataset, spec.name, spec.dtype)
     need = layout.resolve_shape(spec, sizes)
@@ -157,6 +157,8 @@ def _stored_parts(samples: h5py.Dataset) -> list[tuple[slice, ...]]:
     """Return the parts of a dataset that take space: its chunks, or for one without chunks its bins one by one."""
     if samples.chunks is None:
         whole = [slice(0, length) for length in samples.shape]
+        if not samples.id.get_storage_size():  # claimed, never written
+            return []
         return [(whole[0], slice(index, index + 1), *whole[2:]) for index in range(samples.shape[1])]
     offsets: list[tuple[int, ...]] = []
     samples.id.chunk_iter(lambda chunk: offsets.append(chunk.chunk_offset))

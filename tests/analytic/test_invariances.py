@@ -14,6 +14,8 @@ import pytest
 from quadrature import Array, Frame
 from rendering import Rendering, flat_wall, render
 
+from nlosrender.capture.plan import BYTES_OF_STATISTICS, BYTES_PER_SUM
+
 ROUNDING = 1e-12
 
 PLATE = {
@@ -56,8 +58,8 @@ def test_cutting_a_capture_into_batches_changes_no_bit(scan: str, spot: float) -
     """What a lane computes depends on its sensor point alone: not on the batch, not on the number of lasers in it."""
     config = interreflections(scan=scan, capture={"laser_spot_radius": spot})
     whole = render(config)
-    # one (sensor, laser) pair: 4 bounce slots of 161 sums, 8 bytes per replica and 56 for statistics
-    pair = 4 * (BINS[2] + 1) * (8 * whole.plan.replicas + 56)
+    # one (sensor, laser) pair: 4 bounce slots of 161 sums
+    pair = 4 * (BINS[2] + 1) * (BYTES_PER_SUM * whole.plan.replicas + BYTES_OF_STATISTICS)
     for pairs in {"exhaustive": (1, 3, 13)}.get(scan, (2, 7)):
         cut = render(config, batch_bytes=pairs * pair)
         assert len(cut.plan.batches) > 2

@@ -43,7 +43,7 @@ def test_a_render_leaves_a_valid_file_and_an_honest_report(scan, tmp_path):
     done = run("render", config, "-o", "capture.hdf5", "--json", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     report = json.loads(done.stdout)
-    assert set(report["seconds"]) == {"scene", "compile", "render", "write", "total"}
+    assert set(report["seconds"]) == {"scene", "compile", "render", "compress", "write", "total"}
     assert report["error_estimate"] > 0
     assert report["out_of_window"] == 0
     assert validate_file(tmp_path / "capture.hdf5") == []
@@ -120,7 +120,7 @@ def test_a_capture_that_cannot_fit_is_refused(tmp_path):
     assert "memory_limit" in done.stderr
 
 
-@pytest.mark.parametrize("command", ["render", "doctor", "new", "validate", "schema", "info", "plot"])
+@pytest.mark.parametrize("command", ["render", "merge", "doctor", "new", "validate", "schema", "info", "plot"])
 def test_help_ends_with_an_example(command, tmp_path):
     """Each command's --help shows one real call and what it creates."""
     done = run(command, "--help", cwd=tmp_path)

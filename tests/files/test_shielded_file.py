@@ -91,7 +91,7 @@ def test_an_interrupted_write_leaves_nothing(
         return true_write(descriptor, content, offset)
 
     # no cache: every chunk is written at once
-    monkeypatch.setattr("nlosrender.files.writer.CHUNK_CACHE_BYTES", 0)
+    monkeypatch.setattr("nlosrender.files.sink.CHUNK_CACHE_BYTES", 0)
 
     def render() -> None:
         with CaptureWriter(tmp_path / "a.hdf5", header_of("single", n_bins=50_000), compression="none") as writer:

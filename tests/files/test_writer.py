@@ -388,6 +388,7 @@ def test_long_configurations_fit(tmp_path: Path, header_of: Callable, write_capt
         ("x" * 300 + ".hdf5", "File name too long"),
         ("a\0b.hdf5", "cannot be used as an output"),
         ("pipe", "is not a regular file"),
+        ("/proc/a.hdf5", "cannot be written: .*"),  # takes no files, not even root's
     ],
 )
 def test_outputs_that_cannot_be_written(tmp_path: Path, header_of: Callable, name: str, message: str) -> None:

@@ -12,7 +12,8 @@ from rendering import configured, flat_wall
 from nlosrender import pipeline
 from nlosrender.capture.bounces import BounceAxis
 from nlosrender.capture.limits import refuse_impossible_grids, refuse_impossible_samples
-from nlosrender.capture.plan import Batch, Plan, Tile
+from nlosrender.capture.part import Part, Tiling
+from nlosrender.capture.plan import Batch, Plan, Tile, Unit
 from nlosrender.engine.backend import start_backend
 from nlosrender.errors import RenderError
 from nlosrender.files.size import FileSize, disk_warnings, forecast_size
@@ -22,6 +23,12 @@ PLATE = {"type": "rectangle", "width": 0.5, "height": 0.4, "center": [0.1, 0, 0.
 RED = {"type": "diffuse", "reflectance": [0.8, 0.1, 0.1]}
 BALL = {"type": "sphere", "center": [0.5, 0.2, 1.1], "radius": 0.2}
 ROOM = {"type": "room", "size": [2.0, 1.6, 1.5]}
+
+
+def plan_of(batches: tuple[Batch, ...], replicas: int, bytes_per_batch: int) -> Plan:
+    """A plan whose units are single batches."""
+    units = tuple(Unit(batch.sensors, batch.lasers, (batch,)) for batch in batches)
+    return Plan(units, replicas, bytes_per_batch, Tiling(3, 5, 1, 1), Part((0, 1), (0, 15)))
 
 
 # --- sizes ---
@@ -173,7 +180,11 @@ TUBE = {"type": "cylinder", "center": [0, 0, 0], "axis": [0, 1, 0], "radius": 1.
         ("colour", ((PLATE,), {}), (({**PLATE, "bsdf": RED},), {})),
         ("colour", (({**PLATE, "bsdf": RED},), {"color": "grey"}), ((PLATE,), {"color": "rgb"})),
         ("BSDF sampling at the wall (MIS)", ((PLATE,), {"engine": "path"}), ((ROOM,), {"engine": "path"})),
-        ("BSDF sampling at the wall (MIS)", ((PLATE,), {"max_bounces": 4, "engine": "path"}), ((PLATE,), {"max_bounces": 4})),
+        (
+            "BSDF sampling at the wall (MIS)",
+            ((PLATE,), {"max_bounces": 4, "engine": "path"}),
+            ((PLATE,), {"max_bounces": 4}),
+        ),
         ("hidden geometry sampling (MIS)", ((ROOM,), {"engine": "path"}), ((PLATE,), {"engine": "path"})),
         (
             "hidden geometry sampling (MIS)",
@@ -271,7 +282,7 @@ def test_a_memory_limit_is_checked_against_machine_and_lanes():
     backend, plan, engine = prepared(config)
     assert list(memory_warnings(engine, plan, None, backend.lanes)) == []
     assert "is more than the machine's" in next(memory_warnings(engine, plan, 10**16, backend.lanes))
-    cut = Plan((Batch(Tile(0, 1, 0, 2), Tile(0, 8, 0, 9)),) * 750, plan.replicas, 10**6)
+    cut = plan_of((Batch(Tile(0, 1, 0, 2), Tile(0, 8, 0, 9)),) * 750, plan.replicas, 10**6)
     (warning,) = memory_warnings(engine, cut, 10**9, backend.lanes)
     assert "batches of 2 sensor points, too few" in warning
 
@@ -308,7 +319,7 @@ def clockwork(monkeypatch):
 
 
 OVERHEAD_PATHS = 3.1e-4  # s: the overhead is measured with two paths per sensor point, 2 * 15 * 1e-5 s
-WHOLE = Plan((Batch(Tile(0, 3, 0, 5), Tile(0, 1, 0, 1)),), 2, 1000)
+WHOLE = plan_of((Batch(Tile(0, 3, 0, 5), Tile(0, 1, 0, 1)),), 2, 1000)
 
 
 def test_time_is_linear_in_paths(clockwork):
@@ -359,7 +370,7 @@ def test_the_pilot_lies_within_a_batch_and_its_memory():
     engine = SimpleNamespace(capture=SimpleNamespace(scan_type="single"))
     for rows, columns, n_bytes in ((30, 50, 10**10), (3, 500, 10**9), (40, 1, 10**9), (2, 3, 10**12), (3, 5, 10)):
         whole = Tile(10, 10 + rows, 20, 20 + columns)
-        pilot = pilot_batch(engine, Plan((Batch(whole, Tile(0, 1, 0, 1)),), 2, n_bytes)).sensors
+        pilot = pilot_batch(engine, plan_of((Batch(whole, Tile(0, 1, 0, 1)),), 2, n_bytes)).sensors
         assert whole.y0 <= pilot.y0 < pilot.y1 <= whole.y1
         assert whole.x0 <= pilot.x0 < pilot.x1 <= whole.x1
         assert pilot.size == 1 or pilot.size * n_bytes / whole.size <= PILOT_BYTES
@@ -374,7 +385,7 @@ def test_many_lasers_are_cut_once_the_pilot_is_down_to_one_sensor_point():
     engine = SimpleNamespace(capture=SimpleNamespace(scan_type="exhaustive"))
     lasers = Tile(0, 1000, 0, 999)
     few, many = (
-        pilot_batch(engine, Plan((Batch(Tile(0, 1, 0, 2), lasers),), 2, int(n_bytes)))
+        pilot_batch(engine, plan_of((Batch(Tile(0, 1, 0, 2), lasers),), 2, int(n_bytes)))
         for n_bytes in (2 * PILOT_BYTES, 20 * PILOT_BYTES)
     )
     assert (few.sensors.size, few.lasers) == (1, lasers)

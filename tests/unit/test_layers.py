@@ -10,7 +10,7 @@ import pytest
 import nlosrender
 
 PACKAGE = Path(nlosrender.__file__).parent
-STAGES = ("config", "scene", "capture", "engine", "sensor", "files", "analysis", "bench", "cli")
+STAGES = ("config", "scene", "capture", "engine", "sensor", "files", "rendering", "analysis", "bench", "cli")
 SHARED = ("units", "errors")
 MODULES = sorted(PACKAGE.rglob("*.py"))
 IN_STAGES = [path for path in MODULES if path.relative_to(PACKAGE).parts[0] in STAGES]

@@ -6,7 +6,18 @@ import numpy as np
 import pytest
 
 from nlosrender.capture.grids import Capture, point_grid, single_point
-from nlosrender.capture.plan import BYTES_OF_STATISTICS, BYTES_PER_SUM, MOST_SUMS, plan_capture, tiles
+from nlosrender.capture.part import WHOLE, Selection
+from nlosrender.capture.plan import (
+    BYTES_OF_ASSEMBLY,
+    BYTES_OF_STATISTICS,
+    BYTES_PER_SUM,
+    MOST_SUMS,
+    Plan,
+    plan_capture,
+    remaining_units,
+    tiles,
+)
+from nlosrender.capture.tile import Tile, joined, runs
 from nlosrender.errors import RenderError
 from nlosrender.scene.pose import Pose
 from nlosrender.scene.relay_wall import RectangleWall
@@ -72,3 +83,108 @@ def test_a_batch_stays_within_32_bit_indices():
     largest = max(batch.sensors.size * batch.lasers.size for batch in plan.batches)
     assert largest * plan.replicas * 6 * (10**7 + 1) <= MOST_SUMS
     assert len(plan.batches) > 1
+
+
+# --- units ---
+
+PAIR = 101 * (BYTES_PER_SUM * 2 + BYTES_OF_STATISTICS)  # bytes of one pair with one row of 100 bins
+
+
+def planned(scan_type: str, pairs: float, selection: Selection = WHOLE, lanes: int = 8) -> Plan:
+    """Plan with storage tiles of 2 x 3 of the 3 x 5 sensors, and memory for so many pairs."""
+    memory = int(pairs * PAIR) + 6 * 101 * BYTES_OF_ASSEMBLY
+    scanned = capture(scan_type)
+    options = {"rows_per_pair": 1, "n_bins": 100, "lanes": lanes, "memory_limit": memory}
+    return plan_capture(scanned, **options, storage_tile=(2, 3), selection=selection)
+
+
+def pairs_of(unit) -> set[tuple[int, int]]:
+    return set(itertools.product(unit.sensors.flat_indices(5), unit.lasers.flat_indices(7)))
+
+
+@pytest.mark.parametrize("scan_type", ["single", "confocal", "exhaustive"])
+@pytest.mark.parametrize("pairs", [1, 2, 5, 6, 14, 40, 90, 1000])
+@pytest.mark.parametrize("shard", [None, (1, 3), (2, 3), (3, 3)])
+def test_units_are_whole_storage_tiles(scan_type, pairs, shard):
+    """Each chunk of the file is filled by one unit, and a unit's batches cover it once, within the memory."""
+    plan = planned(scan_type, pairs, Selection(shard=shard))
+    cells = list(plan.tiling.cells(plan.part.strips))
+    covered = [0] * len(cells)
+    for unit in plan.units:
+        inside = [cell for cell in cells if unit.sensors.contains(cell)]
+        assert sum(cell.size for cell in inside) == unit.sensors.size
+        for cell in inside:
+            covered[cells.index(cell)] += 1 if scan_type == "confocal" else unit.lasers.size
+        points = [point for batch in unit.batches for point in batch.sensors.flat_indices(5)]
+        assert sorted(points) == unit.sensors.flat_indices(5)
+        for batch in unit.batches:
+            assert batch.lasers == (batch.sensors if scan_type == "confocal" else unit.lasers)
+            size = batch.sensors.size * (1 if scan_type == "confocal" else batch.lasers.size)
+            assert size * PAIR <= plan.bytes_per_batch <= pairs * PAIR + 6 * 101 * BYTES_OF_ASSEMBLY
+    assert covered == [plan.part.lasers[1] - plan.part.lasers[0]] * len(cells)
+
+
+def test_lanes_come_before_lasers():
+    """A batch takes sensor points until the lanes are busy, and only then more lasers: 12 lanes are 6 points twice.
+
+    Storage tiles are 2 x 3, 2 x 2, 1 x 3 and 1 x 2: the last two are joined for it, though memory for 28 pairs would
+    do for 2 points with all 14 lasers.
+    """
+    plan = planned("exhaustive", 28, lanes=12)
+    assert plan.replicas == 2
+    assert {unit.sensors.size for unit in plan.units} == {6, 4, 5}
+    assert {unit.lasers.size for unit in plan.units if unit.sensors.size == 6} == {4, 3}
+
+
+@pytest.mark.parametrize("scan_type", ["confocal", "exhaustive"])
+@pytest.mark.parametrize("first", [1, 9, 28, 90])
+@pytest.mark.parametrize("then", [1, 13, 50])
+def test_what_is_left_after_other_units(scan_type, first, then):
+    """Whatever the memory was and is, nothing that is finished is done again and nothing is left out."""
+    before, now = planned(scan_type, first), planned(scan_type, then)
+    everything = set().union(*(pairs_of(unit) for unit in now.units))
+    for n_finished in range(0, len(before.units) + 1, max(1, len(before.units) // 5)):
+        finished = before.units[:n_finished]
+        left = remaining_units(now, scan_type == "confocal", [(unit.sensors, unit.lasers) for unit in finished])
+        done = set().union(*(pairs_of(unit) for unit in finished)) if finished else set()
+        todo = [pair for unit in left for pair in pairs_of(unit)]
+        assert len(todo) == len(set(todo))
+        assert done.isdisjoint(todo)
+        if scan_type == "exhaustive":
+            assert done | set(todo) == everything
+        else:
+            assert sum(unit.sensors.size for unit in (*finished, *left)) == 15
+        for unit in left:
+            sizes = [batch.sensors.size for batch in unit.batches]
+            assert sum(sizes) == unit.sensors.size
+
+
+def test_an_unchanged_plan_goes_on_where_it_stopped():
+    """With the same memory the units that are left are those of the plan, in their order."""
+    plan = planned("exhaustive", 9)
+    finished = [(unit.sensors, unit.lasers) for unit in plan.units[:7]]
+    assert remaining_units(plan, False, finished) == list(plan.units[7:])
+
+
+@pytest.mark.parametrize(("first", "last", "most"), [(0, 14, 100), (3, 12, 100), (3, 12, 4), (8, 9, 1), (6, 14, 7)])
+def test_runs_keep_the_order_of_the_indices(first, last, most):
+    """A range of a 2 x 7 grid is cut into rectangles whose points are the range, in order."""
+    found = list(runs(first, last, 7, most))
+    assert [index for tile in found for index in tile.flat_indices(7)] == list(range(first, last))
+    assert all(tile.size <= most for tile in found)
+
+
+def test_neighbours_are_joined_along_rows_first():
+    """2 x 2 cells of 2 x 3 points: in pairs along a row, then all; a cell larger than asked for stays."""
+    cells = [Tile(0, 2, 0, 3), Tile(0, 2, 3, 6), Tile(2, 4, 0, 3), Tile(2, 4, 3, 6)]
+    assert joined(cells, 1) == cells
+    assert joined(cells, 12) == [Tile(0, 2, 0, 6), Tile(2, 4, 0, 6)]
+    assert joined(cells, 23) == [Tile(0, 2, 0, 6), Tile(2, 4, 0, 6)]
+    assert joined(cells, 24) == [Tile(0, 4, 0, 6)]
+    assert joined([cells[1], cells[2]], 99) == [cells[1], cells[2]]  # no rectangle
+
+
+def test_a_storage_tile_that_does_not_fit_is_an_error_that_says_what_to_do():
+    """What is put together from batches has to fit beside them."""
+    with pytest.raises(RenderError, match=r"memory_limit.*Raise it"):
+        planned("exhaustive", 0.5)

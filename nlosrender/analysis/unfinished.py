@@ -1,0 +1,47 @@
+"""What there is of a capture that is still being rendered, or was interrupted."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from nlosrender.errors import FileError
+from nlosrender.files.journal import read_records
+from nlosrender.files.partial_capture import JOURNAL
+from nlosrender.files.reader import explained_read
+from nlosrender.files.unit_log import UnfinishedRender
+
+
+def is_unfinished(path: str | Path) -> bool:
+    """Return whether a path is the folder of an unfinished capture."""
+    return (Path(path) / JOURNAL).is_file()
+
+
+def summarise_unfinished(folder: str | Path) -> dict[str, object]:
+    """Return what the journal of an unfinished capture says, as JSON can hold it.
+
+    Raises
+    ------
+    FileError
+        There is no journal, or it says nothing.
+    """
+    folder = Path(folder)
+    with explained_read(folder):
+        state = UnfinishedRender.from_records(read_records(folder / JOURNAL))
+    if not state.first:
+        raise FileError(f"{folder}: nothing has been rendered into it yet")
+    tally, identity = state.tally, state.first["identity"]
+    confocal = identity["config"].get("capture", {}).get("scan_type") == "confocal"
+    pairs = sum(sensors.size * (1 if confocal else lasers.size) for sensors, lasers in tally.units)
+    error = tally.sums.error_estimate
+    return {
+        "file": str(folder),
+        "unfinished": True,
+        "name": identity["config"].get("name"),
+        "part": identity.get("part"),
+        "finished_units": len(tally.units),
+        "finished_pairs": pairs,
+        "size_of_chunks": tally.n_bytes,
+        "error_estimate": error if error < float("inf") else None,
+        "render_seconds": tally.sums.seconds,
+        "last_begun_by": f"process {state.first.get('process')} on {state.first.get('machine')}",
+    }

@@ -1,0 +1,47 @@
+"""``nlosrender merge``: the parts of a capture into one file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+
+def register(app: typer.Typer) -> None:
+    """Add ``merge`` to ``app``."""
+    app.command(
+        "merge",
+        epilog="Example: nlosrender merge part*.hdf5 -o whole.hdf5   "
+        "(creates whole.hdf5, the capture that one render without --shard would have written)",
+    )(merge)
+
+
+def merge(
+    parts: Annotated[
+        list[Path], typer.Argument(metavar="PART...", help="Files rendered with --shard or --lasers, in any order.")
+    ],
+    output: Annotated[Path, typer.Option("--output", "-o", help="File to write.")],
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress bar, no report.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the report as one JSON object.")] = False,
+) -> None:
+    """Put the parts of a capture together; what is missing, there twice, damaged or not its own is named."""
+    from nlosrender.cli.progress import progress_bar
+    from nlosrender.files.merge import merge_captures
+
+    with progress_bar("merge", hidden=quiet) as (progress, _):
+        report = merge_captures(parts, output, progress)
+    if as_json:
+        import dataclasses
+        import json
+        import math
+
+        content = dataclasses.asdict(report) | {"output": str(report.output)}
+        if not math.isfinite(report.error_estimate):
+            content["error_estimate"] = None  # pure noise: JSON knows no infinity
+        typer.echo(json.dumps(content))
+    elif not quiet:
+        typer.echo(f"wrote {report.output} from {report.parts} parts")
+        typer.echo(f"  error estimate  {report.error_estimate:.2%} (relative L2)")
+        energies = ", ".join(f"{name}: {energy:.4g}" for name, energy in report.energy.items())
+        typer.echo(f"  energy          bounce {energies}; outside the time window: {report.out_of_window:.4g}")

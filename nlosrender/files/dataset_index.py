@@ -1,0 +1,108 @@
+"""The index of a dataset: which capture holds what, as one JSON file beside the captures."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from nlosrender.errors import FileError
+from nlosrender.files.part_attributes import PART, json_object
+from nlosrender.files.reader import read_header
+from nlosrender.files.replacement import check_writable, explained_write, partial_path, publish
+
+FORMAT_VERSION = 1
+
+Status = Literal["done", "pending", "failed"]
+
+
+@dataclass(frozen=True)
+class IndexEntry:
+    """One capture of a dataset; what only a finished one can tell is None before."""
+
+    index: int
+    file: str  # relative to the index's folder
+    values: Mapping[str, Any]  # of the keys that differ between the captures
+    status: Status
+    capture_hash: str  # of the configuration, without where and on what it is rendered
+    config_hash: str | None = None
+    energy: Mapping[str, float] | None = None  # H summed over the capture, by bounce [J m^-2 sr^-1]
+    error_estimate: float | None = None  # relative L2 of H
+    seconds: float | None = None  # of the run that finished it
+    message: str | None = None  # why it failed
+
+
+def stored_entry(index: int, path: Path, folder: Path, values: Mapping[str, Any], capture_hash: str) -> IndexEntry:
+    """Return the entry of a capture by what its file says; ``pending`` unless the file holds all of this capture.
+
+    Parameters
+    ----------
+    index, values
+        Of the capture.
+    path, folder
+        The file, and the folder of the index.
+    capture_hash
+        What the file has to say that it holds.
+    """
+    entry = IndexEntry(index, relative_name(path, folder), values, "pending", capture_hash)
+    try:
+        attributes = read_header(path).attributes
+    except FileError:  # missing, or no capture: to be rendered
+        return entry
+    if attributes.get("capture_hash") != capture_hash or PART in attributes:
+        return entry
+    error, stored = attributes.get("error_estimate"), attributes.get("config_hash")
+    return IndexEntry(
+        index,
+        entry.file,
+        values,
+        "done",
+        capture_hash,
+        config_hash=stored if isinstance(stored, str) else None,
+        energy=json_object(attributes.get("energy")),
+        error_estimate=error if isinstance(error, float) else None,
+        seconds=json_object(attributes.get("seconds")).get("total"),
+    )
+
+
+def relative_name(path: Path, folder: Path) -> str:
+    """Return a file's name as the index has it."""
+    return Path(os.path.relpath(path.absolute(), folder)).as_posix()
+
+
+def write_index(path: Path, source: str, keys: Sequence[str], entries: Sequence[IndexEntry]) -> None:
+    """Write an index; it appears whole or not at all.
+
+    Parameters
+    ----------
+    path
+        The index.
+    source
+        What the captures were made from.
+    keys
+        The keys that differ between them.
+    entries
+        All captures, in their order.
+
+    Raises
+    ------
+    FileError
+        It cannot be written.
+    """
+    content = {
+        "format_version": FORMAT_VERSION,
+        "source": source,
+        "keys": list(keys),
+        "captures": [asdict(entry) for entry in entries],
+    }
+    target = check_writable(path)
+    partial = partial_path(target)
+    try:
+        with explained_write(path):
+            partial.write_text(json.dumps(content, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+            publish(partial, target)
+    finally:
+        partial.unlink(missing_ok=True)

@@ -1,0 +1,120 @@
+"""What makes two renders the same capture: only then may one continue, or complete, the other."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from nlosrender.config.canonical import tree_hash
+from nlosrender.files.layout import FORMAT_VERSION
+from nlosrender.files.provenance import package_versions
+
+# Where a capture is written and what it is rendered on say nothing about its samples; the backend that was used is
+# told by the Mitsuba variant.
+NOT_THE_CAPTURE = (("output", "path"), ("render", "memory_limit"), ("render", "backend"))
+PACKAGES = ("nlosrender", "mitsuba", "drjit")  # whose versions the samples depend on
+FILE_KEY = "filename"  # of meshes, textures, spectra
+
+
+def capture_identity(resolved_config: Mapping[str, Any], part: str, variant: str, replicas: int) -> dict[str, Any]:
+    """Return all that has to agree for a render to go on with an earlier one.
+
+    Parameters
+    ----------
+    resolved_config
+        The configuration with all defaults filled in, plain and JSON-able.
+    part
+        Which part of the capture is rendered, in words.
+    variant
+        Mitsuba variant.
+    replicas
+        Independent estimates behind each sensor point; for small grids the number of processors decides.
+    """
+    config = comparable_config(resolved_config)
+    versions = rendering_versions()
+    return {"config": config, "versions": versions, "variant": variant, "replicas": replicas, "part": part}
+
+
+def identity_attributes(identity: Mapping[str, Any]) -> dict[str, object]:
+    """Return the attributes by which a file tells the capture it is, or is a part of."""
+    told = {name: identity[name] for name in ("variant", "replicas")}
+    return {"capture_hash": tree_hash(identity["config"])} | told
+
+
+def comparable_config(resolved_config: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a configuration without what does not change the samples, and with the content of files for their names.
+
+    Parameters
+    ----------
+    resolved_config
+        The configuration with all defaults filled in, plain and JSON-able.
+    """
+    kept: dict[str, Any] = {
+        section: {
+            key: value
+            for key, value in (content.items() if isinstance(content, Mapping) else ())
+            if (section, key) not in NOT_THE_CAPTURE
+        }
+        if isinstance(content, Mapping)
+        else content
+        for section, content in resolved_config.items()
+    }
+    with_content: dict[str, Any] = _with_content(kept)
+    return with_content
+
+
+def capture_hash(resolved_config: Mapping[str, Any]) -> str:
+    """Return the hash by which files of the same capture are known: their attribute ``capture_hash``.
+
+    Parameters
+    ----------
+    resolved_config
+        The configuration with all defaults filled in, plain and JSON-able.
+    """
+    return tree_hash(comparable_config(resolved_config))
+
+
+def rendering_versions() -> dict[str, str]:
+    """Return the versions that have to agree: of the packages behind the samples, and of the file layout."""
+    installed = package_versions()
+    return {package: installed[package] for package in PACKAGES} | {"file layout": str(FORMAT_VERSION)}
+
+
+def differences(one: Any, other: Any, key: str = "") -> Iterator[tuple[str, str, str]]:
+    """Yield (dotted key, value in ``one``, value in ``other``) for everything in which two trees differ."""
+    if one == other:
+        return
+    if isinstance(one, Mapping) and isinstance(other, Mapping):
+        for name in [*one, *(name for name in other if name not in one)]:
+            yield from differences(one.get(name), other.get(name), f"{key}.{name}" if key else str(name))
+    elif isinstance(one, list) and isinstance(other, list) and len(one) == len(other):
+        for index, (first, second) in enumerate(zip(one, other, strict=True)):
+            yield from differences(first, second, f"{key}.{index}")
+    else:
+        yield key, _shown(one), _shown(other)
+
+
+def _shown(value: Any) -> str:
+    text = json.dumps(value)
+    return text if len(text) <= 40 else f"{text[:40]}..."
+
+
+def _with_content(tree: Any) -> Any:
+    if isinstance(tree, Mapping):
+        return {
+            key: _content(value) if key == FILE_KEY and isinstance(value, str) else _with_content(value)
+            for key, value in tree.items()
+        }
+    return [_with_content(item) for item in tree] if isinstance(tree, (list, tuple)) else tree
+
+
+def _content(name: str) -> str:
+    """Return a digest of a file: the same mesh may lie elsewhere on another machine, or be another one by now."""
+    try:
+        with Path(name).open("rb") as stream:
+            return f"sha256:{hashlib.file_digest(stream, 'sha256').hexdigest()}"
+    except OSError:  # the renderer says so, with its place in the YAML
+        return name

@@ -1,0 +1,135 @@
+"""An append-only list of records that survives the process being killed at any byte.
+
+One line per record: CRC-32 of the rest, a space, JSON. A line that was cut off fails its checksum; it and everything
+after it never happened. The file is locked while it is open; the system drops the lock with the process.
+"""
+
+from __future__ import annotations
+
+import errno
+import fcntl
+import json
+import os
+import zlib
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+# File systems without locks (some network ones): two renders into one file are then the user's to avoid.
+NO_LOCKS = (errno.ENOSYS, errno.EOPNOTSUPP, errno.ENOLCK, errno.EINVAL)
+
+
+class JournalInUseError(Exception):
+    """Another process has the journal open."""
+
+
+class Journal:
+    """A journal open for appending.
+
+    Parameters
+    ----------
+    path
+        Its file; created when it is missing.
+
+    Raises
+    ------
+    JournalInUseError
+        Another process has it open.
+    OSError
+        The system refuses.
+    """
+
+    def __init__(self, path: Path):
+        self.path = path
+        self._descriptor = _locked(path)
+        try:
+            self._end = sum(length for _, length in _lines(path))
+            os.ftruncate(self._descriptor, self._end)  # a record that was cut off must not run into the next one
+        except BaseException:
+            self.close()
+            raise
+
+    def records(self) -> Iterator[dict[str, Any]]:
+        """Yield the records from the oldest on, read anew: there may be more of them than memory."""
+        for record, _ in _lines(self.path):
+            yield record
+
+    def append(self, record: Mapping[str, Any]) -> None:
+        """Add a record.
+
+        Raises
+        ------
+        OSError
+            The disk is full, or gone; the record does not count.
+        """
+        line = _line(record)
+        written = 0
+        while written < len(line):  # the system may take less than it is given, as the disk fills
+            written += os.pwrite(self._descriptor, line[written:], self._end + written)
+        self._end += len(line)
+
+    def clear(self) -> None:
+        """Forget all records.
+
+        Raises
+        ------
+        OSError
+            The system refuses.
+        """
+        os.ftruncate(self._descriptor, 0)
+        self._end = 0
+
+    def close(self) -> None:
+        """Give the lock back; once is enough."""
+        if self._descriptor >= 0:
+            os.close(self._descriptor)
+            self._descriptor = -1
+
+
+def read_records(path: Path) -> Iterator[dict[str, Any]]:
+    """Yield the records of a journal that may be in use.
+
+    Raises
+    ------
+    OSError
+        It cannot be read.
+    """
+    for record, _ in _lines(path):
+        yield record
+
+
+def _locked(path: Path) -> int:
+    while True:
+        descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            if error.errno not in NO_LOCKS:
+                os.close(descriptor)
+                if isinstance(error, BlockingIOError):
+                    raise JournalInUseError(str(path)) from error
+                raise
+        # who held the lock may have finished and removed the file since it was opened here
+        try:
+            if os.path.samestat(os.stat(path), os.fstat(descriptor)):
+                return descriptor
+        except FileNotFoundError:
+            if not path.parent.is_dir():
+                os.close(descriptor)
+                raise
+        os.close(descriptor)
+
+
+def _line(record: Mapping[str, Any]) -> bytes:
+    text = json.dumps(record, separators=(",", ":"), allow_nan=False).encode()
+    return b"%08x %s\n" % (zlib.crc32(text), text)
+
+
+def _lines(path: Path) -> Iterator[tuple[dict[str, Any], int]]:
+    """Yield (record, length of its line) up to the first line that is not whole."""
+    with path.open("rb") as stream:
+        for line in stream:
+            checksum, _, text = line.partition(b" ")
+            if not text.endswith(b"\n") or checksum != b"%08x" % zlib.crc32(text[:-1]):
+                return
+            yield json.loads(text), len(line)

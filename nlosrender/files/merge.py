@@ -1,0 +1,182 @@
+"""Puts the parts of a capture together, chunk by chunk: memory does not grow with the capture."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import zlib
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+
+import h5py
+import numpy as np
+
+from nlosrender.capture.bounces import BounceAxis
+from nlosrender.capture.tile import Tile
+from nlosrender.config.canonical import tree_hash
+from nlosrender.errors import FileError
+from nlosrender.files import layout
+from nlosrender.files.interruption import uninterrupted
+from nlosrender.files.part_attributes import CHECKSUMS, NOTE, PART, SUMS, json_object, summed_attributes
+from nlosrender.files.pieces import PackedChunk
+from nlosrender.files.reader import explained_read, open_hdf5
+from nlosrender.files.replacement import check_writable, explained_write, partial_path, publish
+from nlosrender.files.shards import Shard, read_shards
+from nlosrender.files.sink import CaptureSink, sample_names
+from nlosrender.files.sums import Sums
+from nlosrender.files.unit_log import CHECKSUM_RANGE, placed_checksum
+
+Progress = Callable[[float], None]
+
+
+@dataclass(frozen=True)
+class MergeReport:
+    """What was put together."""
+
+    output: Path
+    parts: int
+    error_estimate: float  # relative L2 error of H over the whole capture
+    energy: dict[str, float]  # H summed over the capture, per bounce [J m^-2 sr^-1]
+    out_of_window: float  # the same outside the time window
+    samples: int  # paths per sensor point, the least of all parts
+
+
+def merge_captures(
+    paths: Sequence[str | Path], output: str | Path, progress: Progress = lambda share: None
+) -> MergeReport:
+    """Put the parts of a capture together; ``data`` is bit for bit what one render of the whole would have given.
+
+    Parameters
+    ----------
+    paths
+        Files rendered with ``--shard`` or ``--lasers``, in any order.
+    output
+        File to write; it appears when it is complete.
+    progress
+        Told the share of the work done.
+
+    Raises
+    ------
+    FileError
+        A part is damaged, of another capture, overlaps another one or is missing; or the output cannot be written.
+    """
+    output = Path(output)
+    target = check_writable(output)
+    shards = read_shards([Path(path) for path in paths])
+    for shard in shards:
+        if target.exists() and target.samefile(shard.path):
+            raise FileError(f"{output}: is one of the parts. Name another output.")
+    partial = partial_path(target)
+    sink: CaptureSink | None = None
+    try:
+        with uninterrupted(), explained_write(output):
+            shutil.copyfile(shards[0].path, partial)  # its samples included
+        sink = CaptureSink(partial, output, sample_names(shards[0].header.has_variance))
+        for number, shard in enumerate(shards):
+            _copy(shard, None if number == 0 else sink)
+            progress((number + 1) / len(shards))
+        sums = sum((shard.stored.sums for shard in shards), Sums())
+        sink.remove_attributes((PART, SUMS, CHECKSUMS, NOTE))
+        sink.set_attributes(_attributes(shards, sums, output))
+        sink.close()
+        with uninterrupted(), explained_write(output):
+            publish(partial, target)
+    finally:
+        with uninterrupted():
+            if sink is not None:
+                sink.abandon()
+            with suppress(OSError):
+                partial.unlink(missing_ok=True)
+    return MergeReport(
+        output=output,
+        parts=len(shards),
+        error_estimate=sums.error_estimate,
+        energy=sums.energy_per_bounce(_bounces(shards[0])),
+        out_of_window=float(sums.outside),
+        samples=sums.samples or 0,
+    )
+
+
+def _copy(shard: Shard, sink: CaptureSink | None) -> None:
+    """Copy a shard's chunks, or only check that they are what was rendered.
+
+    Raises
+    ------
+    FileError
+        They are not.
+    """
+    whole = set(shard.tiling.tiles())
+    with open_hdf5(shard.path) as file, explained_read(shard.path):
+        for name in sample_names(shard.header.has_variance):
+            samples: h5py.Dataset = file[name]
+            existing: set[tuple[int, ...]] = set()
+            # not one by one: HDF5 goes through all chunks for each
+            samples.id.chunk_iter(lambda chunk, existing=existing: existing.add(chunk.chunk_offset))
+            checksum = found = 0
+            for cell, chunk in _places(shard):
+                if chunk not in existing:
+                    continue
+                _, content = samples.id.read_direct_chunk(chunk)
+                checksum += placed_checksum(chunk, zlib.crc32(content))
+                found += 1
+                if sink is not None and cell in whole:
+                    sink.put(PackedChunk(name, chunk, content))
+                elif sink is not None:  # the rest of this chunk is another shard's
+                    where = _selection(shard, cell, chunk)
+                    sink.fill(name, where, np.asarray(samples[where], dtype=np.float32))
+            damaged = checksum % CHECKSUM_RANGE != shard.stored.checksum.get(name, 0)
+            if damaged or found != len(existing):
+                message = f"{shard}: is damaged: its {name} is not what was rendered."
+                raise FileError(f"{message} Copy it again, or render it again.")
+
+
+def _places(shard: Shard) -> Iterator[tuple[Tile, tuple[int, ...]]]:
+    """Yield where a shard may have chunks: the sensor points it has of them, and where they start in file order."""
+    header, part, sizes = shard.header, shard.part, shard.header.sizes
+    tiling, steps = shard.tiling, dict(zip(layout.file_axes(header.confocal), header.chunks or (), strict=True))
+    for laser in range(*part.lasers):
+        laser_y, laser_x = divmod(laser, sizes["laser_x"])
+        for cell in tiling.cells(part.strips):
+            corner = {"sensor_y": cell.y0 // tiling.rows * tiling.rows, "sensor_x": cell.x0, "laser_y": laser_y}
+            corner["laser_x"] = laser_x
+            for channel in range(sizes["channel"]):
+                for bounce in header.bounce_indices:
+                    for time_bin in range(0, sizes["bin"], steps["bin"]):
+                        place = corner | {"channel": channel, "bounce": bounce, "bin": time_bin}
+                        yield cell, layout.in_file_order(place, header.confocal)
+
+
+def _selection(shard: Shard, cell: Tile, chunk: tuple[int, ...]) -> tuple[slice, ...]:
+    """Return what a shard has of a chunk, as a selection of the dataset."""
+    header = shard.header
+    axes, steps, shape = layout.file_axes(header.confocal), header.chunks or (), header.data_shape
+    inside = {
+        axis: slice(start, min(start + step, length))
+        for axis, start, step, length in zip(axes, chunk, steps, shape, strict=True)
+    }
+    rows = {"sensor_y": slice(cell.y0, cell.y1), "sensor_x": slice(cell.x0, cell.x1)}
+    return layout.in_file_order(inside | rows, header.confocal)
+
+
+def _attributes(shards: Sequence[Shard], sums: Sums, output: Path) -> dict[str, object]:
+    """Return the attributes of the whole that its first part does not have."""
+    attributes = shards[0].header.attributes
+    seconds: dict[str, float] = {}
+    for shard in shards:
+        for stage, spent in json_object(shard.header.attributes.get("seconds")).items():
+            seconds[stage] = seconds.get(stage, 0.0) + float(spent)
+    changed: dict[str, object] = {"created": datetime.now(UTC).isoformat(timespec="seconds")}
+    config = json_object(attributes.get("config"))
+    if isinstance(config.get("output"), dict):
+        config["output"]["path"] = str(output)
+        changed |= {"config": json.dumps(config, ensure_ascii=False), "config_hash": tree_hash(config)}
+    return changed | summed_attributes(sums, _bounces(shards[0]), seconds)
+
+
+def _bounces(shard: Shard) -> BounceAxis:
+    attributes = shard.header.attributes
+    limit = attributes.get("max_bounces")
+    return BounceAxis(limit if isinstance(limit, int) else None, bool(attributes.get("split_bounces")))

@@ -1,0 +1,320 @@
+"""A capture that is being rendered, on disk: every unit that is finished survives whatever happens to the process.
+
+A folder ``.NAME.partial`` beside the output holds the samples, an HDF5 file, and a journal. HDF5 does not survive a
+kill: its tables are in memory until it is closed. So nothing is read from them. The journal says for each finished
+unit where the bytes of its chunks lie and what their checksums are; those bytes are written once, before the journal's
+record, and never moved. From them a new HDF5 file is built when the earlier one was not closed properly.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import socket
+import time
+import zlib
+from collections.abc import Callable, Iterable, Mapping
+from contextlib import suppress
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+from nlosrender.errors import FileError
+from nlosrender.files.capture_file import CaptureHeader
+from nlosrender.files.header_writer import root_attributes
+from nlosrender.files.identity import differences
+from nlosrender.files.interruption import uninterrupted
+from nlosrender.files.journal import Journal, JournalInUseError
+from nlosrender.files.pieces import Cutter, PackedChunk
+from nlosrender.files.replacement import check_writable, explained_write, partial_folder, publish, synchronise
+from nlosrender.files.sink import CaptureSink, new_capture, sample_names
+from nlosrender.files.sums import Sums
+from nlosrender.files.unit_log import StoredChunk, Tally, UnfinishedRender, UnitKey, unit_record, units_of
+
+JOURNAL = "journal"
+MOST_DIFFERENCES = 6  # that are listed
+ATTEMPTS = 10  # to open a folder that another render is just removing
+
+
+class PartialCapture:
+    """The unfinished render of one output; made by ``claim``, a context manager.
+
+    Leaving the block gives the output free for others. What was finished but not published is kept, so that the same
+    render can go on; where nothing was finished, nothing is left.
+    """
+
+    def __init__(self, path: Path, target: Path, journal: Journal):
+        self.path, self.target, self.folder = path, target, journal.path.parent
+        self._journal = journal
+        self._state = UnfinishedRender.from_records(journal.records())
+        self._identity: dict[str, Any] = {}
+        self._sink: CaptureSink | None = None
+        self._cutter: Cutter | None = None
+
+    @property
+    def tally(self) -> Tally:
+        """What is finished so far, by earlier runs and this one."""
+        return self._state.tally
+
+    @property
+    def sink(self) -> CaptureSink:
+        """The open file.
+
+        Raises
+        ------
+        ValueError
+            It is not open.
+        """
+        if self._sink is None:
+            raise ValueError(f"{self.path}: is not open")
+        return self._sink
+
+    @property
+    def cutter(self) -> Cutter:
+        """What makes chunks of the open file.
+
+        Raises
+        ------
+        ValueError
+            It is not open.
+        """
+        if self._cutter is None:
+            raise ValueError(f"{self.path}: is not open")
+        return self._cutter
+
+    @classmethod
+    def claim(cls, path: str | Path, identity: Mapping[str, Any], resume: bool | None = None) -> PartialCapture:
+        """Reserve an output, and find what there is of it.
+
+        Parameters
+        ----------
+        path
+            The output.
+        identity
+            What has to agree with an earlier render for this one to go on with it; plain JSON values.
+        resume
+            True: there has to be something to go on with. False: what there is is thrown away. None: go on if there
+            is something.
+
+        Raises
+        ------
+        FileError
+            The output cannot be written, another process is writing it, there is nothing to resume, or what there is
+            belongs to another render.
+        """
+        path = Path(path)
+        target = check_writable(path)
+        partial = cls(path, target, _journal(path, target))
+        try:
+            partial._begin(dict(identity), resume)
+        except BaseException:
+            partial._leave()
+            raise
+        return partial
+
+    def open(
+        self, header: CaptureHeader, attributes: Mapping[str, object], compression: str, store_variance: bool
+    ) -> None:
+        """Open the samples' file: a new one, or what the earlier render has left.
+
+        Parameters
+        ----------
+        header, attributes, compression, store_variance
+            As for ``CaptureWriter``.
+
+        Raises
+        ------
+        FileError
+            The disk refuses.
+        """
+        self._cutter = Cutter(header, compression)
+
+        def create() -> CaptureSink:
+            sink = new_capture(self._samples(), self.path, header, compression, store_variance)
+            try:
+                sink.set_attributes(attributes)
+            except BaseException:
+                sink.abandon()
+                raise
+            return sink
+
+        if self.tally.units and self._state.closed:
+            self._note({"opened": True})
+            with suppress(FileError):  # damaged all the same: it is built anew
+                names = sample_names(store_variance)
+                self._sink = CaptureSink(self._samples(), self.path, names, reserved=root_attributes(header))
+                return
+        elif not self.tally.units:
+            self._note({"identity": self._identity, "process": os.getpid(), "machine": socket.gethostname()})
+            self._sink = create()
+            return
+        self._rebuild(create)
+
+    def store(self, unit: UnitKey, chunks: Iterable[PackedChunk], sums: Sums) -> tuple[float, float]:
+        """Write a unit and note that it is finished.
+
+        Parameters
+        ----------
+        unit
+            Its sensors and lasers.
+        chunks
+            Its chunks; dark ones are left out.
+        sums
+            What is summed over the unit.
+
+        Returns
+        -------
+        tuple
+            Seconds spent on making the chunks, and on writing them.
+
+        Raises
+        ------
+        RenderError
+            From ``chunks``: a sample is not finite.
+        FileError
+            The disk refuses.
+        """
+        stored: list[StoredChunk] = []
+        begun = time.perf_counter()
+        writing = 0.0
+        for chunk in chunks:
+            packed = time.perf_counter()
+            stored.append(self.sink.put(chunk))
+            writing += time.perf_counter() - packed
+        self._note(unit_record(self._state.generation, unit, stored, sums))
+        self.tally.add(unit, stored, sums)
+        return time.perf_counter() - begun - writing, writing
+
+    def publish(self, attributes: Mapping[str, object]) -> None:
+        """Complete the file with its last attributes and put it in place.
+
+        Raises
+        ------
+        FileError
+            The disk refuses.
+        """
+        self.sink.set_attributes(attributes)
+        self.sink.close()
+        with uninterrupted(), explained_write(self.path):
+            publish(self._samples(), self.target)
+        self.discard()
+
+    def discard(self) -> None:
+        """Remove everything; nothing is raised."""
+        with uninterrupted():
+            if self._sink is not None:
+                self._sink.abandon()
+                self._sink = None
+            self._state = UnfinishedRender()
+            for leftover in self.folder.glob("samples.*"):  # first: without them the journal means nothing
+                with suppress(OSError):
+                    leftover.unlink()
+            shutil.rmtree(self.folder, ignore_errors=True)
+            self._journal.close()
+
+    def __enter__(self) -> PartialCapture:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._leave()
+
+    def _begin(self, identity: dict[str, Any], resume: bool | None) -> None:
+        exists = bool(self.tally.units) and self._samples().exists()
+        if resume is True and not exists:
+            hint = " It is complete: leave out --resume to render it again." if self.target.exists() else ""
+            raise FileError(f"{self.path}: there is no unfinished render to resume.{hint}")
+        if exists and resume is not False:
+            self._refuse_other(identity)
+        else:
+            with explained_write(self.path):
+                self._journal.clear()
+                for leftover in self.folder.glob("samples.*"):
+                    leftover.unlink()
+            self._state = UnfinishedRender()
+        self._identity = identity
+
+    def _refuse_other(self, identity: dict[str, Any]) -> None:
+        found = list(differences(self._state.first.get("identity", {}), identity))
+        if found:
+            listed = "; ".join(f"{key}: {old} then, {new} now" for key, old, new in found[:MOST_DIFFERENCES])
+            more = f"; and {len(found) - MOST_DIFFERENCES} more" if len(found) > MOST_DIFFERENCES else ""
+            raise FileError(
+                f"{self.path}: there is an unfinished render of something else ({listed}{more}). "
+                "Use --overwrite to throw it away and start anew, or name another output."
+            )
+
+    def _rebuild(self, create: Callable[[], CaptureSink]) -> None:
+        """Copy the units whose bytes are whole into a new file."""
+        old, earlier = self._samples(), self._state
+        state = UnfinishedRender(earlier.first, generation=earlier.newest + 1, newest=earlier.newest + 1)
+        for leftover in self.folder.glob("samples.*"):  # of an attempt that failed
+            if leftover != old:
+                leftover.unlink()
+        self._state = state
+        try:
+            self._sink = create()
+            with explained_write(self.path):
+                descriptor = os.open(old, os.O_RDONLY)
+            try:
+                for unit, chunks, sums in units_of(self._journal.records(), earlier.generation):
+                    if all(zlib.crc32(_bytes(descriptor, chunk)) == chunk.checksum for chunk in chunks):
+                        copies = (PackedChunk(c.dataset, c.at, _bytes(descriptor, c)) for c in chunks)
+                        self.store(unit, copies, sums)
+            finally:
+                os.close(descriptor)
+            self._note({"switched_to": state.generation})
+        except BaseException:
+            # the old file still counts
+            if self._sink is not None:
+                self._sink.abandon()
+                self._sink = None
+            self._state = earlier
+            raise
+        with suppress(OSError):
+            old.unlink()
+
+    def _leave(self) -> None:
+        """Close what is open and give the output free; keep what is finished."""
+        with uninterrupted():
+            if not self.tally.units:
+                self.discard()
+                return
+            if self._sink is not None:
+                try:
+                    self._sink.close()
+                    with explained_write(self.path):
+                        synchronise(self._samples())
+                    self._note({"closed": True})
+                except FileError:  # the journal knows enough to build the file anew
+                    self._sink.abandon()
+                self._sink = None
+            self._journal.close()
+
+    def _note(self, record: Mapping[str, Any]) -> None:
+        with uninterrupted(), explained_write(self.path):
+            self._journal.append(record)
+
+    def _samples(self) -> Path:
+        return self.folder / f"samples.{self._state.generation}.hdf5"
+
+
+def _journal(path: Path, target: Path) -> Journal:
+    folder = partial_folder(target)
+    with explained_write(path):
+        for attempt in range(ATTEMPTS):
+            folder.mkdir(exist_ok=True)
+            try:
+                return Journal(folder / JOURNAL)
+            except JournalInUseError as error:
+                message = f"{path}: another render is writing it now. Wait for it, or name another output."
+                raise FileError(message) from error
+            except FileNotFoundError:
+                if attempt == ATTEMPTS - 1:
+                    raise
+    raise FileError(f"{path}: cannot be written: its folder {folder} vanishes.")
+
+
+def _bytes(descriptor: int, chunk: StoredChunk) -> bytes:
+    return os.pread(descriptor, chunk.length, chunk.offset)

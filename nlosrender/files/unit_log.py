@@ -1,0 +1,107 @@
+"""What the journal of an unfinished capture says: which units are finished, and where their chunks lie."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import astuple, dataclass, field
+from typing import Any
+
+from nlosrender.capture.tile import Tile
+from nlosrender.files.sums import Sums
+
+CHECKSUM_RANGE = 2**64
+UnitKey = tuple[Tile, Tile]  # sensors, lasers
+Record = Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class StoredChunk:
+    """Where the bytes of a chunk lie in a file."""
+
+    dataset: str
+    at: tuple[int, ...]  # where the chunk starts, in file order
+    offset: int
+    length: int
+    checksum: int  # CRC-32 of the bytes
+
+
+@dataclass
+class Tally:
+    """What is finished."""
+
+    units: list[UnitKey] = field(default_factory=list)
+    sums: Sums = field(default_factory=Sums)
+    checksum: dict[str, int] = field(default_factory=dict)  # per dataset, of its chunks in whatever order
+    n_bytes: int = 0  # of all chunks
+
+    def add(self, unit: UnitKey, chunks: Iterable[StoredChunk], sums: Sums) -> None:
+        """Count one unit."""
+        self.units.append(unit)
+        self.sums += sums
+        for chunk in chunks:
+            before = self.checksum.get(chunk.dataset, 0)
+            self.checksum[chunk.dataset] = (before + placed_checksum(chunk.at, chunk.checksum)) % CHECKSUM_RANGE
+            self.n_bytes += chunk.length
+
+
+@dataclass
+class UnfinishedRender:
+    """The state that the records of a journal add up to."""
+
+    first: Record = field(default_factory=dict)  # the record of how it began
+    generation: int = 0  # of the file that holds the samples
+    newest: int = 0  # generation that was ever begun
+    closed: bool = False  # whether HDF5 has closed that file properly
+    tally: Tally = field(default_factory=Tally)
+
+    @classmethod
+    def from_records(cls, records: Iterable[Record]) -> UnfinishedRender:
+        """Add up the records of a journal, oldest first."""
+        state = cls()
+        tallies: dict[int, Tally] = {}
+        for record in records:
+            state.closed = "closed" in record
+            if "identity" in record:
+                state.first = record
+            if "switched_to" in record:
+                state.generation = record["switched_to"]
+            if "unit" in record:
+                state.newest = max(state.newest, record["generation"])
+                tallies.setdefault(record["generation"], Tally()).add(*unit_of(record))
+        state.newest = max(state.newest, state.generation)
+        state.tally = tallies.get(state.generation, Tally())
+        return state
+
+
+def unit_record(generation: int, unit: UnitKey, chunks: Iterable[StoredChunk], sums: Sums) -> dict[str, Any]:
+    """Return the record of a finished unit whose chunks lie in the file of a ``generation``."""
+    return {
+        "unit": [list(astuple(tile)) for tile in unit],
+        "generation": generation,
+        "sums": sums.as_json(),
+        "chunks": [list(astuple(chunk)) for chunk in chunks],
+    }
+
+
+def unit_of(record: Record) -> tuple[UnitKey, list[StoredChunk], Sums]:
+    """Undo ``unit_record``."""
+    sensors, lasers = (Tile(*corners) for corners in record["unit"])
+    chunks = [StoredChunk(name, tuple(at), *rest) for name, at, *rest in record["chunks"]]
+    return (sensors, lasers), chunks, Sums.from_json(record["sums"])
+
+
+def units_of(
+    records: Iterable[Mapping[str, Any]], generation: int
+) -> Iterator[tuple[UnitKey, list[StoredChunk], Sums]]:
+    """Yield the finished units whose chunks lie in the file of a ``generation``."""
+    for record in records:
+        if record.get("generation") == generation:
+            yield unit_of(record)
+
+
+def placed_checksum(at: tuple[int, ...], checksum: int) -> int:
+    """Return a chunk's checksum mixed with its place: chunks that have changed places do not add up to the same."""
+    place = 0
+    for index in at:
+        place = (place * 1_000_003 + index) % CHECKSUM_RANGE
+    return (checksum + 1) * (2 * place + 1) % CHECKSUM_RANGE

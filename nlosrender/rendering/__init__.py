@@ -1,0 +1,1 @@
+"""The work itself: unit after unit from the engine into the file."""

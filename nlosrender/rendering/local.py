@@ -1,0 +1,130 @@
+"""The units of a plan, rendered one after the other in this process; what is finished survives whatever happens."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+from nlosrender.capture.plan import Unit
+from nlosrender.errors import FileError, IncompleteRender, InterruptedRender, RenderError
+from nlosrender.files.interruption import StopRequest, stop_request
+from nlosrender.files.partial_capture import PartialCapture
+from nlosrender.rendering.report import Progress, Stopwatch, Warn
+from nlosrender.rendering.units import RenderedUnit, UnitWriter, finished_unit, render_unit
+
+if TYPE_CHECKING:
+    from nlosrender.engine.path_engine import Budget
+    from nlosrender.rendering.units import Engine
+
+
+@contextmanager
+def resumable(partial: PartialCapture) -> Iterator[StopRequest]:
+    """Let the first SIGINT or SIGTERM inside the block be a request, and say what is left after a failure.
+
+    Raises
+    ------
+    InterruptedRender
+        A second signal came.
+    IncompleteRender
+        A file could not be written, but units are finished and saved.
+    """
+    try:
+        with stop_request() as stop:
+            yield stop
+    except KeyboardInterrupt as error:
+        raise InterruptedRender(f"{partial.path}: interrupted{_kept(partial)}") from error
+    except FileError as error:
+        if not partial.tally.units:
+            raise
+        raise IncompleteRender(f"{error} The render stopped{_kept(partial)}") from error
+    except RenderError:
+        partial.discard()  # the same would come out again
+        raise
+
+
+def render_units(
+    units: Sequence[Unit],
+    engine: Engine,
+    budget: Budget,
+    partial: PartialCapture,
+    stop: StopRequest,
+    *,
+    store_variance: bool,
+    stopwatch: Stopwatch,
+    progress: Progress,
+    warn: Warn,
+) -> None:
+    """Render units and store each as it is done.
+
+    Parameters
+    ----------
+    units
+        What is left to do.
+    engine, budget
+        What renders them; when to stop, ``time_limit_s`` being the limit for all units, earlier runs' included.
+    partial
+        Where they go; open.
+    stop
+        Looked at after every unit.
+    store_variance
+        Whether the file has the variance.
+    stopwatch, progress, warn
+        Told the seconds, the share that is done, and that the user has to wait.
+
+    Raises
+    ------
+    InterruptedRender
+        A stop was requested before the last unit.
+    RenderError, FileError
+        A unit cannot be rendered or stored.
+    """
+    earlier = len(partial.tally.units)
+    total = earlier + len(units)
+    spent = partial.tally.sums.seconds
+    begun = time.perf_counter()
+    writer = UnitWriter(partial, stopwatch)
+    try:
+        for number, unit in enumerate(units):
+            limit = budget.time_limit_s
+            if limit is not None:  # what is left of the time, shared by the units that are left
+                limit = max(0.0, limit - spent - (time.perf_counter() - begun)) / (len(units) - number)
+
+            def told(share: float, done: int = earlier + number) -> None:
+                progress((done + share) / total)
+                if stop.came:
+                    warn(f"{stop.signal_name}: finishing the unit in flight; once more stops at once.")
+
+            writer.store(_rendered(engine, unit, replace(budget, time_limit_s=limit), store_variance, stopwatch, told))
+            told(1.0)
+            if stop.came and number + 1 < len(units):
+                writer.wait()
+                raise InterruptedRender(f"{partial.path}: stopped by {stop.signal_name}{_kept(partial, total)}")
+        writer.wait()
+    finally:
+        writer.close()
+
+
+def _rendered(
+    engine: Engine, unit: Unit, budget: Budget, store_variance: bool, stopwatch: Stopwatch, progress: Progress
+) -> RenderedUnit:
+    """Render a unit; the engine's own arrays are gone when this returns."""
+    compiled, begun = engine.compile_seconds, time.perf_counter()
+    histogram = render_unit(engine, unit, budget, progress)
+    seconds = time.perf_counter() - begun
+    compiled = engine.compile_seconds - compiled
+    stopwatch.seconds["compile"] += compiled
+    stopwatch.seconds["render"] += seconds - compiled
+    confocal = engine.capture.scan_type == "confocal"
+    return finished_unit(unit, histogram, confocal=confocal, store_variance=store_variance, seconds=seconds)
+
+
+def _kept(partial: PartialCapture, total: int | None = None) -> str:
+    """Return the end of a sentence: what is saved."""
+    finished = len(partial.tally.units)
+    if not finished:
+        return " before anything was finished; nothing is kept."
+    of_all = "" if total is None else f" of {total}"
+    return f"; {finished}{of_all} units are finished and saved. The same command goes on from there."

@@ -1,0 +1,178 @@
+"""Unit after unit: rendered here, packed and written by a thread of its own while the next one is rendered."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import TYPE_CHECKING, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nlosrender.capture.plan import Unit
+from nlosrender.files import layout
+from nlosrender.files.interruption import uninterrupted
+from nlosrender.files.partial_capture import PartialCapture
+from nlosrender.files.pieces import Cutter, PackedChunk, packed_chunks
+from nlosrender.files.sums import Sums, sums_of
+from nlosrender.rendering.report import Progress, Stopwatch
+
+if TYPE_CHECKING:
+    from nlosrender.engine.histogram import Histogram
+    from nlosrender.engine.path_engine import Budget, PathEngine
+    from nlosrender.engine.virtual_lights.engine import VirtualLightEngine
+
+    Engine: TypeAlias = PathEngine | VirtualLightEngine
+
+
+def render_unit(engine: Engine, unit: Unit, budget: Budget, progress: Progress = lambda share: None) -> Histogram:
+    """Render one unit: everything that is needed to do so in another process.
+
+    Parameters
+    ----------
+    engine, unit, budget
+        What to render, and when to stop.
+    progress
+        Told the share of the unit that is done.
+
+    Returns
+    -------
+    Histogram
+        Axes (channel, bounce, laser, sensor, bin), laser and sensor flattened row by row.
+
+    Raises
+    ------
+    RenderError
+        The result is not finite.
+    """
+    if len(unit.batches) == 1:
+        return engine.render(unit.batches[0], budget, progress)
+    limit = budget.time_limit_s
+    share_of = replace(budget, time_limit_s=None if limit is None else limit / len(unit.batches))
+    pieces = [
+        engine.render(batch, share_of, partial(_within, progress, number, len(unit.batches)))
+        for number, batch in enumerate(unit.batches)
+    ]
+    return joined_histogram(unit, pieces)
+
+
+def joined_histogram(unit: Unit, pieces: list[Histogram]) -> Histogram:
+    """Put the histograms of a unit's batches together, sensor points row by row."""
+    from nlosrender.engine.histogram import Histogram
+
+    rows, columns = unit.sensors.shape
+    arrays = {}
+    for name in ("mean", "variance", "outside"):
+        first = getattr(pieces[0], name)
+        whole = np.empty((*first.shape[:3], rows, columns, *first.shape[4:]))
+        for batch, piece in zip(unit.batches, pieces, strict=True):
+            tile = batch.sensors
+            inside = np.s_[
+                tile.y0 - unit.sensors.y0 : tile.y1 - unit.sensors.y0,
+                tile.x0 - unit.sensors.x0 : tile.x1 - unit.sensors.x0,
+            ]
+            values = getattr(piece, name)
+            whole[(slice(None),) * 3 + inside] = values.reshape(*first.shape[:3], *tile.shape, *first.shape[4:])
+        arrays[name] = whole.reshape(*first.shape[:3], rows * columns, *first.shape[4:])
+    return Histogram(arrays["mean"], arrays["variance"], arrays["outside"], min(piece.samples for piece in pieces))
+
+
+@dataclass(frozen=True, eq=False)
+class RenderedUnit:
+    """A unit on its way to the file."""
+
+    unit: Unit
+    laser_at: tuple[int, int]  # row and column of its first laser in the file
+    samples: dict[str, NDArray[np.float32]]  # per dataset (channel, bounce, laser_y, laser_x, sensor_y, sensor_x, bin)
+    sums: Sums
+
+    def chunks(self, cutter: Cutter) -> Iterator[PackedChunk]:
+        """Yield the unit's chunks, packed."""
+        for name, block in self.samples.items():
+            yield from packed_chunks(cutter, name, block, self.laser_at, (self.unit.sensors.y0, self.unit.sensors.x0))
+
+
+def finished_unit(
+    unit: Unit, histogram: Histogram, *, confocal: bool, store_variance: bool, seconds: float
+) -> RenderedUnit:
+    """Sum up a unit in float64 and take what is stored of it.
+
+    Parameters
+    ----------
+    unit, histogram
+        The unit, and what the engine made of it.
+    confocal
+        Whether the file has no laser axes.
+    store_variance
+        Whether the file has the variance.
+    seconds
+        Spent rendering it.
+    """
+    lasers = (1, 1) if confocal else unit.lasers.shape
+    channels, slots, _, _, n_bins = histogram.mean.shape
+    axes = (channels, slots, *lasers, *unit.sensors.shape, n_bins)
+    sums = sums_of(histogram.mean, histogram.variance, histogram.outside, histogram.samples, seconds)
+    stored = {layout.DATA: histogram.mean} | ({layout.VARIANCE: histogram.variance} if store_variance else {})
+    with np.errstate(over="ignore"):  # what overflows float32 is refused where it is cut into chunks
+        samples = {name: values.astype(np.float32).reshape(axes) for name, values in stored.items()}
+    return RenderedUnit(unit, (0, 0) if confocal else (unit.lasers.y0, unit.lasers.x0), samples, sums)
+
+
+class UnitWriter:
+    """Stores units in a thread of its own, one at a time; the render waits when it is a whole unit ahead.
+
+    Every call of HDF5 happens in one thread at a time: in this one until ``close``.
+
+    Parameters
+    ----------
+    capture
+        Where they go; open.
+    stopwatch
+        Told the seconds.
+    """
+
+    def __init__(self, capture: PartialCapture, stopwatch: Stopwatch):
+        self._capture, self._stopwatch = capture, stopwatch
+        self._thread = ThreadPoolExecutor(max_workers=1, thread_name_prefix="writer")
+        self._pending: Future[None] | None = None
+
+    def store(self, rendered: RenderedUnit) -> None:
+        """Hand over a unit, once the one before is stored.
+
+        Raises
+        ------
+        FileError, RenderError
+            The unit before could not be stored.
+        """
+        self.wait()
+        self._pending = self._thread.submit(self._store, rendered)
+
+    def wait(self) -> None:
+        """Wait until everything is stored.
+
+        Raises
+        ------
+        FileError, RenderError
+            It could not be.
+        """
+        pending, self._pending = self._pending, None
+        if pending is not None:
+            pending.result()
+
+    def close(self) -> None:
+        """End the thread once it is done; what it could not store is lost."""
+        with uninterrupted():
+            self._thread.shutdown(wait=True)
+
+    def _store(self, rendered: RenderedUnit) -> None:
+        chunks = rendered.chunks(self._capture.cutter)
+        unit = rendered.unit
+        packing, writing = self._capture.store((unit.sensors, unit.lasers), chunks, rendered.sums)
+        self._stopwatch.seconds["compress"] += packing
+        self._stopwatch.seconds["write"] += writing
+
+
+def _within(progress: Progress, number: int, count: int, share: float) -> None:
+    progress((number + share) / count)
