@@ -123,7 +123,7 @@ def render_capture(
     return RenderReport(
         output=Path(output.path),
         engine=engine.name,
-        reason=engine_reason(config, engine),
+        reason=engine.reason,
         variant=backend.variant,
         part=None if selection == WHOLE else str(plan.part),
         units=earlier + len(units),
@@ -172,8 +172,7 @@ def forecast_capture(config: Config) -> Forecast:
     backend = start_backend(config.render.backend, colored=config.is_colored)
     plan, engine, header = set_up(config, backend, warnings)
     spent = time.perf_counter() - begun
-    reason = engine_reason(config, engine)
-    return forecast_render(config, backend, plan, engine, reason, header, tuple(warnings.said), spent)
+    return forecast_render(config, backend, plan, engine, header, tuple(warnings.said), spent)
 
 
 def late_warnings(config: Config, backend: Backend, plan: Plan, engine: Engine, header: CaptureHeader) -> Iterator[str]:
@@ -188,13 +187,6 @@ def late_warnings(config: Config, backend: Backend, plan: Plan, engine: Engine, 
     yield from disk_warnings(
         Path(config.output.path), replace(size, disk_bytes_estimate=int(size.disk_bytes_estimate * share))
     )
-
-
-def engine_reason(config: Config, engine: Engine) -> str:
-    """Return why the capture is rendered by the engine it is."""
-    from nlosrender.engine.planner import choose_engine
-
-    return choose_engine(config.render, engine.capture, engine.built).reason
 
 
 def load_scene(config: Config) -> BuiltScene:
@@ -238,9 +230,8 @@ def prepare(
     selection: Selection = WHOLE,
 ) -> tuple[Plan, Engine]:
     """Stages 3 and 4: cut the work into units and set up the engine."""
-    from nlosrender.engine.path_engine import PathEngine, PathOptions
+    from nlosrender.engine.path_engine import PathOptions
     from nlosrender.engine.planner import choose_engine
-    from nlosrender.engine.virtual_lights.engine import VirtualLightEngine
 
     render = config.render
     bounces = BounceAxis(render.max_bounces, render.split_bounces)
@@ -266,9 +257,7 @@ def prepare(
         seed=render.seed,
         replicas=plan.replicas,
     )
-    if choose_engine(render, capture, built).name == "path":
-        return plan, PathEngine(built, capture, time_axis, options)
-    return plan, VirtualLightEngine(built, capture, time_axis, options, backend.lanes)
+    return plan, choose_engine(render, built, capture, time_axis, options, backend.lanes)
 
 
 def describe_file(config: Config, built: BuiltScene, capture: Capture, time_axis: TimeAxis) -> CaptureHeader:

@@ -53,7 +53,6 @@ def forecast_render(
     backend: Backend,
     plan: Plan,
     engine: PathEngine | VirtualLightEngine,
-    reason: str,
     header: CaptureHeader,
     warnings: tuple[str, ...],
     seconds_before: float,
@@ -64,8 +63,6 @@ def forecast_render(
     ----------
     config, backend, plan, engine
         As set up for the render.
-    reason
-        Why this engine.
     header, warnings
         What the file will say; what has been said already.
     seconds_before
@@ -89,7 +86,7 @@ def forecast_render(
     around = seconds_before + size.write_seconds
     return Forecast(
         engine=engine.name,
-        reason=reason,
+        reason=engine.reason,
         variant=backend.variant,
         skipped=skipped_work(engine, scene_is_colored=config.scene.is_colored),
         scan_type=capture.scan_type,

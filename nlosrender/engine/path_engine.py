@@ -76,6 +76,8 @@ class PathEngine:
         Techniques, bounces, seed.
     first_bounce
         Lowest bounce to compute, >= 3, for engines that know the lower ones.
+    reason
+        Why this engine renders the scene, in plain words.
     """
 
     name = "path"
@@ -87,7 +89,9 @@ class PathEngine:
         time_axis: TimeAxis,
         options: PathOptions,
         first_bounce: int = THIRD_BOUNCE,
+        reason: str = "asked for",
     ):
+        self.reason = reason
         self.built, self.capture, self.time_axis, self.options = built, capture, time_axis, options
         self.sampler = SurfaceSampler(built)
         self.hidden_fraction = self._choose_hidden_fraction()

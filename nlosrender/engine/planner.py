@@ -2,50 +2,48 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Literal
-
 import mitsuba as mi
 
 from nlosrender.capture.bounces import THIRD_BOUNCE
 from nlosrender.capture.grids import Capture
+from nlosrender.capture.time_axis import TimeAxis
 from nlosrender.config.render import RenderConfig
-from nlosrender.engine.virtual_lights.engine import is_lambertian
-from nlosrender.engine.virtual_lights.tessellator import Tessellator, can_tessellate
+from nlosrender.engine.path_engine import PathEngine, PathOptions
+from nlosrender.engine.virtual_lights.engine import VirtualLightEngine, is_lambertian
+from nlosrender.engine.virtual_lights.tessellator import can_tessellate
 from nlosrender.scene.build import BuiltScene
 
-EngineName = Literal["path", "virtual_lights"]
 # Engine units: a surface this near to a laser or sensor point is seen under a large angle however finely it is cut.
 TOUCHING = 2e-3
 MAX_TRIANGLES = 5_000_000  # of all meshes: merging them takes about 1 kB each on the way
 
 
-@dataclass(frozen=True)
-class EngineChoice:
-    """The engine that renders, and the reason in plain words."""
-
-    name: EngineName
-    reason: str
-
-
-def choose_engine(render: RenderConfig, capture: Capture, built: BuiltScene) -> EngineChoice:
-    """Choose the engine for a scene (backend started).
+def choose_engine(
+    render: RenderConfig, built: BuiltScene, capture: Capture, time_axis: TimeAxis, options: PathOptions, lanes: int
+) -> PathEngine | VirtualLightEngine:
+    """Return the engine for a scene (backend started), which knows the reason in plain words.
 
     ``auto`` takes the virtual lights where they are known to be right; asked for by name, they also take rough
     non-Lambertian surfaces. What they cannot do goes to the path engine.
+
+    Parameters
+    ----------
+    render
+        What the user asks for.
+    built, capture, time_axis, options, lanes
+        As for the engines.
     """
-    if render.engine == "path":
-        return EngineChoice("path", "asked for")
-    obstacle = _obstacle(render, capture, built)
-    if obstacle is not None:
-        return EngineChoice("path", obstacle)
+    reason = "asked for" if render.engine == "path" else _obstacle(render, capture, built)
+    if reason is None and render.engine == "auto" and not all(is_lambertian(s.bsdf()) for s in built.hidden_shapes):
+        reason = "some hidden surfaces are not Lambertian"
+    if reason is not None:
+        return PathEngine(built, capture, time_axis, options, reason=reason)
+    engine = VirtualLightEngine(built, capture, time_axis, options, lanes)
     if render.engine == "virtual_lights":
-        return EngineChoice("virtual_lights", "asked for")
-    if not all(is_lambertian(shape.bsdf()) for shape in built.hidden_shapes):
-        return EngineChoice("path", "some hidden surfaces are not Lambertian")
-    if Tessellator(built, capture, 1.0).nearest < TOUCHING:
-        return EngineChoice("path", "hidden geometry touches a laser or sensor point")
-    return EngineChoice("virtual_lights", "Lambertian surfaces before a planar wall")
+        engine.reason = "asked for"
+    elif engine.tessellator.nearest < TOUCHING:
+        return PathEngine(built, capture, time_axis, options, reason="hidden geometry touches a laser or sensor point")
+    return engine
 
 
 def _obstacle(render: RenderConfig, capture: Capture, built: BuiltScene) -> str | None:

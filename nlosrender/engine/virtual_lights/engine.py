@@ -61,6 +61,7 @@ class VirtualLightEngine:
         self.further: FurtherBounces | None = None  # else the path engine
         if self.has_further_bounces and self.settings.is_diffuse:
             self.further = FurtherBounces(self.paths, self.tessellator, self.settings.needs_visibility)
+        self.reason = "Lambertian surfaces before a planar wall"
         self._settled: dict[Budget, Budget] = {}
 
     @property
