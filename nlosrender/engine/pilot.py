@@ -12,7 +12,7 @@ import numpy as np
 from nlosrender.capture.grids import Capture, PointGrid
 
 SENSORS_PER_AXIS = 16
-LASERS_PER_AXIS = 2
+LASERS_PER_AXIS = 3
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ class Pilot:
 
 
 def pilot_of(capture: Capture) -> Pilot:
-    """Return at most 16 x 16 sensor points and, of exhaustive captures, at most 2 x 2 laser points."""
+    """Return at most 16 x 16 sensor points and, of exhaustive captures, at most 3 x 3 laser points."""
     sensors = spread(capture.sensor_grid, SENSORS_PER_AXIS)
     if capture.scan_type == "confocal":
         return Pilot(sensors, sensors)

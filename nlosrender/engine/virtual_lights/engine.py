@@ -27,7 +27,7 @@ from nlosrender.errors import RenderError
 from nlosrender.scene.build import BuiltScene
 
 # Shares of the target error: squares add up to less than 1, for what a pilot cannot know.
-THIRD_ALONE = 0.9
+THIRD_ALONE = 0.85
 THIRD_OF_MANY, REST_OF_MANY = 0.35, 0.88  # patches are cheaper than walks
 PILOT_ERROR = 4.0  # times the target: when a pilot has seen enough to say how many rounds are needed
 MOST_PILOT_ROUNDS = 16
@@ -182,7 +182,7 @@ class VirtualLightEngine:
         fineness = FIRST_COARSENESS
         coarse = self.third.gather(pilot, fineness)
         while True:
-            finer = self.third.finer(fineness, coarse.n_patches, 3.0)
+            finer = self.third.finer(fineness, 3.0)
             begun = time.perf_counter()
             fine = self.third.gather(pilot, finer)
             predicted = (time.perf_counter() - begun) * more * 4

@@ -14,7 +14,7 @@ from nlosrender.capture.plan import Batch
 from nlosrender.engine.device_arrays import laser_points
 from nlosrender.engine.histogram import DeviceHistogram, HistogramShape
 from nlosrender.engine.path_engine import PathEngine
-from nlosrender.engine.pilot import LASERS_PER_AXIS, Pilot, spread
+from nlosrender.engine.pilot import Pilot, spread
 from nlosrender.engine.transport import Transport
 from nlosrender.engine.virtual_lights.lights import is_visible, to_points
 from nlosrender.engine.virtual_lights.sites import Sites, SiteSampler
@@ -24,6 +24,7 @@ from nlosrender.engine.virtual_lights.walks import Impulses, TriedLasers, WalkPl
 SITES_PER_ROUND = 4096  # of all replicas together
 IMPULSES_PER_SITE = 8
 CONFOCAL_IMPULSES_PER_SITE = 2
+TRIED_PER_AXIS = 2  # laser points by which the vertices of walks are judged
 MOST_VALUES = 2**24  # impulses of a round times lasers, for memory
 WALKS_PER_SITE = (16, 64)  # walks are cheap beside the gather when many sensor points share them
 MOST_ROUNDS = 2**20  # of a target that is out of reach
@@ -56,7 +57,7 @@ class FurtherBounces:
         self.built, self.options = paths.built, paths.options
         built, capture, time_axis = paths.built, paths.capture, paths.time_axis
         self.sampler = SiteSampler(tessellator)
-        tried = spread(capture.laser_grid, LASERS_PER_AXIS)
+        tried = spread(capture.laser_grid, TRIED_PER_AXIS)
         points = laser_points(built, capture, time_axis, np.array(tried.indices, dtype=np.uint32))
         self.tried = TriedLasers(points, tried.size, tried.size == capture.n_lasers)
         pairs = capture.n_sensors * (capture.n_lasers if capture.scan_type == "exhaustive" else 1)

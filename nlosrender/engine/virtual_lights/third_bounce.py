@@ -93,23 +93,26 @@ class ThirdBounce:
     def settle(self, pilot: Pilot, target: float) -> tuple[float, Gathered]:
         """Return the fineness whose estimated error is at most ``target``, and the pilot's third bounce at it."""
         coarse = self.gather(pilot, FIRST_COARSENESS)
-        fineness = self.finer(FIRST_COARSENESS, coarse.n_patches, REFINEMENT)
+        fineness = self.finer(FIRST_COARSENESS, REFINEMENT)
         earlier = math.inf
         while True:
             fine = self.gather(pilot, fineness)
             error, _ = estimated_error(coarse, fine)
+            if error <= target:  # as the render will estimate it, from the pair of resolutions that is nearer
+                error = max(error, estimated_error(self.gather(pilot, self.coarser(fineness)), fine)[0])
             needed = fine.n_patches * error / target
             # float32 path lengths and grazing contacts leave an error that no refinement takes away
             is_stuck = error > STUCK * earlier and fine.n_patches > 2 * coarse.n_patches
             if error <= target or is_stuck or max(needed, 2 * fine.n_patches) > MAX_PATCHES:
                 return fineness, fine
             earlier = error
-            coarse, fineness = fine, self.finer(fineness, fine.n_patches, min(max(MARGIN * error / target, 1.5), 16.0))
+            # In small steps: where the coarser one merges much of a mesh, its error says little of the finer one's.
+            coarse, fineness = fine, self.finer(fineness, min(max(MARGIN * error / target, 1.25), REFINEMENT))
 
-    def finer(self, coarseness: float, n_patches: int, factor: float) -> float:
+    def finer(self, coarseness: float, factor: float) -> float:
         """Return a coarseness with at least ``factor`` times the patches (a mesh may be finer than asked for)."""
-        finer = coarseness / math.sqrt(factor)
-        while 0 < self.tessellator.count(finer) < 0.9 * factor * n_patches:
+        count, finer = self.tessellator.count(coarseness), coarseness / math.sqrt(factor)
+        while 0 < self.tessellator.count(finer) < 0.9 * factor * count:
             finer *= 0.9
         return finer
 
