@@ -5,6 +5,7 @@ A reflectance is a number (grey), ``[r, g, b]``, or a texture/spectrum dictionar
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from typing import Annotated, Any
 
@@ -27,6 +28,7 @@ from nlosrender.config.plugin_check import TRANSFORM_KEYS, PluginCheck, checked_
 from nlosrender.config.refusal import KeyPath, listed
 from nlosrender.errors import nearest
 
+_MEDIUM = re.compile(r"[\w -]+")  # no slashes: Mitsuba makes a file name of a metal's
 _WITH_RGB = (Kind.REFLECTANCE, Kind.SPECTRUM)
 _WITH_TEXTURE = (Kind.REFLECTANCE, Kind.UNIT, Kind.SPECTRUM)
 _NUMBER_RANGES = {  # lowest and highest number allowed
@@ -146,7 +148,7 @@ def _parameter(check: PluginCheck, value: Any, path: KeyPath, kind: Kind) -> Any
         return value
     if kind is Kind.DISTRIBUTION and value in ("beckmann", "ggx"):
         return value
-    if kind in (Kind.MATERIAL, Kind.IOR) and isinstance(value, str) and value.strip():
+    if kind in (Kind.MATERIAL, Kind.IOR) and isinstance(value, str) and _MEDIUM.fullmatch(value):
         return value
     low, high = _NUMBER_RANGES.get(kind, (1.0, 0.0))  # an empty range: no number is allowed
     if isinstance(value, (list, tuple)) and len(value) == 3 and kind in _WITH_RGB:

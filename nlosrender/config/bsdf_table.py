@@ -32,21 +32,18 @@ BSDF_TYPES = _names(
     "plastic polarizer pplastic principled principledthin retarder roughconductor roughdielectric roughplastic "
     "thindielectric twosided"
 )
-TEXTURE_TYPES = _names(
-    "bitmap blackbody checkerboard d65 irregular mesh_attribute rawconstant regular rgb spectrum srgb uniform volume"
-)
+# Without blackbody, regular and irregular, which need a spectral variant, and volume, which needs a plugin that is no
+# texture: without it Mitsuba ends the process.
+TEXTURE_TYPES = _names("bitmap checkerboard d65 mesh_attribute rawconstant rgb spectrum srgb uniform")
 # Mitsuba crashes the process (bitmap) or fails late without these.
 TEXTURE_REQUIRED: dict[str, tuple[str, ...]] = {
     "bitmap": ("filename",),
-    "blackbody": ("temperature",),
-    "irregular": ("wavelengths", "values"),
     "mesh_attribute": ("name",),
-    "regular": ("wavelength_min", "wavelength_max", "values"),
     "rgb": ("value",),
     "srgb": ("color",),
     "uniform": ("value",),
 }
-COLORED_TYPES = ("bitmap", "blackbody", "d65", "hair", "irregular", "measured", "mesh_attribute", "regular", "volume")
+COLORED_TYPES = ("bitmap", "d65", "hair", "measured", "mesh_attribute")
 
 _CONDUCTOR = {
     "material": Kind.MATERIAL,

@@ -7,7 +7,17 @@ from typing import Any, Literal
 
 from pydantic import model_validator
 
-from nlosrender.config.fields import BinCount, Finite, Flag, GridCount, NonNegative, Point2, Point3, Positive
+from nlosrender.config.fields import (
+    BinCount,
+    Coordinate,
+    Energy,
+    Flag,
+    GridCount,
+    Length,
+    LengthOrZero,
+    Point2,
+    Point3,
+)
 from nlosrender.config.refusal import Fault
 from nlosrender.config.section import Section
 
@@ -21,9 +31,9 @@ class GridConfig(Section):
     """points along the wall's x axis"""
     ny: GridCount
     """points along the wall's y axis"""
-    width: Positive | None = None
+    width: Length | None = None
     """m, extent along x; null: the whole wall"""
-    height: Positive | None = None
+    height: Length | None = None
     """m, extent along y; null: the whole wall"""
 
     @property
@@ -47,9 +57,9 @@ class CaptureConfig(Section):
     """m, scene coordinates; null: 1 m in front of the wall's centre"""
     sensor_position: Point3 | None = None
     """m, scene coordinates; null: 1 m in front of the wall's centre"""
-    laser_energy: Positive = 1.0
+    laser_energy: Energy = 1.0
     """J per pulse"""
-    laser_spot_radius: NonNegative = 0.0
+    laser_spot_radius: LengthOrZero = 0.0
     """m, radius of the lit disc on the wall; 0: a point"""
     account_first_and_last_bounces: Flag = True
     """count the legs laser to wall and wall to sensor in the path length"""
@@ -82,9 +92,9 @@ class CaptureConfig(Section):
 class TimeAxisConfig(Section):
     """The bins, in metres of optical path length (OPL)."""
 
-    start_opl: Finite = 0.0
+    start_opl: Coordinate = 0.0
     """m, start of bin 0"""
-    bin_width_opl: Positive = 0.003
+    bin_width_opl: Length = 0.003
     """m; 0.003 is 10 ps"""
     n_bins: BinCount = "auto"
     """auto (up to the latest possible arrival) or an integer >= 1"""

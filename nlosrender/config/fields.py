@@ -18,7 +18,13 @@ from pydantic_core import CoreSchema, core_schema
 from nlosrender.config.refusal import refuse
 from nlosrender.config.vectors import length
 
-_SMALLEST_DIRECTION = 1e-12  # below it a vector has no direction in float64 worth the name
+SHORTEST, LONGEST = 1e-9, 1e9  # m; shorter or longer lengths are slips of the pen, and float32 has no room for them
+LONGEST_NAME = 1000  # bytes; file systems take 255 or so and say so themselves
+_FEWEST_JOULES, _MOST_JOULES = 1e-15, 1e15  # the square of H stays a float32 number
+_MOST_SAMPLES = 10**12
+_MOST_BOUNCES = 10**6
+_SMALLEST_DIRECTION = 1e-12  # below it, and above its inverse, a vector has no direction in float64 worth the name
+_LONGEST_SIZE = 40  # characters
 _MEMORY = re.compile(r"(\d+(?:\.\d+)?|\.\d+)\s*([kmgt]?i?b)", re.IGNORECASE)
 _MEMORY_UNITS = {"b": 1, **{f"{p}b": 1000 ** (i + 1) for i, p in enumerate("kmgt")}} | {
     f"{p}ib": 1024 ** (i + 1) for i, p in enumerate("kmgt")
@@ -66,11 +72,15 @@ def as_finite(value: object) -> float | None:
     return number + 0.0 if math.isfinite(number) else None  # + 0.0: -0.0 and 0.0 are one config
 
 
-def _number(need: str, allows: Callable[[float], bool]) -> Callable[[object], float]:
+def _number(
+    need: str, allows: Callable[[float], bool], least: float = 0.0, most: float = math.inf, unit: str = "m"
+) -> Callable[[object], float]:
     def check(value: object) -> float:
         number = as_finite(value)
         if number is None or not allows(number):
             raise refuse(value, need, _quoted_number(value))
+        if number and not least <= abs(number) <= most:
+            raise refuse(value, f"{least:g} to {most:g} {unit}")
         return number
 
     return check
@@ -85,12 +95,33 @@ def _integer(need: str, allows: Callable[[int], bool], advice: str = "") -> Call
     return check
 
 
-def _vector(size: int, need: str, allows: Callable[[tuple[float, ...]], bool]) -> Callable[[object], Any]:
+def _bounded_integer(need: str, least: int, most: int, advice: str = "") -> Callable[[object], int]:
+    check_least = _integer(need, lambda n: n >= least, advice)
+
+    def check(value: object) -> int:
+        number = check_least(value)
+        if number > most:
+            raise refuse(value, f"at most {most:_}")
+        return number
+
+    return check
+
+
+def _vector(
+    size: int,
+    need: str,
+    allows: Callable[[tuple[float, ...]], bool],
+    least: float = 0.0,
+    most: float = math.inf,
+) -> Callable[[object], Any]:
     def check(value: object) -> Any:
         numbers = [as_finite(item) for item in value] if isinstance(value, (list, tuple)) else []
         finite = tuple(number for number in numbers if number is not None)
         if len(finite) != size or len(numbers) != size or not allows(finite):
             raise refuse(value, need)
+        if any(abs(number) > most or 0 < abs(number) < least for number in finite):
+            need_range = f"{least:g} to {most:g} m" if least else f"coordinates up to {most:g} m"
+            raise refuse(value, need_range)
         return finite
 
     return check
@@ -115,8 +146,8 @@ def _flag(value: object) -> bool:
 def _text(value: object) -> str:
     if not isinstance(value, str):
         raise refuse(value, "text", "" if value is None else "Put it in quotes.")
-    if not value.strip() or any(ord(character) < 32 for character in value):
-        raise refuse(value, "text that is not blank and has no control characters")
+    if not value.strip() or any(ord(character) < 32 or 0xD800 <= ord(character) < 0xE000 for character in value):
+        raise refuse(value, "text that is not blank and has no control characters or halves of characters")
     return value
 
 
@@ -124,6 +155,8 @@ def _name(value: object) -> str:
     text = _text(value)
     if "/" in text or "\\" in text:
         raise refuse(value, "a name without slashes", "It becomes part of file names; folders go into output.path.")
+    if len(text.encode()) > LONGEST_NAME:
+        raise refuse(value, f"a name of at most {LONGEST_NAME} bytes", "It becomes part of file names.")
     return text
 
 
@@ -142,7 +175,7 @@ def _memory(value: object) -> str:
 def memory_bytes(text: str) -> int | None:
     """Return the bytes in a size such as ``600MB`` (10^6) or ``2GiB`` (2^30); None when it is not one, or below 1."""
     match = _MEMORY.fullmatch(text.strip())
-    if match is None:
+    if match is None or len(text) > _LONGEST_SIZE:
         return None
     return int(float(match[1]) * _MEMORY_UNITS[match[2].lower()]) or None
 
@@ -152,18 +185,44 @@ def _array(size: int, **item: object) -> dict[str, Any]:
 
 
 def _has_direction(vector: tuple[float, ...]) -> bool:
-    return length(vector) > _SMALLEST_DIRECTION
+    return _SMALLEST_DIRECTION < length(vector) < 1 / _SMALLEST_DIRECTION
 
 
 def _all_positive(vector: tuple[float, ...]) -> bool:
     return all(item > 0 for item in vector)
 
 
-Finite = Annotated[float, Checked(_number("a finite number", lambda x: True), {"type": "number"})]
 Positive = Annotated[
     float, Checked(_number("a number > 0", lambda x: x > 0), {"type": "number", "exclusiveMinimum": 0})
 ]
-NonNegative = Annotated[float, Checked(_number("a number >= 0", lambda x: x >= 0), {"type": "number", "minimum": 0})]
+Energy = Annotated[
+    float,
+    Checked(
+        _number("a number > 0", lambda x: x > 0, _FEWEST_JOULES, _MOST_JOULES, "J"),
+        {"type": "number", "exclusiveMinimum": 0, "maximum": _MOST_JOULES},
+    ),
+]
+Coordinate = Annotated[
+    float,
+    Checked(
+        _number("a finite number", lambda x: True, most=LONGEST),
+        {"type": "number", "minimum": -LONGEST, "maximum": LONGEST},
+    ),
+]
+Length = Annotated[
+    float,
+    Checked(
+        _number("a number > 0", lambda x: x > 0, SHORTEST, LONGEST),
+        {"type": "number", "exclusiveMinimum": 0, "maximum": LONGEST},
+    ),
+]
+LengthOrZero = Annotated[
+    float,
+    Checked(
+        _number("a number >= 0", lambda x: x >= 0, SHORTEST, LONGEST),
+        {"type": "number", "minimum": 0, "maximum": LONGEST},
+    ),
+]
 OpenUnit = Annotated[
     float,
     Checked(
@@ -171,7 +230,13 @@ OpenUnit = Annotated[
         {"type": "number", "exclusiveMinimum": 0, "exclusiveMaximum": 1},
     ),
 ]
-Count = Annotated[int, Checked(_integer("an integer >= 1", lambda n: n >= 1), {"type": "integer", "minimum": 1})]
+SampleCount = Annotated[
+    int,
+    Checked(
+        _bounded_integer("an integer >= 1", 1, _MOST_SAMPLES),
+        {"type": "integer", "minimum": 1, "maximum": _MOST_SAMPLES},
+    ),
+]
 GridCount = Annotated[
     int,
     Checked(
@@ -182,8 +247,8 @@ GridCount = Annotated[
 BounceCount = Annotated[
     int,
     Checked(
-        _integer("an integer >= 2 or null for no limit", lambda n: n >= 2, "3 is the third bounce."),
-        {"type": "integer", "minimum": 2},
+        _bounded_integer("an integer >= 2 or null for no limit", 2, _MOST_BOUNCES, "3 is the third bounce."),
+        {"type": "integer", "minimum": 2, "maximum": _MOST_BOUNCES},
     ),
 ]
 Seed = Annotated[
@@ -194,13 +259,18 @@ Seed = Annotated[
     ),
 ]
 Vector3 = tuple[float, float, float]
-Point2 = Annotated[tuple[float, float], Checked(_vector(2, "2 finite numbers [x, y]", lambda v: True), _array(2))]
-Point3 = Annotated[Vector3, Checked(_vector(3, "3 finite numbers [x, y, z]", lambda v: True), _array(3))]
+Point2 = Annotated[
+    tuple[float, float],
+    Checked(_vector(2, "2 finite numbers [x, y]", lambda v: True, most=LONGEST), _array(2)),
+]
+Point3 = Annotated[Vector3, Checked(_vector(3, "3 finite numbers [x, y, z]", lambda v: True, most=LONGEST), _array(3))]
+Angles3 = Annotated[Vector3, Checked(_vector(3, "3 finite numbers [x, y, z]", lambda v: True), _array(3))]
 Direction = Annotated[
     Vector3, Checked(_vector(3, "3 finite numbers [x, y, z], not all zero", _has_direction), _array(3))
 ]
 Sizes3 = Annotated[
-    Vector3, Checked(_vector(3, "3 numbers > 0 [x, y, z]", _all_positive), _array(3, exclusiveMinimum=0))
+    Vector3,
+    Checked(_vector(3, "3 numbers > 0 [x, y, z]", _all_positive, SHORTEST, LONGEST), _array(3, exclusiveMinimum=0)),
 ]
 Flag = Annotated[bool, Checked(_flag, {"type": "boolean"})]
 Text = Annotated[str, Checked(_text, {"type": "string", "minLength": 1})]

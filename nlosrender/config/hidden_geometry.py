@@ -11,13 +11,30 @@ from pydantic import Field, ValidationInfo
 
 from nlosrender.config.bsdf import WHITE_DIFFUSE, BsdfMapping
 from nlosrender.config.bsdf_table import SHAPE_TYPES
-from nlosrender.config.fields import Checked, Direction, Flag, Name, NonNegative, Point3, Positive, Sizes3
+from nlosrender.config.fields import (
+    LONGEST,
+    SHORTEST,
+    Angles3,
+    Checked,
+    Direction,
+    Flag,
+    Length,
+    LengthOrZero,
+    Name,
+    Point3,
+    Positive,
+    Sizes3,
+    as_finite,
+)
 from nlosrender.config.frozen import FrozenDict
 from nlosrender.config.plugin_check import PluginCheck, checked_plugin, config_folder, existing_file
 from nlosrender.config.refusal import Fault, refusal, refuse
 from nlosrender.config.section import Section, pose_faults
 
 LETTERS = string.ascii_uppercase + string.digits + " "
+MOST_LETTERS = 256
+_ROUND = ("sphere", "cylinder")  # shapes whose parameters give their box before Mitsuba loads them
+_POINTS = ("center", "p0", "p1")
 _MESH_SUFFIXES = (".ply", ".obj")
 _TOWARDS_WALL = (0.0, 0.0, -1.0)  # a default wall looks along +z
 _NO_ROTATION = (0.0, 0.0, 0.0)
@@ -27,6 +44,8 @@ def _letters(value: object) -> str:
     need = "A-Z, 0-9 and spaces, at least one of them visible"
     if not isinstance(value, str):
         raise refuse(value, need, "" if value is None else "Put it in quotes.")
+    if len(value) > MOST_LETTERS:
+        raise refuse(value, f"at most {MOST_LETTERS} characters")
     if value.strip(" ") and all(letter in LETTERS for letter in value):
         return value
     upper = value.upper()
@@ -56,8 +75,17 @@ def _check_shape(check: PluginCheck, value: Any) -> Any:
             check.fault((key,), "the BSDF belongs beside shape, not in it; move it one level up.", at_key=True)
         elif isinstance(item, dict) and key != "to_world":
             check.refuse((key,), item, "a number, text or list", "Emitters and sensors cannot be part of a shape.")
+        elif key in _POINTS and value["type"] in _ROUND:
+            result[key] = check.numbers(item, (key,), 3, "3 finite numbers [x, y, z]")
+        elif key == "radius" and value["type"] in _ROUND:
+            number = as_finite(item)
+            if number is None or not SHORTEST <= number <= LONGEST:
+                check.refuse((key,), item, f"a number from {SHORTEST:g} to {LONGEST:g} m")
+            result[key] = item
         else:
             result[key] = check.generic(item, (key,))
+    if value["type"] == "cylinder" and result.get("p0", [0.0, 0.0, 0.0]) == result.get("p1", [0.0, 0.0, 1.0]):
+        check.fault((), "p0 and p1 are the same point, need the two ends of the axis.", at_key=True)
     return result
 
 
@@ -99,9 +127,9 @@ class RectangleConfig(_FacingItem):
     """A flat rectangle, seen from the side of its normal."""
 
     type: Literal["rectangle"]
-    width: Positive
+    width: Length
     """m, along the item's x axis (up x normal)"""
-    height: Positive
+    height: Length
     """m, along the item's y axis (up)"""
 
 
@@ -111,13 +139,13 @@ class LettersConfig(_FacingItem):
     type: Literal["letters"]
     text: LetterText
     """A-Z, 0-9 and spaces"""
-    height: Positive
+    height: Length
     """m, height of the letters"""
-    thickness: NonNegative = 0.0
+    thickness: LengthOrZero = 0.0
     """m; 0: a sheet, more: a solid"""
-    stroke_width: Positive | None = None
+    stroke_width: Length | None = None
     """m; null: 0.2 height"""
-    spacing: NonNegative | None = None
+    spacing: LengthOrZero | None = None
     """m, gap between letters; null: 0.2 height"""
 
     def rules(self) -> Iterator[Fault]:
@@ -136,7 +164,7 @@ class MeshConfig(_HiddenItem):
     """a .ply or .obj file; relative names start at the YAML's folder"""
     scale: Positive = 1.0
     """m per unit of the file"""
-    rotate_deg: Point3 = _NO_ROTATION
+    rotate_deg: Angles3 = _NO_ROTATION
     """degrees about x, y, z, in this order"""
     translate: Point3 = (0.0, 0.0, 0.0)
     """m, scene coordinates"""
@@ -152,7 +180,7 @@ class BoxConfig(_HiddenItem):
     """m, scene coordinates"""
     size: Sizes3
     """m, edge lengths along x, y, z before the rotation"""
-    rotate_deg: Point3 = _NO_ROTATION
+    rotate_deg: Angles3 = _NO_ROTATION
     """degrees about x, y, z, in this order"""
 
 
@@ -162,7 +190,7 @@ class SphereConfig(_HiddenItem):
     type: Literal["sphere"]
     center: Point3
     """m, scene coordinates"""
-    radius: Positive
+    radius: Length
     """m"""
     inside: Flag = False
     """true: the surface seen from within"""
@@ -176,9 +204,9 @@ class CylinderConfig(_HiddenItem):
     """m, scene coordinates, the middle of the axis"""
     axis: Direction = (0.0, 1.0, 0.0)
     """direction of the axis, any length"""
-    radius: Positive
+    radius: Length
     """m"""
-    height: Positive
+    height: Length
     """m, along the axis"""
     inside: Flag = False
     """true: the surface seen from within"""

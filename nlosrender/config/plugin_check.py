@@ -9,7 +9,7 @@ from typing import Any
 
 from pydantic import ValidationInfo
 
-from nlosrender.config.fields import as_finite
+from nlosrender.config.fields import LONGEST, as_finite
 from nlosrender.config.frozen import freeze
 from nlosrender.config.refusal import Fault, KeyPath, raise_faults, refusal, shown
 from nlosrender.errors import nearest
@@ -67,6 +67,13 @@ class PluginCheck:
         if value is None:
             self.refuse(path, value, "a value")
         return value
+
+    def numbers(self, value: Any, path: KeyPath, size: int, need: str) -> Any:
+        """Return a list of ``size`` finite numbers as floats."""
+        found = _finite_list(value, (size,))
+        if found is None or any(abs(number) > LONGEST for number in found):
+            self.refuse(path, value, need)
+        return found
 
     def file(self, value: object, path: KeyPath) -> str:
         """Return the absolute name of an existing file."""

@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 from pydantic import Field
 
 from nlosrender.config.bsdf import WHITE_DIFFUSE, BsdfMapping
-from nlosrender.config.fields import Direction, Flag, Point3, Positive
+from nlosrender.config.fields import Direction, Flag, Length, Point3
 from nlosrender.config.refusal import Fault, shown
 from nlosrender.config.section import Section, pose_faults
 from nlosrender.config.vectors import height_above
@@ -28,9 +28,9 @@ class RectangleWallConfig(_Wall):
     """A flat wall; hidden geometry lies on the side of its normal."""
 
     type: Literal["rectangle"]
-    width: Positive
+    width: Length
     """m, along the wall's x axis (up x normal)"""
-    height: Positive
+    height: Length
     """m, along the wall's y axis (up)"""
     normal: Direction = (0.0, 0.0, 1.0)
     """direction the lit side looks in, any length"""
@@ -55,13 +55,13 @@ class SphereWallConfig(_Wall):
     """A sphere, by default lit from within; wall coordinates are its equal-area cylindrical projection."""
 
     type: Literal["sphere"]
-    radius: Positive
+    radius: Length
     """m"""
     inside: Flag = True
     """true: laser and sensor points lie on the surface seen from within"""
-    width: Positive | None = None
+    width: Length | None = None
     """m, default width of the grids along the equator; null: the whole circumference 2 pi radius"""
-    height: Positive | None = None
+    height: Length | None = None
     """m, default height of the grids along the polar axis; null: the whole diameter"""
 
     def rules(self) -> Iterator[Fault]:
@@ -83,9 +83,9 @@ class CylinderWallConfig(_Wall):
     type: Literal["cylinder"]
     axis: Direction = (0.0, 1.0, 0.0)
     """direction of the wall's y axis, any length"""
-    radius: Positive
+    radius: Length
     """m"""
-    height: Positive
+    height: Length
     """m, along the axis"""
     inside: Flag = True
     """true: laser and sensor points lie on the surface seen from within"""

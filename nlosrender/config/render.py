@@ -11,11 +11,11 @@ from pydantic import model_validator
 from nlosrender.config.fields import (
     BounceCount,
     Checked,
-    Count,
     Flag,
     MemoryLimit,
     OpenUnit,
     Positive,
+    SampleCount,
     Seed,
     memory_bytes,
 )
@@ -56,7 +56,7 @@ class RenderConfig(Section):
     """highest bounce, counting both points on the wall: 3 is the third bounce; null: no limit"""
     split_bounces: Flag = True
     """give each bounce an index of its own in the file; false: all in index 1"""
-    spp: Count | None = None
+    spp: SampleCount | None = None
     """paths per pair of laser and sensor point; excludes target_error"""
     target_error: OpenUnit | None = None
     """relative L2 error of H to stop at; default 0.05 when neither spp nor time_limit_s is given"""

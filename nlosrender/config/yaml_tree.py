@@ -210,7 +210,8 @@ class _Builder:
             if _is_merge(key_node):
                 continue
             if not isinstance(key_node, ScalarNode) or key_node.tag != _TAG + "str":
-                self._problem(key_node, path, f"got {shown(key_node.value)} as a key, need text; put it in quotes.")
+                found = shown(key_node.value) if isinstance(key_node, ScalarNode) else "a list or mapping"
+                self._problem(key_node, path, f"got {found} as a key, need text; put it in quotes.")
                 continue
             key, at = key_node.value, (*path, key_node.value)
             if key in values:

@@ -8,20 +8,25 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from pathlib import Path
+from dataclasses import dataclass, replace
 
 import mitsuba as mi
 import numpy as np
+from numpy.typing import NDArray
 
 from nlosrender.errors import ConfigError, Problem
+from nlosrender.scene.double_faces import without_double_faces
 from nlosrender.scene.hidden_geometry import Bounds, MeshFile, ShapeDescription, Surface, box_corners, joined_bounds
+from nlosrender.scene.mesh_file import read_mesh
 from nlosrender.scene.pose import Float64
 from nlosrender.scene.relay_wall import RelayWall
 from nlosrender.scene.transforms import transform_matrix
 from nlosrender.scene.triangle_mesh import TriangleMesh
 
 WALL_ID = "relay_wall"
+MOST_REACH = 1e5  # hidden geometry over the wall's size: float32 then tells points 1 % of the wall apart
+LEAST_EXTENT = 1e-12  # hidden geometry over the wall's size: the squares of areas stay numbers in float32
+TEXEL_ROUNDING = 1e-3  # half-precision images and their filters may pass 1 a little
 TRANSFORMS = ("to_world", "to_uv")  # keys of a plugin that hold a matrix or a list of steps
 
 
@@ -62,7 +67,9 @@ def build_scene(wall: RelayWall, wall_bsdf: Mapping[str, object], surfaces: Sequ
         Mitsuba rejects a shape or a BSDF, or a mesh file cannot be read; the key of the item is named.
     """
     loaded = [_read_mesh(surface) for surface in surfaces]
-    boxes = [shape.bounds() if isinstance(shape, (TriangleMesh, ShapeDescription)) else None for shape in loaded]
+    boxes = [shape.bounds() for shape in loaded]
+    for surface, box in zip(surfaces, boxes, strict=True):
+        _check_reach(surface, box, wall)
     unit = _unit_length(wall, joined_bounds(boxes))
     wall_shape = _load_shape(wall.shape_description(), wall_bsdf, "scene.relay_wall", WALL_ID, unit)
     hidden_shapes = []
@@ -73,8 +80,11 @@ def build_scene(wall: RelayWall, wall_bsdf: Mapping[str, object], surfaces: Sequ
             hidden_shapes.append(_load_shape(shape.description, surface.bsdf, surface.key, surface.name, unit))
     contents: dict[str, object] = {"type": "scene", WALL_ID: wall_shape}
     contents |= {f"hidden_{index}": shape for index, shape in enumerate(hidden_shapes)}
+    hidden_boxes = [_shape_bounds(shape, unit) for shape in hidden_shapes]
+    for surface, box in zip(surfaces, hidden_boxes, strict=True):
+        _check_reach(surface, box, wall)
     scene = mi.load_dict(contents)
-    hidden_bounds = joined_bounds(_shape_bounds(shape, unit) for shape in hidden_shapes)
+    hidden_bounds = joined_bounds(hidden_boxes)
     n_triangles = sum(int(shape.face_count()) for shape in hidden_shapes if shape.is_mesh())
     return BuiltScene(scene, wall, wall_shape, tuple(surfaces), tuple(hidden_shapes), hidden_bounds, unit, n_triangles)
 
@@ -103,25 +113,24 @@ def _read_mesh(surface: Surface) -> TriangleMesh | ShapeDescription:
     shape = surface.shape
     if not isinstance(shape, MeshFile):
         return shape
-    suffix = Path(shape.filename).suffix.lower().lstrip(".")
     try:
-        mesh = mi.load_dict({"type": suffix, "filename": shape.filename, "face_normals": surface.face_normals})
-        parameters = mi.traverse(mesh)
-        normals = np.asarray(parameters["vertex_normals"], dtype=np.float64).reshape(-1, 3)
-        uvs = np.asarray(parameters["vertex_texcoords"], dtype=np.float64).reshape(-1, 2)
-        return TriangleMesh(
-            np.asarray(parameters["vertex_positions"], dtype=np.float64).reshape(-1, 3),
-            np.asarray(parameters["faces"], dtype=np.uint32).reshape(-1, 3),
-            uvs if len(uvs) else None,
-            normals if len(normals) and not surface.face_normals else None,
-        ).transformed(shape.to_local)
-    except (RuntimeError, ValueError) as error:
-        raise _rejected(f"{surface.key}.filename", f"{shape.filename} cannot be used as a mesh: {error}") from error
+        mesh = read_mesh(shape.filename, shape.kind, face_normals=surface.face_normals).transformed(shape.to_local)
+        if shape.flip_v and mesh.uvs is not None:
+            mesh = replace(mesh, uvs=mesh.uvs * [1.0, -1.0] + [0.0, 1.0])
+        return mesh.turned_round() if shape.flip_normals else mesh
+    except ValueError as error:
+        raise _rejected(f"{surface.key}.filename", f"{shape.filename} cannot be used as a mesh: {error}.") from error
 
 
 def _load_mesh(mesh: TriangleMesh, surface: Surface, unit: float) -> mi.Mesh:
+    # A triangle that float32 rounds to nothing has no normal, and NaN would come of it.
+    mesh = replace(mesh, vertices=(mesh.vertices / unit).astype(np.float32)).with_area_only()
+    if not len(mesh.faces):
+        raise _rejected(surface.key, f"too small in a scene of {unit:g} m: float32 rounds its triangles to nothing.")
+    bsdf = _load_bsdf(surface.bsdf, f"{surface.key}.bsdf")
+    mesh = without_double_faces(mesh, both_sides=bool(bsdf.flags() & mi.BSDFFlags.BackSide))
     properties = mi.Properties()
-    properties["mesh_bsdf"] = _load_bsdf(surface.bsdf, f"{surface.key}.bsdf")
+    properties["mesh_bsdf"] = bsdf
     properties["face_normals"] = surface.face_normals
     shape = mi.Mesh(
         surface.name,
@@ -132,7 +141,7 @@ def _load_mesh(mesh: TriangleMesh, surface: Surface, unit: float) -> mi.Mesh:
         props=properties,
     )
     parameters = mi.traverse(shape)
-    parameters["vertex_positions"] = np.ravel(mesh.vertices / unit).astype(np.float32)
+    parameters["vertex_positions"] = np.ravel(mesh.vertices).astype(np.float32)
     parameters["faces"] = np.ravel(mesh.faces).astype(np.uint32)
     if mesh.normals is not None:
         parameters["vertex_normals"] = np.ravel(mesh.normals).astype(np.float32)
@@ -150,9 +159,18 @@ def _load_shape(
     plugin["bsdf"] = _load_bsdf(bsdf, f"{key}.bsdf")
     plugin["id"] = name
     try:
+        if plugin["type"] == "serialized":
+            _check_faces(mi.load_dict({**plugin, "face_normals": True}))
         return mi.load_dict(plugin)
     except (RuntimeError, TypeError, ValueError) as error:
         raise _rejected(key, f"Mitsuba rejects this shape: {_first_line(error)}") from error
+
+
+def _check_faces(mesh: mi.Mesh) -> None:
+    """Look at a mesh without vertex normals, before Mitsuba computes them and reads where a wrong index leads."""
+    faces = np.asarray(mi.traverse(mesh)["faces"])
+    if not len(faces) or int(faces.max()) >= mesh.vertex_count():
+        raise ValueError(f"a face refers to vertex {faces.max(initial=0)}, the file has {mesh.vertex_count()}")
 
 
 def _scaled(description: Mapping[str, object], unit: float) -> dict[str, object]:
@@ -171,9 +189,26 @@ def _scaled(description: Mapping[str, object], unit: float) -> dict[str, object]
 
 def _load_bsdf(bsdf: Mapping[str, object], key: str) -> mi.BSDF:
     try:
-        return mi.load_dict(mitsuba_value(bsdf))
+        loaded = mi.load_dict(mitsuba_value(bsdf))
     except (RuntimeError, TypeError, ValueError) as error:
         raise _rejected(key, f"Mitsuba rejects this BSDF: {_first_line(error)}") from error
+    for name, values in mi.traverse(loaded).items():
+        if name.endswith(".data"):
+            _check_texels(np.asarray(values), name.removesuffix(".data"), f"{key}.{name.split('.')[0]}")
+    return loaded
+
+
+def _check_texels(values: NDArray, name: str, key: str) -> None:
+    """Refuse images with values no reflectance has; numbers in the configuration have been checked before."""
+    if values.dtype.kind == "u":
+        return  # 8-bit images stand for 0 to 1
+    most = 1.0 if "reflectance" in name or "color" in name else float("inf")
+    wrong = ~((values >= 0) & (values <= most * (1 + TEXEL_ROUNDING)) & np.isfinite(values))
+    if wrong.any():
+        found, need = float(values[wrong][0]), "from 0 to 1" if most == 1 else "finite and not negative"
+        raise _rejected(
+            key, f"{int(wrong.sum())} of {values.size} values of the image, such as {found:g}, are not {need}."
+        )
 
 
 def _shape_bounds(shape: mi.Shape, unit: float) -> Bounds | None:
@@ -183,6 +218,21 @@ def _shape_bounds(shape: mi.Shape, unit: float) -> Bounds | None:
     return np.ravel(np.asarray(box.min, dtype=np.float64)) * unit, np.ravel(
         np.asarray(box.max, dtype=np.float64)
     ) * unit
+
+
+def _check_reach(surface: Surface, box: Bounds | None, wall: RelayWall) -> None:
+    """Refuse what is so far away or so large that the wall's own points fall together in float32, or has no extent."""
+    if box is None:
+        return
+    size, reach = max(wall.width, wall.height), float(np.abs(box).max())
+    if not float((box[1] - box[0]).max()) >= LEAST_EXTENT * size:
+        raise _rejected(surface.key, f"it has no extent beside a relay wall of {size:.4g} m. Check units and scale.")
+    if not reach <= MOST_REACH * size:
+        raise _rejected(
+            surface.key,
+            f"it reaches {reach:.4g} m from the relay wall's centre, need at most {MOST_REACH:g} times the wall's size "
+            f"of {size:.4g} m. Check units, scale and position.",
+        )
 
 
 def _unit_length(wall: RelayWall, hidden: Bounds | None) -> float:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -22,6 +23,7 @@ from nlosrender.scene.triangle_mesh import TriangleMesh
 if TYPE_CHECKING:
     from nlosrender.config.hidden_geometry import CylinderConfig, HiddenItemConfig, MeshConfig, SphereConfig
 
+MESH_PLUGINS = ("ply", "obj")
 Bounds = tuple[Float64, Float64]  # smallest and largest coordinates, (3,) and (3,) m
 
 
@@ -31,6 +33,9 @@ class MeshFile:
 
     filename: str
     to_local: Float64
+    kind: str = "ply"  # one of MESH_PLUGINS
+    flip_normals: bool = False  # seen from the other side
+    flip_v: bool = False  # turn the vertical texture coordinate round
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,7 +101,7 @@ def hidden_surfaces(hidden_geometry_configs: Sequence[HiddenItemConfig], wall: R
             raise ValueError(f"{key}: {error}") from error
         name = item.name or f"{item.type}-{index}"
         # Generated meshes are flat; analytic shapes bring their own normals; only files have a choice.
-        face_normals = bool(item.face_normals) if item.type == "mesh" else isinstance(shape, TriangleMesh)
+        face_normals = _wants_face_normals(item) if isinstance(shape, MeshFile) else isinstance(shape, TriangleMesh)
         surfaces.append(Surface(name, key, shape, item.bsdf, face_normals))
     return tuple(surfaces)
 
@@ -137,7 +142,8 @@ def _shape(item: HiddenItemConfig, wall: RelayWall) -> TriangleMesh | MeshFile |
     if item.type == "room":
         return room_mesh(item.size)  # defined in the wall's local frame
     if item.type == "mesh":
-        return MeshFile(str(item.filename), wall.pose.inverse_matrix() @ _mesh_matrix(item))
+        kind = Path(item.filename).suffix.lower().lstrip(".")
+        return MeshFile(str(item.filename), wall.pose.inverse_matrix() @ _mesh_matrix(item), kind)
     if item.type == "sphere":
         center = wall.pose.to_local(item.center).tolist()
         return _round_shape(item, type="sphere", center=center)
@@ -146,8 +152,29 @@ def _shape(item: HiddenItemConfig, wall: RelayWall) -> TriangleMesh | MeshFile |
         return _round_shape(item, type="cylinder", p0=(center - half).tolist(), p1=(center + half).tolist())
     if item.type == "mitsuba":
         to_world = wall.pose.inverse_matrix() @ transform_matrix(item.shape.get("to_world"))
+        if item.shape["type"] in MESH_PLUGINS:
+            return _mesh_file(item.shape, to_world)
+        if item.shape["type"] == "rectangle":  # two triangles, which every engine can cut
+            rectangle = rectangle_mesh(2.0, 2.0).transformed(to_world)
+            return rectangle.turned_round() if item.shape.get("flip_normals", False) else rectangle
         return ShapeDescription({**item.shape, "to_world": to_world})
     raise ValueError(f"type {item.type!r}: need rectangle, letters, box, room, mesh, sphere, cylinder or mitsuba")
+
+
+def _mesh_file(plugin: Mapping[str, object], to_world: Float64) -> MeshFile:
+    """Return a mesh plugin as a file of ours: Mitsuba's own readers end the process on a wrong index."""
+    unknown = set(plugin) - {"type", "filename", "to_world", "face_normals", "flip_normals", "flip_tex_coords"}
+    if unknown or "filename" not in plugin:
+        wrong = f"unknown parameter {min(unknown)}" if unknown else "no filename"
+        raise ValueError(f"shape: {wrong}, need filename, to_world, face_normals, flip_normals or flip_tex_coords")
+    turned_round = plugin["type"] == "obj"  # Mitsuba's default, and what reading an .obj does
+    flip_v = bool(plugin.get("flip_tex_coords", turned_round)) != turned_round
+    flip_normals = bool(plugin.get("flip_normals", False))
+    return MeshFile(str(plugin["filename"]), to_world, str(plugin["type"]), flip_normals, flip_v)
+
+
+def _wants_face_normals(item: HiddenItemConfig) -> bool:
+    return bool(item.face_normals if item.type == "mesh" else item.type == "mitsuba" and item.shape.get("face_normals"))
 
 
 def _local_pose(pose: Pose, wall: RelayWall) -> Pose:

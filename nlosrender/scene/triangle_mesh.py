@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -35,7 +36,7 @@ class TriangleMesh:
     """
 
     vertices: Float64
-    faces: UInt32
+    faces: NDArray[np.integer]
     uvs: Float64 | None = None
     normals: Float64 | None = None
 
@@ -116,6 +117,11 @@ class TriangleMesh:
         faces = self.faces if determinant > 0 else self.faces[:, ::-1]
         return TriangleMesh(self.vertices @ linear.T + matrix[:3, 3], faces, self.uvs, normals)
 
+    def turned_round(self) -> TriangleMesh:
+        """Return the mesh seen from the other side: faces run the other way, normals point the other way."""
+        normals = None if self.normals is None else -self.normals
+        return TriangleMesh(self.vertices, self.faces[:, ::-1], self.uvs, normals)
+
     def subset(self, mask: ArrayLike) -> TriangleMesh:
         """Return the faces where ``mask`` (m,) is true, without the vertices they do not use.
 
@@ -134,6 +140,13 @@ class TriangleMesh:
             None if self.uvs is None else self.uvs[used],
             None if self.normals is None else self.normals[used],
         )
+
+    def with_area_only(self) -> TriangleMesh:
+        """Return the mesh without faces of no area and without vertices that no face uses; itself if it has neither."""
+        kept = np.einsum("ij,ij->i", *[self._cross_products()] * 2) > 0
+        used = np.zeros(len(self.vertices), dtype=bool)
+        used[self.faces] = True
+        return self if kept.all() and used.all() else self.subset(kept)
 
     @staticmethod
     def merged(meshes: Sequence[TriangleMesh]) -> TriangleMesh:
@@ -160,6 +173,41 @@ class TriangleMesh:
     def _cross_products(self) -> Float64:
         a, b, c = (self.vertices[self.faces[:, corner]] for corner in range(3))
         return np.cross(b - a, c - a)
+
+
+def fan_triangles(polygons: Sequence[NDArray]) -> NDArray[np.int64]:
+    """Return the triangles (m, 3) of polygons, each cut into a fan from its first corner: right for convex ones.
+
+    Parameters
+    ----------
+    polygons
+        Arrays (faces, corners) of vertex indices, one per number of corners; those of less than 3 have no area.
+
+    Raises
+    ------
+    ValueError
+        An index is not an integer.
+    """
+    fans = [np.zeros((0, 3), dtype=np.int64)]
+    for corners in polygons:
+        if corners.dtype.kind == "f" and not (np.abs(corners) < 2**53).all():
+            raise ValueError("a face has an index that is no number, or far too large")
+        indices = corners.astype(np.int64)
+        if corners.dtype.kind == "f" and (indices != corners).any():
+            raise ValueError(f"a face has the index {corners[indices != corners][0]:g}, need integers")
+        for corner in range(1, corners.shape[1] - 1):
+            fans.append(indices[:, [0, corner, corner + 1]])
+    return np.concatenate(fans)
+
+
+def numbers_in(text: bytes, dtype: type) -> NDArray:
+    """Return the numbers in a text, separated by white space, up to the first word that is none."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)  # how numpy reports such a word
+        try:
+            return np.fromstring(text.decode("latin-1"), dtype=dtype, sep=" ")
+        except ValueError:  # the first word already
+            return np.zeros(0, dtype=dtype)
 
 
 def _per_vertex(name: str, rows: ArrayLike, width: int, count: int | None) -> Float64:
