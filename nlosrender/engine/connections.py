@@ -14,6 +14,7 @@ from nlosrender.engine.device_arrays import WallPoints
 from nlosrender.engine.histogram import DeviceHistogram
 from nlosrender.engine.transport import PathSettings, Transport
 
+LEAST_COSINE = 1e-2  # between a ray and a surface's normal
 RAY_OFFSET = 2e-5  # engine units; float32 positions of a scene of size 1 are good to 1e-7
 
 
@@ -150,6 +151,23 @@ def offset_origin(si: mi.SurfaceInteraction3f, direction: mi.Vector3f) -> mi.Poi
     """Return where a ray that leaves a surface in ``direction`` starts: a little off the surface, on the ray's side."""
     scale = RAY_OFFSET * (1 + dr.max(dr.abs(si.p)))
     return si.p + si.n * dr.mulsign(mi.Float(scale), dr.dot(si.n, direction))
+
+
+def on_tangent_plane(
+    si: mi.SurfaceInteraction3f, origin: mi.Point3f, direction: mi.Vector3f, all_flat: bool
+) -> mi.Point3f:
+    """Return where a ray from ``origin`` itself meets the surface that was found by the ray offset from it.
+
+    The offset shortens the way to a surface close by: 4e-5 m of a 2 m wall are 4 % of H 1 mm in front of it. Where
+    the ray grazes the surface, or the surface is curved or lies within the offset, the point that was found has to do.
+    ``all_flat`` tells that the scene has no curved surfaces, and saves asking the one that was found.
+    """
+    along = dr.dot(si.n, direction)
+    way = dr.dot(si.n, si.p - origin) / along
+    trusted = (dr.abs(along) > LEAST_COSINE) & (way > 0) & si.is_valid()
+    if not all_flat:
+        trusted &= si.shape.is_mesh()
+    return dr.select(trusted, origin + direction * way, si.p)
 
 
 def connection_segment(si: mi.SurfaceInteraction3f, direction: mi.Vector3f, point: mi.Point3f) -> mi.Ray3f:

@@ -16,7 +16,7 @@ import drjit as dr
 import mitsuba as mi
 
 from nlosrender.capture.bounces import FIRST_BOUNCE, BounceAxis
-from nlosrender.engine.connections import connect_to_lasers, deposit_spot, offset_origin
+from nlosrender.engine.connections import connect_to_lasers, deposit_spot, offset_origin, on_tangent_plane
 from nlosrender.engine.histogram import DeviceHistogram
 from nlosrender.engine.low_discrepancy import recurrence_steps
 from nlosrender.engine.transport import LaneRandomness, PathSettings, Transport
@@ -71,6 +71,7 @@ def trace_paths(
         # ---- Intersect -----------------------------------------------------------------------------------------
         si = scene.ray_intersect(ray, mi.RayFlags.All, coherent=False, active=alive)
         hit = alive & si.is_valid()
+        si.p = dr.select(has_target, si.p, on_tangent_plane(si, origin, ray.d, built.all_flat))
         distance2 = dr.squared_norm(si.p - origin)
         distance = dr.sqrt(distance2)
         if dr.hint(q > 0, mode="scalar"):

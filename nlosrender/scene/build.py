@@ -44,6 +44,11 @@ class BuiltScene:
     n_triangles: int  # of the hidden geometry; analytic shapes count as none
 
     @property
+    def all_flat(self) -> bool:
+        """Whether the wall is a plane and every hidden surface made of triangles."""
+        return self.wall.is_planar and all(shape.is_mesh() for shape in self.hidden_shapes)
+
+    @property
     def wall_bsdf(self) -> mi.BSDF:
         """BSDF of the relay wall."""
         return self.wall_shape.bsdf()

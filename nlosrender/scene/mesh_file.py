@@ -84,7 +84,8 @@ def smooth_normals(mesh: TriangleMesh) -> Float64:
 def _with_normals(mesh: TriangleMesh) -> TriangleMesh:
     """Return the mesh with a unit normal at every vertex: the file's, else a smooth one, else the face's."""
     normals = np.zeros_like(mesh.vertices) if mesh.normals is None else mesh.normals
-    length = np.linalg.norm(normals, axis=1, keepdims=True)
+    with np.errstate(over="ignore"):  # the length of an absurd normal is infinite: it becomes a missing one
+        length = np.linalg.norm(normals, axis=1, keepdims=True)
     normals = np.divide(normals, length, out=np.zeros_like(normals), where=length > _SHORTEST)
     if not normals.any(axis=1).all():
         missing = ~normals.any(axis=1)

@@ -22,6 +22,7 @@ from nlosrender.engine.virtual_lights.tessellator import MAX_PATCHES, Tessellato
 FIRST_COARSENESS = 1.0
 REFINEMENT = 3.0  # at least so many times more patches between the two resolutions that are compared
 STUCK = 0.9  # of the error before, with twice the patches: refining further is in vain
+ROUGH = 0.2  # an error beyond which the law of its decrease does not hold yet
 MARGIN = 1.1  # on the patches that an extrapolated error asks for
 
 
@@ -102,8 +103,9 @@ class ThirdBounce:
                 error = max(error, estimated_error(self.gather(pilot, self.coarser(fineness)), fine)[0])
             needed = fine.n_patches * error / target
             # float32 path lengths and grazing contacts leave an error that no refinement takes away
-            is_stuck = error > STUCK * earlier and fine.n_patches > 2 * coarse.n_patches
-            if error <= target or is_stuck or max(needed, 2 * fine.n_patches) > MAX_PATCHES:
+            is_stuck = STUCK * earlier < error < ROUGH and fine.n_patches > 2 * coarse.n_patches
+            in_vain = is_stuck or (error < ROUGH and needed > MAX_PATCHES)
+            if error <= target or in_vain or 2 * fine.n_patches > MAX_PATCHES:
                 return fineness, fine
             earlier = error
             # In small steps: where the coarser one merges much of a mesh, its error says little of the finer one's.
