@@ -6,6 +6,7 @@ Mitsuba and Dr.Jit are imported only when a render starts, after the backend has
 
 from __future__ import annotations
 
+import functools
 import time
 from collections.abc import Iterator
 from dataclasses import replace
@@ -33,13 +34,17 @@ from nlosrender.files.partial_capture import PartialCapture
 from nlosrender.files.provenance import provenance_attributes
 from nlosrender.files.replacement import check_writable
 from nlosrender.files.size import disk_warnings
+from nlosrender.rendering.dask_executor import render_on_cluster
+from nlosrender.rendering.dask_worker import Job
 from nlosrender.rendering.local import render_units, resumable
 from nlosrender.rendering.report import Progress, RenderReport, Stopwatch, Warn, Warnings
+from nlosrender.rendering.sharing import ALONE, Sharing
 from nlosrender.scene.hidden_geometry import Surface, hidden_surfaces
 from nlosrender.scene.relay_wall import RelayWall, relay_wall_from_config
 
 if TYPE_CHECKING:
     from nlosrender.engine.path_engine import Budget
+    from nlosrender.rendering.dask_cluster import Cluster
     from nlosrender.rendering.units import Engine
     from nlosrender.scene.build import BuiltScene
 
@@ -51,6 +56,7 @@ def render_capture(
     *,
     selection: Selection = WHOLE,
     resume: bool | None = None,
+    cluster: Cluster | None = None,
 ) -> RenderReport:
     """Render one capture, or a part of it, and write its file.
 
@@ -67,6 +73,8 @@ def render_capture(
     resume
         None: go on with an unfinished render of the same capture where there is one; True: there has to be one;
         False: start anew.
+    cluster
+        Who renders the units; None: this process. The file is the same.
 
     Raises
     ------
@@ -74,7 +82,7 @@ def render_capture(
         Something only the renderer could find wrong: a mesh that cannot be read, a BSDF that Mitsuba rejects, a part
         that the capture does not have.
     BackendError
-        There is no usable LLVM or GPU.
+        There is no usable LLVM or GPU, here or on a worker.
     FileError
         The output cannot be written, or there is an unfinished render of something else.
     RenderError
@@ -89,11 +97,13 @@ def render_capture(
         with uninterrupted():  # an import that Ctrl-C cuts off ends in errors of its own
             backend = start_backend(config.render.backend, colored=config.is_colored)
     resolved, output = config_to_dict(config), config.output
+    sharing = ALONE if cluster is None else cluster.sharing
     replicas = replicas_for(backend.lanes, config.capture.sensor_grid.n_points)
     identity = capture_identity(resolved, str(selection), backend.variant, replicas)
     with PartialCapture.claim(output.path, identity, resume) as partial:
         with stopwatch.stage("scene"):
-            plan, engine, header = set_up(config, backend, warnings, selection)
+            plan, engine, header = set_up_engine(config, backend, selection, sharing)
+            warnings.say(late_warnings(config, backend, plan, engine, header, sharing))
         with stopwatch.stage("render"):
             budget = settled_budget(config, engine)
         with resumable(partial) as stop:
@@ -103,12 +113,12 @@ def render_capture(
             partial.open(header, provenance | identity_attributes(identity), output.compression, output.variance)
             earlier = len(partial.tally.units)
             units = remaining_units(plan, header.confocal, partial.tally.units)
-            render_units(
-                units,
-                engine,
-                budget,
-                partial,
-                stop,
+            if cluster is None:
+                render = functools.partial(render_units, units, engine, budget, partial, stop)
+            else:
+                job = Job(config, selection, identity, backend.name, sharing, set_up_engine)
+                render = functools.partial(render_on_cluster, units, job, budget, partial, stop, cluster)
+            render(
                 store_variance=output.variance,
                 stopwatch=stopwatch,
                 progress=progress,
@@ -139,16 +149,14 @@ def render_capture(
     )
 
 
-def set_up(
-    config: Config, backend: Backend, warnings: Warnings, selection: Selection = WHOLE
+def set_up_engine(
+    config: Config, backend: Backend, selection: Selection = WHOLE, sharing: Sharing = ALONE
 ) -> tuple[Plan, Engine, CaptureHeader]:
     """Stages 2 to 4 up to the first ray: scene, capture, plan, engine, and what the file will say of them."""
     built = load_scene(config)
     capture, time_axis = describe_capture(config, built.wall, built)
-    plan, engine = prepare(config, backend, built, capture, time_axis, selection)
-    header = describe_file(config, built, capture, time_axis)
-    warnings.say(late_warnings(config, backend, plan, engine, header))
-    return plan, engine, header
+    plan, engine = prepare(config, backend, built, capture, time_axis, selection, sharing)
+    return plan, engine, describe_file(config, built, capture, time_axis)
 
 
 def settled_budget(config: Config, engine: Engine) -> Budget:
@@ -170,18 +178,21 @@ def forecast_capture(config: Config) -> Forecast:
     begun = time.perf_counter()
     warnings.say(config_warnings(config))
     backend = start_backend(config.render.backend, colored=config.is_colored)
-    plan, engine, header = set_up(config, backend, warnings)
+    plan, engine, header = set_up_engine(config, backend)
+    warnings.say(late_warnings(config, backend, plan, engine, header))
     spent = time.perf_counter() - begun
     return forecast_render(config, backend, plan, engine, header, tuple(warnings.said), spent)
 
 
-def late_warnings(config: Config, backend: Backend, plan: Plan, engine: Engine, header: CaptureHeader) -> Iterator[str]:
+def late_warnings(
+    config: Config, backend: Backend, plan: Plan, engine: Engine, header: CaptureHeader, sharing: Sharing = ALONE
+) -> Iterator[str]:
     """Yield the warnings that take a scene, a plan and an engine; ``config_warnings`` needs none of them."""
     from nlosrender.engine.memory import memory_warnings
     from nlosrender.engine.scene_warnings import scene_warnings
 
     yield from scene_warnings(engine)
-    yield from memory_warnings(engine, plan, config.render.memory_limit_bytes, backend.lanes)
+    yield from memory_warnings(engine, plan, sharing.memory_limit(config.render.memory_limit_bytes), backend.lanes)
     share = plan.part.share_of(plan.tiling.everything(header.sizes["laser_y"] * header.sizes["laser_x"]))
     size = forecast_file(config, header, engine)
     yield from disk_warnings(
@@ -228,6 +239,7 @@ def prepare(
     capture: Capture,
     time_axis: TimeAxis,
     selection: Selection = WHOLE,
+    sharing: Sharing = ALONE,
 ) -> tuple[Plan, Engine]:
     """Stages 3 and 4: cut the work into units and set up the engine."""
     from nlosrender.engine.path_engine import PathOptions
@@ -236,7 +248,7 @@ def prepare(
     render = config.render
     bounces = BounceAxis(render.max_bounces, render.split_bounces)
     channels = 3 if config.is_colored else 1
-    memory, rows = batch_memory(render.memory_limit_bytes), bounces.n_slots * channels
+    memory, rows = batch_memory(sharing.memory_limit(render.memory_limit_bytes)), bounces.n_slots * channels
     refuse_impossible_samples(config.capture, rows_per_pair=rows, n_bins=time_axis.n_bins, memory_limit=memory)
     _, *storage_tile = sensor_tile(time_axis.n_bins, capture.sensor_grid.ny, capture.sensor_grid.nx)
     plan = plan_capture(
@@ -247,6 +259,8 @@ def prepare(
         memory_limit=memory,
         storage_tile=(storage_tile[0], storage_tile[1]),
         selection=selection,
+        unit_samples=sharing.unit_samples,
+        least_units=sharing.least_units,
     )
     options = PathOptions(
         bounces=bounces,

@@ -72,6 +72,8 @@ def plan_capture(
     memory_limit: int,
     storage_tile: tuple[int, int] = (1, 1),
     selection: Selection = WHOLE,
+    unit_samples: int = UNIT_SAMPLES,
+    least_units: int = 1,
 ) -> Plan:
     """Cut a capture into units.
 
@@ -91,6 +93,10 @@ def plan_capture(
         Rows and columns of sensor points that share a chunk of the file.
     selection
         The part that is rendered.
+    unit_samples
+        Samples of a unit at most.
+    least_units
+        Cut into so many units; but a unit is at least a storage tile with one laser.
 
     Raises
     ------
@@ -114,8 +120,13 @@ def plan_capture(
             f"one sensor point with one laser needs {needed / 1e6:.0f} MB but render.memory_limit leaves "
             f"{memory_limit / 1e6:.0f} MB. Raise it, or use fewer bins ({n_bins}) or bounces."
         )
-    units = tuple(_units(capture, tiling, part, pairs, max(1, UNIT_SAMPLES // row), math.ceil(lanes / replicas)))
     confocal = capture.scan_type == "confocal"
+    enough = unit_samples // row
+    everything = tiling.everything(capture.n_lasers if capture.scan_type == "exhaustive" else 1)
+    of_part = round(capture.n_sensors * (1 if confocal else capture.n_lasers) * part.share_of(everything))
+    if least_units > 1:  # the share is not exact: of one unit it would cut a crumb
+        enough = min(enough, of_part // least_units)
+    units = tuple(_units(capture, tiling, part, pairs, max(1, enough), math.ceil(lanes / replicas)))
     largest = max(b.sensors.size * (1 if confocal else b.lasers.size) for unit in units for b in unit.batches)
     return Plan(units, replicas, largest * pair, tiling, part)
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+from contextlib import AbstractContextManager, nullcontext
+from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -10,7 +12,15 @@ import typer
 
 if TYPE_CHECKING:
     from nlosrender.capture.part import Selection
+    from nlosrender.rendering.dask_cluster import Cluster
     from nlosrender.rendering.report import RenderReport
+
+
+class Executor(StrEnum):
+    """Who renders."""
+
+    LOCAL = "local"
+    DASK = "dask"
 
 
 def register(app: typer.Typer) -> None:
@@ -40,6 +50,17 @@ def render(
             show_default="go on with one if there is one",
         ),
     ] = None,
+    executor: Annotated[
+        Executor, typer.Option(help="Who renders: this process, or the workers of a dask cluster.")
+    ] = Executor.LOCAL,
+    scheduler: Annotated[
+        str | None,
+        typer.Option(metavar="ADDRESS|FILE", help="dask: scheduler to use.", show_default="start one on this machine"),
+    ] = None,
+    workers: Annotated[
+        int | None,
+        typer.Option(min=1, help="dask: processes to start, or to wait for.", show_default="one per core"),
+    ] = None,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress bar, no report.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print the report as one JSON object.")] = False,
 ) -> None:
@@ -52,6 +73,9 @@ def render(
     creates out/z-letter.hdf5, a capture of a hidden letter Z.
     """
     selection = _selection(shard, lasers)
+    if executor is Executor.LOCAL and (scheduler is not None or workers is not None):
+        hint = "--workers" if scheduler is None else "--scheduler"
+        raise typer.BadParameter("needs --executor dask", param_hint=hint)
 
     from nlosrender.cli.progress import progress_bar
     from nlosrender.cli.sweep_command import render_all
@@ -68,18 +92,34 @@ def render(
     if sweep is not None:
         if lasers is not None:
             raise typer.BadParameter("cuts one capture, not a sweep; use --shard", param_hint="--lasers")
-        render_all(sweep, changes, shard=selection.shard, resume=resume, quiet=quiet, as_json=as_json)
+        with _cluster(executor, scheduler, workers) as cluster:
+            render_all(
+                sweep, changes, shard=selection.shard, resume=resume, quiet=quiet, as_json=as_json, cluster=cluster
+            )
         return
     loaded = load_config(config, changes)
     try:
-        with progress_bar("render", hidden=quiet) as (progress, warn):
-            report = render_capture(loaded, progress, warn, selection=selection, resume=resume)
+        with (
+            _cluster(executor, scheduler, workers) as cluster,
+            progress_bar("render", hidden=quiet) as (progress, warn),
+        ):
+            report = render_capture(loaded, progress, warn, selection=selection, resume=resume, cluster=cluster)
     except ConfigError as error:
         raise with_places(error, config, changes) from error
     if as_json:
         _print_json(report)
     elif not quiet:
         _print_report(report)
+
+
+def _cluster(
+    executor: Executor, scheduler: str | None, workers: int | None
+) -> AbstractContextManager[Cluster] | nullcontext[None]:
+    if executor is Executor.LOCAL:
+        return nullcontext()
+    from nlosrender.rendering.dask_cluster import joined_cluster
+
+    return joined_cluster(scheduler, workers)
 
 
 def _selection(shard: str | None, lasers: str | None) -> Selection:

@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from nlosrender.analysis.forecast import Forecast
     from nlosrender.config.document import Config
     from nlosrender.config.sweep_load import Sweep
+    from nlosrender.rendering.dask_cluster import Cluster
     from nlosrender.rendering.report import Progress, RenderReport, Warn
     from nlosrender.rendering.sweep import SweepReport
 
@@ -26,6 +27,7 @@ def render_all(
     resume: bool | None,
     quiet: bool,
     as_json: bool,
+    cluster: Cluster | None = None,
 ) -> None:
     """Render the captures of a sweep and print what came of it.
 
@@ -44,7 +46,7 @@ def render_all(
 
     def render(config: Config, progress: Progress, warn: Warn, resume: bool | None) -> RenderReport:
         try:
-            return render_capture(config, progress, warn, resume=resume)
+            return render_capture(config, progress, warn, resume=resume, cluster=cluster)
         except ConfigError as error:
             raise with_places(error, Path(sweep.source), overrides) from error
 

@@ -78,6 +78,14 @@ def start_backend(wanted: BackendName = "auto", *, colored: bool = False) -> Bac
     return Backend(name, variant, library)
 
 
+def limit_threads(count: int) -> None:
+    """Let Dr.Jit use so many threads of this process; the backend is started."""
+    import drjit
+
+    if drjit.thread_count() != count:
+        drjit.set_thread_count(count)
+
+
 def _load_llvm() -> str:
     if "drjit" in sys.modules:
         return _loaded_library()

@@ -35,11 +35,11 @@ def resumable(partial: PartialCapture) -> Iterator[StopRequest]:
         with stop_request() as stop:
             yield stop
     except KeyboardInterrupt as error:
-        raise InterruptedRender(f"{partial.path}: interrupted{_kept(partial)}") from error
+        raise InterruptedRender(f"{partial.path}: interrupted{kept(partial)}") from error
     except FileError as error:
         if not partial.tally.units:
             raise
-        raise IncompleteRender(f"{error} The render stopped{_kept(partial)}") from error
+        raise IncompleteRender(f"{error} The render stopped{kept(partial)}") from error
     except RenderError:
         partial.discard()  # the same would come out again
         raise
@@ -97,20 +97,40 @@ def render_units(
                 if stop.came:
                     warn(f"{stop.signal_name}: finishing the unit in flight; once more stops at once.")
 
-            writer.store(_rendered(engine, unit, replace(budget, time_limit_s=limit), store_variance, stopwatch, told))
+            writer.store(rendered(engine, unit, replace(budget, time_limit_s=limit), store_variance, stopwatch, told))
             told(1.0)
             if stop.came and number + 1 < len(units):
                 writer.wait()
-                raise InterruptedRender(f"{partial.path}: stopped by {stop.signal_name}{_kept(partial, total)}")
+                raise InterruptedRender(f"{partial.path}: stopped by {stop.signal_name}{kept(partial, total)}")
         writer.wait()
     finally:
         writer.close()
 
 
-def _rendered(
-    engine: Engine, unit: Unit, budget: Budget, store_variance: bool, stopwatch: Stopwatch, progress: Progress
+def rendered(
+    engine: Engine,
+    unit: Unit,
+    budget: Budget,
+    store_variance: bool,
+    stopwatch: Stopwatch,
+    progress: Progress = lambda share: None,
 ) -> RenderedUnit:
-    """Render a unit; the engine's own arrays are gone when this returns."""
+    """Render a unit; the engine's own arrays are gone when this returns.
+
+    Parameters
+    ----------
+    engine, unit, budget, progress
+        As for ``render_unit``.
+    store_variance
+        Whether the file has the variance.
+    stopwatch
+        Told the seconds.
+
+    Raises
+    ------
+    RenderError
+        The result is not finite.
+    """
     compiled, begun = engine.compile_seconds, time.perf_counter()
     histogram = render_unit(engine, unit, budget, progress)
     seconds = time.perf_counter() - begun
@@ -121,8 +141,8 @@ def _rendered(
     return finished_unit(unit, histogram, confocal=confocal, store_variance=store_variance, seconds=seconds)
 
 
-def _kept(partial: PartialCapture, total: int | None = None) -> str:
-    """Return the end of a sentence: what is saved."""
+def kept(partial: PartialCapture, total: int | None = None) -> str:
+    """Return the end of a sentence: what is saved, of ``total`` units."""
     finished = len(partial.tally.units)
     if not finished:
         return " before anything was finished; nothing is kept."

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING, Protocol, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -120,6 +120,21 @@ def finished_unit(
     return RenderedUnit(unit, (0, 0) if confocal else (unit.lasers.y0, unit.lasers.x0), samples, sums)
 
 
+class Storable(Protocol):
+    """A unit that can be stored, whoever packs its chunks: a ``RenderedUnit``, or one that came from elsewhere."""
+
+    @property
+    def unit(self) -> Unit:
+        """Its sensors and lasers."""
+
+    @property
+    def sums(self) -> Sums:
+        """What is summed over it."""
+
+    def chunks(self, cutter: Cutter) -> Iterable[PackedChunk]:
+        """Return its chunks, packed."""
+
+
 class UnitWriter:
     """Stores units in a thread of its own, one at a time; the render waits when it is a whole unit ahead.
 
@@ -138,7 +153,7 @@ class UnitWriter:
         self._thread = ThreadPoolExecutor(max_workers=1, thread_name_prefix="writer")
         self._pending: Future[None] | None = None
 
-    def store(self, rendered: RenderedUnit) -> None:
+    def store(self, rendered: Storable) -> None:
         """Hand over a unit, once the one before is stored.
 
         Raises
@@ -166,7 +181,7 @@ class UnitWriter:
         with uninterrupted():
             self._thread.shutdown(wait=True)
 
-    def _store(self, rendered: RenderedUnit) -> None:
+    def _store(self, rendered: Storable) -> None:
         chunks = rendered.chunks(self._capture.cutter)
         unit = rendered.unit
         packing, writing = self._capture.store((unit.sensors, unit.lasers), chunks, rendered.sums)

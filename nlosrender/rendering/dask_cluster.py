@@ -1,0 +1,112 @@
+"""The processes that render, found or started through dask.distributed; imported only when they are asked for."""
+
+from __future__ import annotations
+
+import os
+import signal
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from nlosrender.errors import BackendError
+from nlosrender.rendering.sharing import Sharing
+
+if TYPE_CHECKING:
+    from distributed import Client
+
+CONNECT_SECONDS = 10.0  # for a scheduler to answer
+WORKER_SECONDS = 60.0  # for workers to join it
+ADVICE = "Start one with 'dask scheduler' and 'dask worker ADDRESS', or leave --scheduler out to use this machine."
+
+
+@dataclass(frozen=True)
+class Cluster:
+    """A connection to a dask scheduler with workers."""
+
+    client: Client
+    sharing: Sharing
+    threads: int | None  # of Dr.Jit in each worker; None: as many as dask gave that worker
+
+
+@contextmanager
+def joined_cluster(scheduler: str | None = None, workers: int | None = None) -> Iterator[Cluster]:
+    """Connect to a scheduler, or start one and workers on this machine; they end with the block.
+
+    Parameters
+    ----------
+    scheduler
+        Address (``tcp://host:8786``) or scheduler file (JSON); None: processes on this machine.
+    workers
+        How many to start, or to wait for; None: one per core, or whichever there are.
+
+    Raises
+    ------
+    BackendError
+        dask.distributed is not installed, no scheduler answers, or too few workers join it.
+    """
+    try:
+        import distributed
+    except ImportError as error:
+        message = f"--executor dask: {error}. Install it with: pip install 'nlosrender[dask]'"
+        raise BackendError(message) from error
+    if scheduler is not None:
+        with _connected(scheduler) as client:
+            yield Cluster(client, Sharing(workers=_awaited(client, scheduler, workers)), threads=None)
+        return
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    count = workers or cores
+    with (
+        # memory_limit 0: units are planned to fit, and dask would kill workers for what is the machine's file cache
+        distributed.LocalCluster(
+            n_workers=count, threads_per_worker=1, processes=True, memory_limit=0, dashboard_address=None
+        ) as local,
+        distributed.Client(local) as client,
+    ):
+        client.register_plugin(_deaf_to_ctrl_c())
+        # the process that writes takes a share of the memory, too
+        yield Cluster(client, Sharing(workers=count, memory_shares=count + 1), threads=max(1, cores // count))
+
+
+@contextmanager
+def _connected(scheduler: str) -> Iterator[Client]:
+    from distributed import Client
+
+    is_file = "://" not in scheduler and (scheduler.endswith(".json") or Path(scheduler).exists())
+    if is_file and not Path(scheduler).exists():  # dask would wait for it without end
+        raise BackendError(f"--scheduler {scheduler}: there is no such scheduler file. {ADVICE}")
+    try:
+        if is_file:
+            client = Client(scheduler_file=scheduler, timeout=CONNECT_SECONDS)
+        else:
+            client = Client(scheduler, timeout=CONNECT_SECONDS)
+    except (OSError, TimeoutError, ValueError, KeyError) as error:  # the last two: no address, no scheduler file
+        reason = str(error) or type(error).__name__
+        raise BackendError(f"--scheduler {scheduler}: no scheduler can be reached: {reason}. {ADVICE}") from error
+    with client:
+        yield client
+
+
+def _awaited(client: Client, scheduler: str, wanted: int | None) -> int:
+    """Wait for workers and return how many there are."""
+    try:
+        client.wait_for_workers(wanted or 1, timeout=WORKER_SECONDS)
+    except TimeoutError as error:
+        found = len(client.scheduler_info()["workers"])
+        raise BackendError(
+            f"--scheduler {scheduler}: has {found} workers after {WORKER_SECONDS:.0f} s, need {wanted or 1}. "
+            "Start them with 'dask worker ADDRESS --nthreads CORES'."
+        ) from error
+    return len(client.scheduler_info()["workers"])
+
+
+def _deaf_to_ctrl_c() -> object:
+    """Return what lets workers finish their unit when Ctrl-C reaches every process of the terminal."""
+    from distributed import WorkerPlugin
+
+    class DeafToCtrlC(WorkerPlugin):
+        def setup(self, worker: object) -> None:
+            signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+    return DeafToCtrlC()

@@ -1,0 +1,183 @@
+"""The units of a plan, rendered by the workers of a dask cluster and written by this process alone.
+
+dask hands out the units, and hands out again those of workers that die; here their number on the way is bounded.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Sequence
+from concurrent.futures import CancelledError
+from contextlib import suppress
+from dataclasses import asdict, replace
+from itertools import islice
+from typing import TYPE_CHECKING
+
+from nlosrender.capture.plan import Unit
+from nlosrender.errors import BackendError, IncompleteRender, InterruptedRender
+from nlosrender.files.interruption import StopRequest
+from nlosrender.files.partial_capture import PartialCapture
+from nlosrender.rendering.dask_cluster import Cluster
+from nlosrender.rendering.dask_worker import Job, PackedUnit, Refusal, render_remotely
+from nlosrender.rendering.local import kept
+from nlosrender.rendering.report import Progress, Stopwatch, Warn
+from nlosrender.rendering.units import UnitWriter
+
+if TYPE_CHECKING:
+    from distributed import Future, as_completed
+
+    from nlosrender.engine.path_engine import Budget
+
+PER_WORKER = 2  # units on the way for each worker: the one it renders, and the next or the last
+LOOK_SECONDS = 0.02  # between two looks at what has come, and at the signals
+WORKER_LOOK_SECONDS = 5.0  # between two looks at whether there are workers at all
+
+
+def render_on_cluster(
+    units: Sequence[Unit],
+    job: Job,
+    budget: Budget,
+    partial: PartialCapture,
+    stop: StopRequest,
+    cluster: Cluster,
+    *,
+    store_variance: bool,
+    stopwatch: Stopwatch,
+    progress: Progress,
+    warn: Warn,
+) -> None:
+    """Render units on a cluster and store each as it comes.
+
+    Parameters
+    ----------
+    units, job
+        What is left to do, of which capture.
+    budget
+        When to stop, settled; ``time_limit_s`` is dealt out to the units as if all workers were always busy.
+    partial
+        Where they go; open.
+    stop
+        When it comes no more units are begun; those that are being rendered are waited for.
+    cluster
+        Who renders.
+    store_variance
+        Whether the file has the variance.
+    stopwatch, progress, warn
+        Told the seconds (render and compress: summed over the workers), the share that is done, and what is odd.
+
+    Raises
+    ------
+    InterruptedRender
+        A stop was requested before the last unit.
+    IncompleteRender
+        The scheduler is gone, or a unit took several workers down with it.
+    BackendError, RenderError, FileError
+        A worker cannot render, a unit cannot be rendered or stored.
+    """
+    workers = cluster.sharing.workers
+    if len(units) < workers:
+        warn(f"--workers: the capture is cut into {len(units)} units, so that some of {workers} workers have no work.")
+    if budget.time_limit_s is not None and units:
+        left = max(0.0, budget.time_limit_s - partial.tally.sums.seconds / workers)
+        budget = replace(budget, time_limit_s=left * workers / len(units))
+    total = len(partial.tally.units) + len(units)
+    flight = _Flight(units, job, budget, store_variance, cluster)
+    writer = UnitWriter(partial, stopwatch)
+    done = len(partial.tally.units)
+    try:
+        for arrived in flight.arrivals(stop, warn):
+            for stage, spent in arrived.seconds.items():
+                stopwatch.seconds[stage] += spent
+            writer.store(arrived)
+            done += 1
+            progress(done / total)
+        writer.wait()
+    except (BackendError, IncompleteRender) as error:
+        writer.wait()
+        raise type(error)(f"{partial.path}: {error} The render stopped{kept(partial, total)}") from error
+    finally:
+        writer.close()
+        flight.cancel()
+    if done < total:
+        raise InterruptedRender(f"{partial.path}: stopped by {stop.signal_name}{kept(partial, total)}")
+
+
+class _Flight:
+    """The units on their way to the workers and back: never more than ``PER_WORKER`` for each."""
+
+    def __init__(self, units: Sequence[Unit], job: Job, budget: Budget, store_variance: bool, cluster: Cluster):
+        self._left, self._client = iter(units), cluster.client
+        self._arguments = (asdict(budget), store_variance, cluster.threads)
+        self._job = job
+        self._out: dict[Future, None] = {}  # the oldest first: the order in which they are begun
+        self._recalled = False
+
+    def arrivals(self, stop: StopRequest, warn: Warn) -> Iterator[PackedUnit]:
+        """Yield units as they come; after a stop only those that were begun."""
+        from distributed import as_completed
+
+        flying = as_completed([])
+        looked = time.monotonic()
+        self._top_up(flying)
+        while not flying.is_empty():
+            if stop.came and not self._recalled:
+                warn(f"{stop.signal_name}: finishing the units in flight; once more stops at once.")
+                self._recall()
+            if time.monotonic() - looked > WORKER_LOOK_SECONDS:
+                looked = time.monotonic()
+                if not self._client.scheduler_info()["workers"]:
+                    if self._recalled:  # the signal has ended them, too
+                        return
+                    warn("no worker is left; waiting for one to join. Ctrl-C saves what is finished.")
+            if not flying.has_ready():
+                time.sleep(LOOK_SECONDS)
+                continue
+            future = next(flying)
+            if future not in self._out:  # recalled
+                continue
+            arrived = self._arrived(future)
+            del self._out[future], future  # the worker may forget it now
+            yield arrived  # which waits for the writer, so that results stay with the workers
+            if not self._recalled:
+                self._top_up(flying)
+
+    def cancel(self) -> None:
+        """Take back what is still out."""
+        with suppress(OSError, TimeoutError, CancelledError):  # the scheduler is gone, and everything with it
+            self._client.cancel(list(self._out))
+        self._out.clear()
+
+    def _top_up(self, flying: as_completed) -> None:
+        bound = PER_WORKER * max(1, len(self._client.scheduler_info()["workers"]))
+        for unit in islice(self._left, max(0, bound - len(self._out))):
+            # not pure: dask would take units of equal arguments for one
+            future = self._client.submit(render_remotely, self._job, unit, *self._arguments, pure=False)
+            self._out[future] = None
+            flying.add(future)
+
+    def _recall(self) -> None:
+        """Take back the units that wait behind those that are being rendered."""
+        self._recalled = True
+        running = max(1, len(self._client.scheduler_info()["workers"]))
+        waiting = [future for future in list(self._out)[running:] if not future.done()]
+        self._client.cancel(waiting)
+        for future in waiting:
+            del self._out[future]
+
+    def _arrived(self, future: Future) -> PackedUnit:
+        from distributed import KilledWorker
+
+        try:
+            result: PackedUnit | Refusal = future.result()
+        except KilledWorker as error:
+            raise IncompleteRender(
+                "a unit has ended every worker process it was given to. Lower render.memory_limit if they ran out "
+                "of memory; the workers' logs tell."
+            ) from error
+        except (CancelledError, OSError) as error:
+            raise IncompleteRender("the dask scheduler is gone, and the units in flight with it.") from error
+        except ImportError as error:
+            raise BackendError(f"a worker lacks a package ({error}). Install nlosrender on every machine.") from error
+        if isinstance(result, Refusal):
+            raise result.error()
+        return result

@@ -1,0 +1,155 @@
+"""What a worker process does: set up a capture once, then render and pack unit after unit.
+
+Nothing that is sent here may import Dr.Jit by being unpickled: the backend has to choose LLVM before that.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, TypeAlias
+
+from nlosrender.capture.part import Selection
+from nlosrender.capture.plan import Plan, Unit, replicas_for
+from nlosrender.config.canonical import tree_hash
+from nlosrender.config.document import Config
+from nlosrender.config.load import config_to_dict
+from nlosrender.engine.backend import Backend, BackendName, limit_threads, start_backend
+from nlosrender.errors import BackendError, ConfigError, NlosError, Problem
+from nlosrender.files.capture_file import CaptureHeader
+from nlosrender.files.identity import capture_identity, differences
+from nlosrender.files.pieces import Cutter, PackedChunk
+from nlosrender.files.sums import Sums
+from nlosrender.rendering.local import rendered
+from nlosrender.rendering.report import Stopwatch
+from nlosrender.rendering.sharing import Sharing
+
+if TYPE_CHECKING:
+    from nlosrender.rendering.units import Engine
+
+    SetUp: TypeAlias = Callable[[Config, Backend, Selection, Sharing], tuple[Plan, Engine, CaptureHeader]]
+
+
+@dataclass(frozen=True)
+class Job:
+    """A capture, as workers are told of it."""
+
+    config: Config
+    selection: Selection
+    identity: Mapping[str, Any]  # what the worker's own view of the capture has to agree with
+    backend: BackendName
+    sharing: Sharing
+    set_up: SetUp  # a function of a module, which is found by its name
+
+
+@dataclass(frozen=True, eq=False)
+class PackedUnit:
+    """A unit as it travels: chunks ready to be written."""
+
+    unit: Unit
+    packed: tuple[PackedChunk, ...]
+    sums: Sums
+    seconds: dict[str, float]  # per stage, spent on it in the worker
+
+    def chunks(self, cutter: Cutter) -> tuple[PackedChunk, ...]:
+        """Return its chunks, packed by the worker."""
+        return self.packed
+
+
+@dataclass(frozen=True)
+class Refusal:
+    """An explained error as it travels: a value, so that dask neither retries nor pickles an exception."""
+
+    kind: type[NlosError]
+    content: str | tuple[Problem, ...]
+
+    def error(self) -> NlosError:
+        """Return the error to raise."""
+        return self.kind(self.content)
+
+
+@dataclass
+class _Desk:
+    """The one capture that this process is set up for; a unit is rendered at a time, the one before is packed."""
+
+    lock: threading.Lock = field(default_factory=threading.Lock)
+    key: str = ""
+    engine: Engine | None = None
+    cutter: Cutter | None = None
+
+    def prepared(self, job: Job) -> tuple[Engine, Cutter]:
+        """Return what renders and what cuts; the backend is started."""
+        # in every thread: Mitsuba's variant belongs to the thread
+        backend = start_backend(job.backend, colored=job.config.is_colored)
+        key = tree_hash(dict(job.identity))
+        if key != self.key or self.engine is None or self.cutter is None:
+            self.key, self.engine, self.cutter = "", None, None  # only one fits the memory
+            _refuse_other_capture(job, backend)
+            _, self.engine, header = job.set_up(job.config, backend, job.selection, job.sharing)
+            self.cutter = Cutter(header, job.config.output.compression)
+            self.key = key
+        return self.engine, self.cutter
+
+
+_DESK = _Desk()
+
+
+def render_remotely(
+    job: Job, unit: Unit, budget: Mapping[str, Any], store_variance: bool, threads: int | None
+) -> PackedUnit | Refusal:
+    """Render a unit in a worker process.
+
+    Parameters
+    ----------
+    job, unit
+        What to render.
+    budget
+        The fields of a settled ``Budget``: the class itself would import Dr.Jit.
+    store_variance
+        Whether the file has the variance.
+    threads
+        Of Dr.Jit; None: as many as the dask worker has.
+    """
+    stopwatch = Stopwatch()
+    try:
+        with _DESK.lock:
+            with stopwatch.stage("scene"):
+                engine, cutter = _DESK.prepared(job)
+                limit_threads(threads or _threads_of_worker())
+            from nlosrender.engine.path_engine import Budget
+
+            finished = rendered(engine, unit, Budget(**budget), store_variance, stopwatch)
+        begun = time.perf_counter()
+        packed = tuple(finished.chunks(cutter))
+        stopwatch.seconds["compress"] += time.perf_counter() - begun
+    except ConfigError as error:
+        return Refusal(ConfigError, error.problems)
+    except NlosError as error:
+        return Refusal(type(error), f"{error} (on worker {_worker_name()})")
+    return PackedUnit(unit, packed, finished.sums, stopwatch.seconds)
+
+
+def _refuse_other_capture(job: Job, backend: Backend) -> None:
+    """Refuse to render what would be another capture here: other versions, another mesh under the same name."""
+    replicas = replicas_for(backend.lanes, job.config.capture.sensor_grid.n_points)
+    mine = capture_identity(config_to_dict(job.config), str(job.selection), backend.variant, replicas)
+    found = [f"{key}: {there} there, {here} here" for key, there, here in differences(job.identity, mine)]
+    if found:
+        raise BackendError(
+            f"a worker would render another capture ({'; '.join(found)}). Install the same versions everywhere, and "
+            "let every machine read the same files under the same names."
+        )
+
+
+def _threads_of_worker() -> int:
+    from distributed import get_worker
+
+    return get_worker().state.nthreads
+
+
+def _worker_name() -> str:
+    from distributed import get_worker
+
+    return str(get_worker().address)
