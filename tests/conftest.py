@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 from pathlib import Path
 
 import pytest
@@ -15,3 +16,9 @@ def bunny() -> Path:
     if not BUNNY.exists():
         pytest.skip(f"{BUNNY} is not there")
     return BUNNY
+
+
+def pytest_configure() -> None:
+    """Make Ctrl-C arrive, also where the suite is run in the background: shells let such commands ignore it."""
+    if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
