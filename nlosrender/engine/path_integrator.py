@@ -19,10 +19,9 @@ from nlosrender.capture.bounces import FIRST_BOUNCE, BounceAxis
 from nlosrender.engine.connections import connect_to_lasers, deposit_spot, offset_origin, on_tangent_plane
 from nlosrender.engine.histogram import DeviceHistogram
 from nlosrender.engine.low_discrepancy import recurrence_steps
-from nlosrender.engine.transport import LaneRandomness, PathSettings, Transport
+from nlosrender.engine.transport import HIGHEST_SURVIVAL, LaneRandomness, PathSettings, Transport
 
 PLUGIN_NAME = "nlos_path"
-HIGHEST_SURVIVAL = 0.95  # of the roulette: even a white closed room ends
 
 
 @dr.syntax

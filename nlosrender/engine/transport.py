@@ -12,6 +12,8 @@ from nlosrender.engine.device_arrays import WallPoints
 from nlosrender.engine.surface_sampler import SurfaceSampler
 from nlosrender.scene.build import BuiltScene
 
+HIGHEST_SURVIVAL = 0.95  # of the roulette: even a white closed room ends
+
 
 @dataclass(frozen=True)
 class PathSettings:

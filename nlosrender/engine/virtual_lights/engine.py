@@ -22,7 +22,7 @@ from nlosrender.engine.virtual_lights.further_bounces import FurtherBounces, rou
 from nlosrender.engine.virtual_lights.lights import GatherSettings
 from nlosrender.engine.virtual_lights.occlusion import nothing_occludes
 from nlosrender.engine.virtual_lights.tessellator import Tessellator
-from nlosrender.engine.virtual_lights.third_bounce import FIRST_COARSENESS, ThirdBounce, estimated_error
+from nlosrender.engine.virtual_lights.third_bounce import FIRST_COARSENESS, REFINEMENT, ThirdBounce, estimated_error
 from nlosrender.errors import RenderError
 from nlosrender.scene.build import BuiltScene
 
@@ -182,7 +182,7 @@ class VirtualLightEngine:
         fineness = FIRST_COARSENESS
         coarse = self.third.gather(pilot, fineness)
         while True:
-            finer = self.third.finer(fineness, 3.0)
+            finer = self.third.finer(fineness, REFINEMENT)
             begun = time.perf_counter()
             fine = self.third.gather(pilot, finer)
             predicted = (time.perf_counter() - begun) * more * 4

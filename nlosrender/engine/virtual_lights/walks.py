@@ -19,13 +19,12 @@ from numpy.typing import NDArray
 from nlosrender.capture.bounces import FIRST_BOUNCE
 from nlosrender.engine.connections import connection_segment, offset_origin
 from nlosrender.engine.device_arrays import WallPoints
-from nlosrender.engine.transport import LaneRandomness, Transport
+from nlosrender.engine.transport import HIGHEST_SURVIVAL, LaneRandomness, Transport
 from nlosrender.engine.virtual_lights.lights import normal_reflectance, surface_at
 from nlosrender.engine.virtual_lights.sites import Sites
 from nlosrender.scene.build import BuiltScene
 from nlosrender.scene.pose import Float64
 
-HIGHEST_SURVIVAL = 0.95  # of the roulette: even a white closed room ends
 # Share of the average laser's light that a vertex is taken to receive from the lasers it was not tried with.
 UNTRIED_SHARE = 0.2
 
