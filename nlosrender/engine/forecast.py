@@ -18,7 +18,8 @@ from nlosrender.capture.grids import Capture
 from nlosrender.capture.plan import Batch, Plan, Tile
 from nlosrender.engine.histogram import Histogram, relative_l2_error
 from nlosrender.engine.memory import n_pairs
-from nlosrender.engine.path_engine import DEFAULT_TARGET, FIRST_SAMPLES, Budget, PathEngine
+from nlosrender.engine.path_engine import PathEngine
+from nlosrender.engine.sampling import DEFAULT_TARGET, FIRST_SAMPLES, Budget
 from nlosrender.engine.skipped import traces_paths
 from nlosrender.engine.virtual_lights.engine import VirtualLightEngine
 from nlosrender.engine.virtual_lights.third_bounce import FIRST_COARSENESS, REFINEMENT

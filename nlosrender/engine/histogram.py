@@ -50,11 +50,6 @@ class HistogramShape:
         """Entries of all lanes."""
         return self.lanes * self.entries_per_lane
 
-    @property
-    def axes(self) -> tuple[int, ...]:
-        """Shape of the statistics: (sensor, laser, slot, channel, bin and outside)."""
-        return (self.sensors, self.lasers, self.slots, self.channels, self.row)
-
 
 class DeviceHistogram:
     """Deposits of a batch, summed per lane in float64."""
@@ -82,20 +77,53 @@ class DeviceHistogram:
             index = (row * shape.channels + channel) * shape.row + entry
             dr.scatter_add(self.sums, mi.Float64(value[channel]), index, active, dr.ReduceMode.NoConflicts)
 
-    def statistics(self, samples_per_lane: int) -> tuple[mi.Float64, mi.Float64]:
-        """Return mean and variance of the mean over replicas, each (sensor, laser, slot, channel, row) flattened.
+    def statistics(
+        self, samples_per_lane: int, scale: float = 1.0, slots: range | None = None
+    ) -> tuple[mi.Float64, mi.Float64]:
+        """Return mean and variance of the mean over replicas times ``scale``, in memory order, flattened.
 
         The replicas are independent, so their spread estimates the variance whatever correlates within one.
+
+        Parameters
+        ----------
+        samples_per_lane
+            What a replica's sums are divided by.
+        scale
+            Of the mean.
+        slots
+            Bounce slots of the result, counted from the histogram's first; slots it does not have are zero.
         """
-        shape = self.shape
-        size = shape.size // shape.replicas
-        index = dr.arange(mi.UInt32, size)
-        scale = 1.0 / samples_per_lane
-        replicas = [dr.gather(mi.Float64, self.sums, index + r * size) * scale for r in range(shape.replicas)]
-        mean = sum(replicas[1:], replicas[0]) / shape.replicas
+        count = self.shape.replicas
+        replicas = self._replicas(1.0 / samples_per_lane, slots)
+        mean = sum(replicas[1:], replicas[0]) / count
         squares = [dr.square(replica - mean) for replica in replicas]
-        variance = sum(squares[1:], squares[0]) / ((shape.replicas - 1) * shape.replicas)
-        return mean, variance
+        variance = sum(squares[1:], squares[0]) / ((count - 1) * count)
+        return mean * scale, variance * scale**2
+
+    def total(self, scale: float = 1.0) -> mi.Float64:
+        """Return the sum over replicas times ``scale``, in memory order, flattened."""
+        replicas = self._replicas(scale, None)
+        return sum(replicas[1:], replicas[0])
+
+    def on_host(self, values: mi.Float64) -> NDArray[np.float64]:
+        """Return statistics as an array (channel, slot, laser, sensor, row), a view of them on a CPU."""
+        shape = self.shape
+        return np.asarray(values.numpy()).reshape(shape.channels, -1, shape.lasers, shape.sensors, shape.row)
+
+    def _replicas(self, scale: float, slots: range | None) -> list[mi.Float64]:
+        """Return the sums of every replica times ``scale``, transposed to memory order while they are read."""
+        shape = self.shape
+        slots = range(shape.slots) if slots is None else slots
+        size = shape.size // shape.replicas
+        index = dr.arange(mi.UInt32, size // shape.slots * len(slots))
+        entry, rest = index % shape.row, index // shape.row
+        sensor, rest = rest % shape.sensors, rest // shape.sensors
+        laser, rest = rest % shape.lasers, rest // shape.lasers
+        slot, channel = mi.Int32(rest % len(slots)) + slots.start, rest // len(slots)
+        own = (slot >= 0) & (slot < shape.slots)
+        row = ((sensor * shape.lasers + laser) * shape.slots + mi.UInt32(slot)) * shape.channels + channel
+        start = row * shape.row + entry
+        return [dr.gather(mi.Float64, self.sums, start + r * size, own) * scale for r in range(shape.replicas)]
 
     def relative_error(self, samples_per_lane: int, known_squares: float = 0.0) -> float:
         """Return the estimated relative L2 error of H inside the time window.
@@ -120,8 +148,3 @@ class Histogram:
     variance: NDArray[np.float64]
     outside: NDArray[np.float64]  # (channel, bounce, laser, sensor): H outside the time window
     samples: int  # per sensor point; 0 for a deterministic engine
-
-
-def to_memory_order(values: NDArray[np.float64], shape: HistogramShape) -> NDArray[np.float64]:
-    """Bring flat statistics to (channel, slot, laser, sensor, row)."""
-    return values.reshape(shape.axes).transpose(3, 2, 1, 0, 4)

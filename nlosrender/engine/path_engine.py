@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import math
-import time
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import drjit as dr
@@ -15,40 +13,27 @@ from nlosrender.capture.bounces import THIRD_BOUNCE, BounceAxis
 from nlosrender.capture.grids import Capture
 from nlosrender.capture.plan import MOST_SUMS, Batch
 from nlosrender.capture.time_axis import TimeAxis
+from nlosrender.engine.connections import offset_origin
 from nlosrender.engine.device_arrays import laser_points, sensor_points
-from nlosrender.engine.histogram import DeviceHistogram, Histogram, HistogramShape, to_memory_order
+from nlosrender.engine.histogram import DeviceHistogram, Histogram, HistogramShape
 from nlosrender.engine.path_integrator import load_path_integrator
 from nlosrender.engine.pilot import Pilot, pilot_of
+from nlosrender.engine.sampling import (
+    Budget,
+    Progress,
+    Schedule,
+    accumulate,
+    pilot_replicas,
+    settled_by_pilot,
+)
 from nlosrender.engine.second_bounce import deposit_second_bounce
 from nlosrender.engine.surface_sampler import SurfaceSampler
 from nlosrender.engine.transport import LaneRandomness, PathSettings, Transport
 from nlosrender.errors import RenderError
 from nlosrender.scene.build import BuiltScene
 
-FIRST_SAMPLES = 32  # per lane, before the first look at the error
-LAUNCH_SECONDS = 0.5  # launches are kept this short, for the progress bar and Ctrl-C
 NEAR_RATIO = 4.0  # hidden area over pi times (its distance from the wall)^2 above which its density is too peaked
-DEFAULT_TARGET = 0.01  # where neither an error nor samples are asked for
-SETTLED_SHARE = 0.9  # of the target error: the pilot's estimate has an error of its own
-PILOT_ERROR = 3.0  # times the goal: when a pilot has seen enough
-PILOT_LANES = 2048
 SURROUNDED = 0.75  # share of the hemisphere above which BSDF sampling alone does better
-
-Progress = Callable[[float], None]
-
-
-@dataclass(frozen=True)
-class Budget:
-    """When to stop: after ``spp`` samples per sensor point, at ``target_error`` (relative L2 of H), after seconds.
-
-    An engine's ``settle`` turns a target error into fixed settings.
-    """
-
-    spp: int | None = None
-    target_error: float | None = None
-    time_limit_s: float | None = None
-    fineness: float | None = None  # settled: coarseness of the patches of the virtual lights
-    rounds: int | None = None  # settled: rounds of walks of the virtual lights
 
 
 @dataclass(frozen=True)
@@ -143,21 +128,14 @@ class PathEngine:
                 f"a batch of {shape.size:.2e} sums is more than 32-bit indices reach; lower render.memory_limit"
             )
         transport = self.transport(batch, shape)
-        if not self._has_bounces:
-            mean, variance = np.zeros(shape.axes), np.zeros(shape.axes)
-            per_lane = 0
-        else:
-            schedule = _Schedule(budget, shape.replicas, known_squares)
+        if self._has_bounces:
+            schedule = Schedule(budget, shape.replicas, known_squares)
             mean, variance, per_lane = self._accumulate(batch, shape, transport, schedule, progress)
-        mean, variance = to_memory_order(mean, shape), to_memory_order(variance, shape)
-        if bounces.split:
-            second = np.zeros((shape.channels, 1, *mean.shape[2:]))
-            keep = 0 if bounces.n_slots == 1 else shape.slots
-            mean = np.concatenate([second, mean[:, :keep]], axis=1)
-            variance = np.concatenate([second, variance[:, :keep]], axis=1)
+        else:
+            axes = (shape.channels, bounces.n_slots, shape.lasers, shape.sensors, shape.row)
+            mean, variance, per_lane = np.zeros(axes), np.zeros(axes), 0
         if not self.built.wall.is_planar:
             mean[:, :1] += self._second_bounce(batch, transport)
-        mean, variance = mean * self.scale, variance * self.scale**2
         if not (np.isfinite(mean).all() and np.isfinite(variance).all()):
             raise RenderError("the path engine produced a value that is not finite; please report the configuration")
         return Histogram(mean[..., :-1], variance[..., :-1], mean[..., -1], per_lane * shape.replicas)
@@ -174,20 +152,20 @@ class PathEngine:
         known_squares
             Sum of the squares of H over the pilot's points known from elsewhere [(engine unit)^-4].
         """
-        if budget.target_error is None or budget.spp is not None or budget.time_limit_s is not None:
+        if budget.is_settled:
             return budget
         if not self._has_bounces:
             return budget
         pilot = pilot_of(self.capture)
         bounces = self.options.bounces
         slots = max(1, bounces.n_slots - 1) if bounces.split else 1
-        replicas = max(self.options.replicas, PILOT_LANES // pilot.sensors.size // 2 * 2)
-        shape = replace(self.shape(pilot, slots), replicas=replicas)
-        goal = SETTLED_SHARE * budget.target_error
-        schedule = _Schedule(Budget(target_error=PILOT_ERROR * goal), replicas, known_squares)
-        _, _, per_lane = self._accumulate(pilot, shape, self.transport(pilot, shape), schedule, lambda share: None)
-        error = schedule.errors[-1][1]
-        return replace(budget, spp=max(1, math.ceil(per_lane * replicas * (error / goal) ** 2)))
+        shape = replace(self.shape(pilot, slots), replicas=pilot_replicas(self.options.replicas, pilot.sensors.size))
+        transport = self.transport(pilot, shape)
+
+        def look(schedule: Schedule) -> int:
+            return self._accumulate(pilot, shape, transport, schedule, lambda share: None)[2]
+
+        return settled_by_pilot(budget, shape.replicas, look, known_squares)
 
     @property
     def _has_bounces(self) -> bool:
@@ -195,31 +173,17 @@ class PathEngine:
         return highest is None or highest >= self.settings.first_bounce
 
     def _accumulate(
-        self, batch: Batch | Pilot, shape: HistogramShape, transport: Transport, schedule: _Schedule, progress: Progress
+        self, batch: Batch | Pilot, shape: HistogramShape, transport: Transport, schedule: Schedule, progress: Progress
     ) -> tuple[np.ndarray, np.ndarray, int]:
-        histogram = DeviceHistogram(shape)
-        lane = dr.arange(mi.UInt32, shape.lanes)
-        point = dr.gather(mi.UInt32, mi.UInt32(self.sensor_indices(batch)), lane % shape.sensors)
-        key = point * shape.replicas + lane // shape.sensors
-        randomness = LaneRandomness.seeded(self.options.seed, key)
-        begun = time.perf_counter()
-        done = 0
-        while (more := schedule.next_samples(done, time.perf_counter() - begun)) > 0:
-            launched = time.perf_counter()
-            randomness = self.integrator.accumulate(transport, histogram, randomness, more)
-            dr.sync_thread()
-            seconds = time.perf_counter() - launched
-            if done == 0:
-                self.compile_seconds += seconds  # the first launch is small: nearly all of it is compilation
-            else:
-                schedule.speed = more / max(seconds, 1e-6)
-            done += more
-            if schedule.wants_error(done):
-                schedule.record_error(done, histogram.relative_error(done, schedule.known_squares))
-            progress(schedule.fraction(done, time.perf_counter() - begun))
-        mean, variance = histogram.statistics(done)
-        dr.eval(mean, variance)
-        return mean.numpy(), variance.numpy(), done
+        def launch(histogram: DeviceHistogram, randomness: LaneRandomness, more: int) -> LaneRandomness:
+            return self.integrator.accumulate(transport, histogram, randomness, more)
+
+        bounces, points = self.options.bounces, self.sensor_indices(batch)
+        first = 1 if bounces.split else 0  # the second bounce has slot 0
+        slots = range(-first, bounces.n_slots - first)
+        result = accumulate(shape, points, self.options.seed, launch, schedule, progress, self.scale, slots)
+        self.compile_seconds += result.compile_seconds
+        return result.mean, result.variance, result.per_lane
 
     def shape(self, batch: Batch | Pilot, slots: int) -> HistogramShape:
         """Return the shape of a batch's histogram with ``slots`` bounce slots."""
@@ -261,8 +225,7 @@ class PathEngine:
         )
         histogram = DeviceHistogram(shape)
         deposit_second_bounce(single, histogram)
-        dr.eval(histogram.sums)
-        return to_memory_order(histogram.sums.numpy(), shape)
+        return histogram.on_host(histogram.total(self.scale))
 
     def sensor_indices(self, batch: Batch | Pilot) -> np.ndarray:
         """Return the flat indices of a batch's sensor points."""
@@ -298,60 +261,5 @@ class PathEngine:
         k = lanes % 64
         stratified = mi.Point2f((mi.Float(k % 8) + 0.5) / 8, (mi.Float(k // 8) + 0.5) / 8)
         direction = si.to_world(mi.warp.square_to_cosine_hemisphere(stratified))
-        ray = mi.Ray3f(si.p + 1e-4 * si.n, direction)
+        ray = mi.Ray3f(offset_origin(self.built, si, direction), direction)
         return float(dr.mean(dr.select(self.built.scene.ray_test(ray), mi.Float(1), 0))[0])
-
-
-class _Schedule:
-    """How many samples each launch takes. Only the last launches depend on time, and only with a time limit."""
-
-    def __init__(self, budget: Budget, replicas: int, known_squares: float):
-        self.budget, self.known_squares = budget, known_squares
-        self.limit = math.ceil(budget.spp / replicas) if budget.spp is not None else None
-        self.errors: list[tuple[int, float]] = []  # (samples per lane, relative L2 error)
-        self.speed = math.inf  # samples per lane and second
-        self._next_look = FIRST_SAMPLES
-
-    def next_samples(self, done: int, seconds: float) -> int:
-        """Return the samples per lane of the next launch; 0 when the budget is met."""
-        budget = self.budget
-        if done == 0:
-            return min(FIRST_SAMPLES, self.limit or FIRST_SAMPLES)
-        if budget.time_limit_s is not None and seconds >= budget.time_limit_s:
-            return 0
-        if self.limit is not None:
-            goal = self.limit
-        elif budget.target_error is not None:
-            if self.errors and self.errors[-1][0] == done and self.errors[-1][1] <= budget.target_error:
-                return 0
-            goal = self._next_look
-        else:
-            goal = done * 2
-        launch = max(1.0, self.speed * LAUNCH_SECONDS)
-        if budget.time_limit_s is not None:
-            launch = min(launch, max(1.0, self.speed * (budget.time_limit_s - seconds)))
-        return int(min(goal - done, launch if math.isfinite(launch) else 4 * done))
-
-    def wants_error(self, done: int) -> bool:
-        """Return whether to look at the error now: at sample counts fixed by the errors seen so far."""
-        return self.budget.target_error is not None and done >= self._next_look
-
-    def record_error(self, done: int, error: float) -> None:
-        """Note the error after ``done`` samples and when to look next: it falls at least as 1 / sqrt(samples)."""
-        self.errors.append((done, error))
-        target = self.budget.target_error or error
-        needed = done * (error / target) ** 2 if target > 0 else done
-        self._next_look = int(min(max(needed * 1.05, done * 1.25), done * 4)) + 1
-
-    def fraction(self, done: int, seconds: float) -> float:
-        """Return the share of the work that is done, estimated, in [0, 1]."""
-        budget = self.budget
-        shares = [0.0]
-        if self.limit is not None:
-            shares.append(done / self.limit)
-        if budget.time_limit_s is not None:
-            shares.append(seconds / budget.time_limit_s if budget.time_limit_s > 0 else 1.0)
-        if budget.target_error is not None and self.errors:
-            counted, error = self.errors[-1]
-            shares.append((budget.target_error / error) ** 2 * done / counted if error > 0 else 1.0)
-        return min(1.0, max(shares))

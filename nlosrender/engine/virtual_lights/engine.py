@@ -9,20 +9,27 @@ from dataclasses import replace
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-from numpy.typing import NDArray
 
 from nlosrender.capture.bounces import THIRD_BOUNCE
 from nlosrender.capture.grids import Capture
 from nlosrender.capture.plan import Batch
 from nlosrender.capture.time_axis import TimeAxis
-from nlosrender.engine.histogram import Histogram, to_memory_order
-from nlosrender.engine.path_engine import DEFAULT_TARGET, Budget, PathEngine, PathOptions, Progress
+from nlosrender.engine.histogram import Histogram
+from nlosrender.engine.path_engine import PathEngine, PathOptions
 from nlosrender.engine.pilot import pilot_of
+from nlosrender.engine.sampling import DEFAULT_TARGET, Budget, Progress
 from nlosrender.engine.virtual_lights.further_bounces import FurtherBounces, rounds_needed
 from nlosrender.engine.virtual_lights.lights import GatherSettings
 from nlosrender.engine.virtual_lights.occlusion import nothing_occludes
 from nlosrender.engine.virtual_lights.tessellator import Tessellator
-from nlosrender.engine.virtual_lights.third_bounce import FIRST_COARSENESS, REFINEMENT, ThirdBounce, estimated_error
+from nlosrender.engine.virtual_lights.third_bounce import (
+    FIRST_COARSENESS,
+    REFINEMENT,
+    Gathered,
+    ThirdBounce,
+    difference_divisor,
+    estimated_error,
+)
 from nlosrender.errors import RenderError
 from nlosrender.scene.build import BuiltScene
 
@@ -122,26 +129,30 @@ class VirtualLightEngine:
         budget = self.settle(budget)
         fineness = budget.fineness or FIRST_COARSENESS
         coarse, fine = self.third.pair(batch, fineness)
-        _, divisor = estimated_error(coarse, fine)
-        third, scale = fine.values, self.paths.scale
         progress(0.5 if self.has_further_bounces else 1.0)
         left = budget.time_limit_s
         if left is not None:
             left = max(0.0, left - (time.perf_counter() - begun))
         result = self._further_bounces(
-            batch, replace(budget, time_limit_s=left), fine.squares, lambda share: progress((1 + share) / 2)
+            batch, replace(budget, time_limit_s=left), fine, lambda share: progress((1 + share) / 2)
         )
-        slot = self.options.bounces.slot(THIRD_BOUNCE)
-        result.mean[:, slot] += third[:, 0, ..., :-1] * scale
-        result.variance[:, slot] += ((third - coarse.values)[:, 0, ..., :-1] * (scale / divisor)) ** 2
-        result.outside[:, slot] += third[:, 0, ..., -1] * scale
+        slot, scale = self.options.bounces.slot(THIRD_BOUNCE), self.paths.scale
+        third, deviation = fine.values, coarse.values  # large: worked on in place
+        np.subtract(third, deviation, out=deviation)
+        deviation *= scale / difference_divisor(coarse, fine)
+        third *= scale
+        result.mean[:, slot] += third[:, 0, ..., :-1]
+        result.variance[:, slot] += np.square(deviation, out=deviation)[:, 0, ..., :-1]
+        result.outside[:, slot] += third[:, 0, ..., -1]
         if not np.isfinite(result.mean).all():
             raise RenderError("the gather produced a value that is not finite; please report the configuration")
         return result
 
-    def _further_bounces(self, batch: Batch, budget: Budget, known_squares: float, progress: Progress) -> Histogram:
+    def _further_bounces(self, batch: Batch, budget: Budget, third: Gathered, progress: Progress) -> Histogram:
         if self.further is None:
+            known_squares = third.squares if self.has_further_bounces else 0.0
             return self.paths.render(batch, budget, progress, known_squares=known_squares)
+        known_squares = third.squares
         histogram = self.further.histogram(batch, self.options.replicas)
         begun = time.perf_counter()
         done = 0
@@ -159,19 +170,12 @@ class VirtualLightEngine:
             progress(min(share, 1.0))
             if share >= 1:
                 break
-        mean, variance = (to_memory_order(values.numpy(), histogram.shape) for values in histogram.statistics(done))
-        return self._placed(mean * self.paths.scale, variance * self.paths.scale**2, done)
-
-    def _placed(self, mean: NDArray[np.float64], variance: NDArray[np.float64], rounds: int) -> Histogram:
-        """Return the statistics of bounces 4 and up with all bounce slots of the capture."""
         bounces = self.options.bounces
         first = bounces.slot(THIRD_BOUNCE + 1)
-        channels, slots, lasers, sensors, row = mean.shape
-        whole = [np.zeros((channels, bounces.n_slots, lasers, sensors, row)) for _ in range(2)]
-        for target, values in zip(whole, (mean, variance), strict=True):
-            target[:, first : first + slots] = values
-        impulses = rounds * self.further.impulses_per_round if self.further is not None else 0
-        return Histogram(whole[0][..., :-1], whole[1][..., :-1], whole[0][..., -1], impulses)
+        statistics = histogram.statistics(done, self.paths.scale, range(-first, bounces.n_slots - first))
+        mean, variance = (histogram.on_host(values) for values in statistics)
+        impulses = done * self.further.impulses_per_round
+        return Histogram(mean[..., :-1], variance[..., :-1], mean[..., -1], impulses)
 
     def _fineness_in_time(self, budget: Budget, target: float) -> float:
         """Return the fineness for ``target``, or the one that half of the time is predicted to suffice for."""
@@ -186,7 +190,7 @@ class VirtualLightEngine:
             begun = time.perf_counter()
             fine = self.third.gather(pilot, finer)
             predicted = (time.perf_counter() - begun) * more * 4
-            error, _ = estimated_error(coarse, fine)
+            error = estimated_error(coarse, fine)
             if error <= target or predicted > (budget.time_limit_s or 0.0) / 2:
                 return finer if error <= target else fineness
             fineness, coarse = finer, fine

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nlosrender.capture.plan import Batch
-from nlosrender.engine.histogram import DeviceHistogram, HistogramShape, relative_l2_error, to_memory_order
+from nlosrender.engine.histogram import DeviceHistogram, HistogramShape, relative_l2_error
 from nlosrender.engine.path_engine import PathEngine
 from nlosrender.engine.pilot import Pilot
 from nlosrender.engine.transport import Transport
@@ -36,7 +36,7 @@ class Gathered:
     @property
     def squares(self) -> float:
         """Sum of squares inside the time window."""
-        return float((self.values[..., :-1] ** 2).sum())
+        return _squares(self.values)
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,14 +70,13 @@ class ThirdBounce:
         shape = self.shape(batch)
         patches = self.tessellator.patches(coarseness)
         if not len(patches):  # nothing faces the wall
-            return Gathered(np.zeros(to_memory_order(np.zeros(shape.axes), shape).shape), 1)
+            return Gathered(np.zeros((shape.channels, shape.slots, shape.lasers, shape.sensors, shape.row)), 1)
         transport, slice_of_lane, jitter = self._transport(batch, shape)
         on_device = upload_patches(self.paths.built, patches)
         lights = light_patches(self.settings, transport, on_device, shape.lasers, shape.replicas)
         histogram = DeviceHistogram(shape)
         gather_third_bounce(self.settings, transport, lights, histogram, slice_of_lane, jitter)
-        values = histogram.sums.numpy().reshape(shape.replicas, -1).sum(axis=0)
-        return Gathered(to_memory_order(values, shape), len(patches))
+        return Gathered(histogram.on_host(histogram.total()), len(patches))
 
     def lit_patches(self, batch: Batch | Pilot, coarseness: float) -> LitPatches:
         """Return the patches that the gather of a batch goes through."""
@@ -98,9 +97,9 @@ class ThirdBounce:
         earlier = math.inf
         while True:
             fine = self.gather(pilot, fineness)
-            error, _ = estimated_error(coarse, fine)
+            error = estimated_error(coarse, fine)
             if error <= target:  # as the render will estimate it, from the pair of resolutions that is nearer
-                error = max(error, estimated_error(self.gather(pilot, self.coarser(fineness)), fine)[0])
+                error = max(error, estimated_error(self.gather(pilot, self.coarser(fineness)), fine))
             needed = fine.n_patches * error / target
             # float32 path lengths and grazing contacts leave an error that no refinement takes away
             is_stuck = STUCK * earlier < error < ROUGH and fine.n_patches > 2 * coarse.n_patches
@@ -148,13 +147,23 @@ class ThirdBounce:
         return replace(transport, sensors=sensors, first_laser=first_laser), slice_of_lane, jitter
 
 
-def estimated_error(coarse: Gathered, fine: Gathered) -> tuple[float, float]:
-    """Return the relative L2 error of the finer resolution, and what to divide the difference of the two by.
+def estimated_error(coarse: Gathered, fine: Gathered) -> float:
+    """Return the relative L2 error of the finer resolution."""
+    noise = _squares(fine.values - coarse.values) / difference_divisor(coarse, fine) ** 2
+    return relative_l2_error(noise, fine.squares + noise)
+
+
+def difference_divisor(coarse: Gathered, fine: Gathered) -> float:
+    """Return what to divide the difference of two resolutions by to have the error of the finer one.
 
     The discretisation error falls as 1 / n patches: the difference is (r - 1) times the finer's error, with r the
     ratio of the counts. The error of random visibility rays falls as n^(-3/4) and is independent: sqrt(r^1.5 + 1).
     """
     ratio = max(fine.n_patches / coarse.n_patches, 1.0 + 1e-9)
-    divisor = min(ratio - 1, math.sqrt(ratio**1.5 + 1))
-    noise = float(((fine.values - coarse.values)[..., :-1] ** 2).sum()) / divisor**2
-    return relative_l2_error(noise, fine.squares + noise), divisor
+    return min(ratio - 1, math.sqrt(ratio**1.5 + 1))
+
+
+def _squares(values: NDArray[np.float64]) -> float:
+    """Return the sum of the squares inside the time window, without a copy of it."""
+    inside = values[..., :-1]
+    return float(np.einsum("abcde,abcde->", inside, inside))

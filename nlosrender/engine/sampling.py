@@ -1,0 +1,193 @@
+"""Sampling until a budget is met: launches of a sampling engine, and how many samples they take.
+
+An engine that traces paths has lanes that belong to a sensor point (or a pixel) each; this is what such engines share.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+
+from nlosrender.engine.histogram import DeviceHistogram, HistogramShape
+from nlosrender.engine.transport import LaneRandomness
+
+FIRST_SAMPLES = 32  # per lane, before the first look at the error
+LAUNCH_SECONDS = 0.5  # launches are kept this short, for the progress bar and Ctrl-C
+DEFAULT_TARGET = 0.01  # where neither an error nor samples are asked for
+SETTLED_SHARE = 0.9  # of the target error: the pilot's estimate has an error of its own
+PILOT_ERROR = 3.0  # times the goal: when a pilot has seen enough
+PILOT_LANES = 2048
+
+Progress = Callable[[float], None]
+Launch = Callable[[DeviceHistogram, LaneRandomness, int], LaneRandomness]
+
+
+@dataclass(frozen=True)
+class Budget:
+    """When to stop: after ``spp`` samples per sensor point, at ``target_error`` (relative L2 of H), after seconds.
+
+    An engine's ``settle`` turns a target error into fixed settings.
+    """
+
+    spp: int | None = None
+    target_error: float | None = None
+    time_limit_s: float | None = None
+    fineness: float | None = None  # settled: coarseness of the patches of the virtual lights
+    rounds: int | None = None  # settled: rounds of walks of the virtual lights
+
+    @property
+    def is_settled(self) -> bool:
+        """Whether no pilot is needed: samples or a time are given, or nothing is."""
+        return self.target_error is None or self.spp is not None or self.time_limit_s is not None
+
+
+@dataclass(frozen=True, eq=False)
+class Sampled:
+    """What ``accumulate`` returns; mean and variance are (channel, slot, laser, sensor, row)."""
+
+    mean: NDArray[np.float64]
+    variance: NDArray[np.float64]  # of the mean
+    per_lane: int  # samples
+    compile_seconds: float
+
+
+def accumulate(
+    shape: HistogramShape,
+    points: NDArray[np.uint32],
+    seed: int,
+    launch: Launch,
+    schedule: Schedule,
+    progress: Progress,
+    scale: float = 1.0,
+    slots: range | None = None,
+) -> Sampled:
+    """Launch until the schedule has enough.
+
+    Parameters
+    ----------
+    shape
+        Of the batch's histogram.
+    points
+        (sensors,) flat indices of the batch's sensor points: what their random numbers depend on.
+    seed
+        Of the render.
+    launch
+        Traces so many more paths per lane into a histogram and returns the advanced random state.
+    schedule, progress
+        How many, and whom to tell the share of the work done.
+    scale
+        What sums are multiplied by.
+    slots
+        Bounce slots of the result, as for ``DeviceHistogram.statistics``.
+    """
+    histogram = DeviceHistogram(shape)
+    lane = dr.arange(mi.UInt32, shape.lanes)
+    point = dr.gather(mi.UInt32, mi.UInt32(points), lane % shape.sensors)
+    randomness = LaneRandomness.seeded(seed, point * shape.replicas + lane // shape.sensors)
+    begun, done, compile_seconds = time.perf_counter(), 0, 0.0
+    while (more := schedule.next_samples(done, time.perf_counter() - begun)) > 0:
+        launched = time.perf_counter()
+        randomness = launch(histogram, randomness, more)
+        dr.sync_thread()
+        seconds = time.perf_counter() - launched
+        if done == 0:
+            compile_seconds = seconds  # the first launch is small: nearly all of it is compilation
+        else:
+            schedule.speed = more / max(seconds, 1e-6)
+        done += more
+        if schedule.wants_error(done):
+            schedule.record_error(done, histogram.relative_error(done, schedule.known_squares))
+        progress(schedule.fraction(done, time.perf_counter() - begun))
+    mean, variance = histogram.statistics(done, scale, slots)
+    dr.eval(mean, variance)
+    return Sampled(histogram.on_host(mean), histogram.on_host(variance), done, compile_seconds)
+
+
+def pilot_replicas(replicas: int, n_sensors: int) -> int:
+    """Return how many replicas a pilot of ``n_sensors`` points takes: enough of them to keep any machine busy."""
+    return max(replicas, PILOT_LANES // n_sensors // 2 * 2)
+
+
+def settled_by_pilot(
+    budget: Budget, replicas: int, look: Callable[[Schedule], int], known_squares: float = 0.0
+) -> Budget:
+    """Return a budget of samples that meets a target error, found by a pilot.
+
+    Parameters
+    ----------
+    budget
+        With a target error.
+    replicas
+        Of the pilot.
+    look
+        Runs the pilot with a schedule and returns the samples per lane it took.
+    known_squares
+        As for ``Schedule``.
+    """
+    goal = SETTLED_SHARE * (budget.target_error or DEFAULT_TARGET)
+    schedule = Schedule(Budget(target_error=PILOT_ERROR * goal), replicas, known_squares)
+    per_lane = look(schedule)
+    error = schedule.errors[-1][1]
+    return replace(budget, spp=max(1, math.ceil(per_lane * replicas * (error / goal) ** 2)))
+
+
+class Schedule:
+    """How many samples each launch takes. Only the last launches depend on time, and only with a time limit."""
+
+    def __init__(self, budget: Budget, replicas: int, known_squares: float):
+        self.budget, self.known_squares = budget, known_squares
+        self.limit = math.ceil(budget.spp / replicas) if budget.spp is not None else None
+        self.errors: list[tuple[int, float]] = []  # (samples per lane, relative L2 error)
+        self.speed = math.inf  # samples per lane and second
+        self._next_look = FIRST_SAMPLES
+
+    def next_samples(self, done: int, seconds: float) -> int:
+        """Return the samples per lane of the next launch; 0 when the budget is met."""
+        budget = self.budget
+        if done == 0:
+            return min(FIRST_SAMPLES, self.limit or FIRST_SAMPLES)
+        if budget.time_limit_s is not None and seconds >= budget.time_limit_s:
+            return 0
+        if self.limit is not None:
+            goal = self.limit
+        elif budget.target_error is not None:
+            if self.errors and self.errors[-1][0] == done and self.errors[-1][1] <= budget.target_error:
+                return 0
+            goal = self._next_look
+        else:
+            goal = done * 2
+        launch = max(1.0, self.speed * LAUNCH_SECONDS)
+        if budget.time_limit_s is not None:
+            launch = min(launch, max(1.0, self.speed * (budget.time_limit_s - seconds)))
+        return int(min(goal - done, launch if math.isfinite(launch) else 4 * done))
+
+    def wants_error(self, done: int) -> bool:
+        """Return whether to look at the error now: at sample counts fixed by the errors seen so far."""
+        return self.budget.target_error is not None and done >= self._next_look
+
+    def record_error(self, done: int, error: float) -> None:
+        """Note the error after ``done`` samples and when to look next: it falls at least as 1 / sqrt(samples)."""
+        self.errors.append((done, error))
+        target = self.budget.target_error or error
+        needed = done * (error / target) ** 2 if target > 0 else done
+        self._next_look = int(min(max(needed * 1.05, done * 1.25), done * 4)) + 1
+
+    def fraction(self, done: int, seconds: float) -> float:
+        """Return the share of the work that is done, estimated, in [0, 1]."""
+        budget = self.budget
+        shares = [0.0]
+        if self.limit is not None:
+            shares.append(done / self.limit)
+        if budget.time_limit_s is not None:
+            shares.append(seconds / budget.time_limit_s if budget.time_limit_s > 0 else 1.0)
+        if budget.target_error is not None and self.errors:
+            counted, error = self.errors[-1]
+            shares.append((budget.target_error / error) ** 2 * done / counted if error > 0 else 1.0)
+        return min(1.0, max(shares))
