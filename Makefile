@@ -6,7 +6,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
 # Exact versions that passed the test suite; pyproject.toml holds the ranges that are allowed.
 PINS := -c .constraints.txt
 
-.PHONY: help install render test test-slow stress lint format peers bench bench-peers clean
+.PHONY: help install render test test-slow stress lint format peers bench bench-peers paper paper-quick clean
 .DEFAULT_GOAL := help
 
 help: ## Show this list.
@@ -71,6 +71,12 @@ bench: install ## Measure run time against error in 5 minutes: out/bench.json an
 bench-peers: install .venv-peers-mitransient/.installed ## The same, in turns with mitransient: out/bench-peers.json and .png. MESH=, SECONDS=
 	$(BIN)/nlosrender bench --part curves --seconds $(or $(SECONDS),600) $(if $(MESH),--mesh $(MESH)) -o out/bench-peers \
 		--peer '.venv-peers-mitransient/bin/python tests/peers/render_with_mitransient.py'
+
+paper: install ## Reproduce the paper's figures and tables: out/paper/index.html. FIGURES='4 8'
+	$(BIN)/nlosrender paper $(foreach name,$(FIGURES),--figure $(name)) -o out/paper
+
+paper-quick: install ## The same with fewer points and paths, in minutes. FIGURES='4 8'
+	$(BIN)/nlosrender paper --quick $(foreach name,$(FIGURES),--figure $(name)) -o out/paper
 
 clean: ## Remove what make made, but not out/.
 	rm -rf $(VENV) .venv-peers .venv-peers-mitransient build *.egg-info .pytest_cache .mypy_cache .ruff_cache

@@ -19,6 +19,7 @@ from nlosrender.cli import (
     file_commands,
     machine_commands,
     merge_command,
+    paper_command,
     plan_command,
     reconstruct_command,
     render_command,
@@ -43,6 +44,7 @@ export_command.register(app)
 machine_commands.register(app)
 compare_command.register(app)
 bench_command.register(app)
+paper_command.register(app)
 
 
 def _print_version(wanted: bool) -> None:

@@ -1,0 +1,82 @@
+"""The map of the reproduction: every figure and table of the paper, in the paper's order."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import replace
+from datetime import UTC, datetime
+from functools import partial
+from pathlib import Path
+
+from nlosrender.bench.paper.ablation import ablation
+from nlosrender.bench.paper.binning import time_binning
+from nlosrender.bench.paper.convergence import convergence
+from nlosrender.bench.paper.figure import PaperFigure
+from nlosrender.bench.paper.page import write_page
+from nlosrender.bench.paper.rooms import closed_rooms
+from nlosrender.bench.paper.scenes_table import scenes_table
+from nlosrender.bench.paper.silhouettes import silhouettes
+from nlosrender.bench.paper.study import Study
+from nlosrender.bench.paper.wavefronts import captured_letters, z_letter
+from nlosrender.bench.runs import Timer
+from nlosrender.files.provenance import package_versions
+
+# by the name that --figure takes
+FIGURES: Mapping[str, Callable[[Study], PaperFigure]] = {
+    "1": captured_letters,
+    "4": z_letter,
+    "6": time_binning,
+    "table1": scenes_table,
+    "8": partial(ablation, name="letters-near", figure="Figure 8, Table 2", title="the four techniques, close"),
+    "9": partial(
+        ablation, name="letters-far", figure="Figure 9, Table 2", title="the four techniques, three times as far"
+    ),
+    "10": closed_rooms,
+    "11": convergence,
+    "12": silhouettes,
+}
+
+
+def reproduce(
+    study: Study, names: Iterable[str] = FIGURES, told: Callable[[PaperFigure], None] = lambda figure: None
+) -> tuple[list[PaperFigure], Path]:
+    """Make figures and the page that shows them.
+
+    Parameters
+    ----------
+    study
+        Where from, where to, how much.
+    names
+        Keys of ``FIGURES``.
+    told
+        Told each figure as it is done.
+
+    Returns
+    -------
+    tuple
+        The figures, and the page.
+
+    Raises
+    ------
+    NlosError
+        A configuration, a render or a file failed.
+    """
+    study.make_folders()
+    begun = Timer()
+    facts = {
+        "date": datetime.now(UTC).isoformat(timespec="minutes"),
+        "setting": "quick" if study.quick else "full",
+        "processors": os.cpu_count(),
+        "load at start": round(os.getloadavg()[0], 2),
+        **package_versions(),
+    }
+    figures: list[PaperFigure] = []
+    page = study.folder
+    for name in names:
+        timer = Timer()
+        figure = replace(FIGURES[name](study), seed=study.seed, seconds=timer.read()[0])
+        figures.append(replace(figure, seconds=timer.read()[0]))
+        told(figures[-1])
+        page = write_page(figures, study.folder, facts | {"seconds": round(begun.read()[0], 1)})
+    return figures, page

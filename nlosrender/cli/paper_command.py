@@ -1,0 +1,58 @@
+"""``nlosrender paper``: the paper's figures and tables, reproduced."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+if TYPE_CHECKING:
+    from nlosrender.bench.paper.figure import PaperFigure
+
+
+def register(app: typer.Typer) -> None:
+    """Add ``paper`` to ``app``."""
+    app.command(
+        epilog="Example: nlosrender paper --quick --figure 4 -o out/paper   (creates out/paper/index.html, a page with "
+        "the Z letter's capture and its wavefronts)"
+    )(paper)
+
+
+def paper(
+    figure: Annotated[
+        list[str] | None,
+        typer.Option(metavar="NAME", help="Figure or table such as 4 or table1; may be repeated.", show_default="all"),
+    ] = None,
+    quick: Annotated[bool, typer.Option("--quick", help="Fewer points and paths: minutes instead of an hour.")] = False,
+    seed: Annotated[int, typer.Option(min=0, help="Of every render.")] = 0,
+    configs: Annotated[Path, typer.Option(help="Folder of the paper's configurations.")] = Path("configs/paper"),
+    output: Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="Folder to write.")] = Path("out/paper"),
+) -> None:
+    """Reproduce the figures and tables of Royo et al. 2022 into one HTML page."""
+    from nlosrender.bench.paper.reproduce import FIGURES, reproduce
+    from nlosrender.bench.paper.study import Study
+    from nlosrender.errors import EXIT_FAILURE, nearest
+
+    for name in figure or ():
+        if name not in FIGURES:
+            close = nearest(name, list(FIGURES))
+            hint = f" Did you mean {close}?" if close else ""
+            raise typer.BadParameter(f"got {name!r}, need one of {', '.join(FIGURES)}.{hint}", param_hint="--figure")
+    if not configs.is_dir():
+        raise typer.BadParameter(f"{configs}: there is no such folder", param_hint="--configs")
+    study = Study(configs, output, quick, seed, lambda what: typer.echo(what, err=True))
+    figures, page = reproduce(study, figure or FIGURES, _print_figure)
+    typer.echo(f"page: {page}")
+    if not all(found.holds for found in figures):
+        raise typer.Exit(EXIT_FAILURE)
+
+
+def _print_figure(figure: PaperFigure) -> None:
+    from nlosrender.bench.paper.figure import text_table
+
+    typer.echo(f"\n{figure.name}: {figure.title} ({figure.seconds:.1f} s)\n  {figure.measured}")
+    for check in figure.checks:
+        typer.echo(f"  {'holds' if check.holds else 'FAILS'}: {check.statement}")
+    for table in figure.tables:
+        typer.echo("  " + text_table(table).replace("\n", "\n  "))
