@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from nlosrender.analysis.forecast import Forecast, forecast_file, forecast_render
-from nlosrender.capture.bounces import BounceAxis
+from nlosrender.capture.bounces import BounceAxis, first_bounce_of
 from nlosrender.capture.grids import Capture, build_capture
 from nlosrender.capture.limits import refuse_impossible_grids, refuse_impossible_samples
 from nlosrender.capture.part import WHOLE, Selection
@@ -24,7 +24,6 @@ from nlosrender.config.document import Config
 from nlosrender.config.load import config_hash, config_to_dict
 from nlosrender.config.warnings import config_warnings
 from nlosrender.engine.backend import Backend, batch_memory, physical_memory, start_backend
-from nlosrender.errors import ConfigError, Problem
 from nlosrender.files.capture_file import CaptureHeader
 from nlosrender.files.chunks import sensor_tile
 from nlosrender.files.identity import capture_identity, identity_attributes
@@ -40,6 +39,7 @@ from nlosrender.rendering.local import render_units, resumable
 from nlosrender.rendering.report import Progress, RenderReport, Stopwatch, Warn, Warnings
 from nlosrender.rendering.sharing import ALONE, Sharing
 from nlosrender.scene.hidden_geometry import Surface, hidden_surfaces
+from nlosrender.scene.placing import placed
 from nlosrender.scene.relay_wall import RelayWall, relay_wall_from_config
 
 if TYPE_CHECKING:
@@ -47,6 +47,7 @@ if TYPE_CHECKING:
     from nlosrender.rendering.dask_cluster import Cluster
     from nlosrender.rendering.units import Engine
     from nlosrender.scene.build import BuiltScene
+    from nlosrender.scene.view import BuiltView
 
 
 def render_capture(
@@ -95,7 +96,7 @@ def render_capture(
     with stopwatch.stage("scene"):
         check_writable(config.output.path)
         with uninterrupted():  # an import that Ctrl-C cuts off ends in errors of its own
-            backend = start_backend(config.render.backend, colored=config.is_colored)
+            backend = started_backend(config)
     resolved, output = config_to_dict(config), config.output
     sharing = ALONE if cluster is None else cluster.sharing
     replicas = replicas_for(backend.lanes, config.capture.sensor_grid.n_points)
@@ -149,11 +150,23 @@ def render_capture(
     )
 
 
+def started_backend(config: Config) -> Backend:
+    """Start what renders a configuration.
+
+    Raises
+    ------
+    BackendError
+        There is no usable LLVM or GPU.
+    """
+    render = config.render
+    return start_backend(render.backend, colored=config.is_colored, polarized=render.polarized)
+
+
 def set_up_engine(
     config: Config, backend: Backend, selection: Selection = WHOLE, sharing: Sharing = ALONE
 ) -> tuple[Plan, Engine, CaptureHeader]:
     """Stages 2 to 4 up to the first ray: scene, capture, plan, engine, and what the file will say of them."""
-    built = load_scene(config)
+    built = load_view(config) if config.capture.is_line_of_sight else load_scene(config)
     capture, time_axis = describe_capture(config, built.wall, built)
     plan, engine = prepare(config, backend, built, capture, time_axis, selection, sharing)
     return plan, engine, describe_file(config, built, capture, time_axis)
@@ -177,7 +190,7 @@ def forecast_capture(config: Config) -> Forecast:
     warnings = Warnings(lambda text: None)
     begun = time.perf_counter()
     warnings.say(config_warnings(config))
-    backend = start_backend(config.render.backend, colored=config.is_colored)
+    backend = started_backend(config)
     plan, engine, header = set_up_engine(config, backend)
     warnings.say(late_warnings(config, backend, plan, engine, header))
     spent = time.perf_counter() - begun
@@ -200,12 +213,26 @@ def late_warnings(
     )
 
 
+def load_view(config: Config) -> BuiltView:
+    """Stage 2 of a line-of-sight capture: the scene and the camera that sees it (backend started).
+
+    Raises
+    ------
+    ConfigError
+        A pose is degenerate, or Mitsuba rejects something.
+    """
+    from nlosrender.scene.view import build_view
+
+    with placed():
+        return build_view(config.scene, config.capture)
+
+
 def load_scene(config: Config) -> BuiltScene:
     """Stage 2: place wall and hidden geometry in the local frame and hand them to Mitsuba (backend started)."""
     from nlosrender.scene.build import build_scene
 
     wall, surfaces = place_scene(config)
-    return build_scene(wall, config.scene.relay_wall.bsdf, surfaces)
+    return build_scene(wall, config.scene.wall.bsdf, surfaces)
 
 
 def place_scene(config: Config) -> tuple[RelayWall, tuple[Surface, ...]]:
@@ -216,15 +243,12 @@ def place_scene(config: Config) -> tuple[RelayWall, tuple[Surface, ...]]:
     ConfigError
         A pose is degenerate.
     """
-    try:
-        wall = relay_wall_from_config(config.scene.relay_wall)
+    with placed():
+        wall = relay_wall_from_config(config.scene.wall)
         return wall, hidden_surfaces(config.scene.hidden_geometry, wall)
-    except ValueError as error:
-        key, _, message = str(error).partition(": ")
-        raise ConfigError(Problem("", key, message)) from error
 
 
-def describe_capture(config: Config, wall: RelayWall, built: BuiltScene) -> tuple[Capture, TimeAxis]:
+def describe_capture(config: Config, wall: RelayWall, built: BuiltScene | BuiltView) -> tuple[Capture, TimeAxis]:
     """Stage 3: laser and sensor points, legs and bins."""
     refuse_impossible_grids(config.capture, config.render.memory_limit_bytes or physical_memory())
     capture = build_capture(config.capture, wall)
@@ -232,10 +256,16 @@ def describe_capture(config: Config, wall: RelayWall, built: BuiltScene) -> tupl
     return capture, time_axis
 
 
+def bounce_axis(config: Config) -> BounceAxis:
+    """Return which bounces are computed, and where each is added."""
+    render = config.render
+    return BounceAxis(render.max_bounces, render.split_bounces, first_bounce_of(config.capture.scan_type))
+
+
 def prepare(
     config: Config,
     backend: Backend,
-    built: BuiltScene,
+    built: BuiltScene | BuiltView,
     capture: Capture,
     time_axis: TimeAxis,
     selection: Selection = WHOLE,
@@ -246,8 +276,8 @@ def prepare(
     from nlosrender.engine.planner import choose_engine
 
     render = config.render
-    bounces = BounceAxis(render.max_bounces, render.split_bounces)
-    channels = 3 if config.is_colored else 1
+    bounces = bounce_axis(config)
+    channels = config.n_channels
     memory, rows = batch_memory(sharing.memory_limit(render.memory_limit_bytes)), bounces.n_slots * channels
     refuse_impossible_samples(config.capture, rows_per_pair=rows, n_bins=time_axis.n_bins, memory_limit=memory)
     _, *storage_tile = sensor_tile(time_axis.n_bins, capture.sensor_grid.ny, capture.sensor_grid.nx)
@@ -270,13 +300,16 @@ def prepare(
         channels=channels,
         seed=render.seed,
         replicas=plan.replicas,
+        temporal_kernel_bins=render.temporal_kernel_opl / time_axis.bin_width_opl,
     )
     return plan, choose_engine(render, built, capture, time_axis, options, backend.lanes)
 
 
-def describe_file(config: Config, built: BuiltScene, capture: Capture, time_axis: TimeAxis) -> CaptureHeader:
+def describe_file(
+    config: Config, built: BuiltScene | BuiltView, capture: Capture, time_axis: TimeAxis
+) -> CaptureHeader:
     """Stage 6: what the file says beside its samples."""
-    bounces = BounceAxis(config.render.max_bounces, config.render.split_bounces)
+    bounces = bounce_axis(config)
     return CaptureHeader(
         scan_type=capture.scan_type,
         sensor_positions=capture.sensor_grid.positions,
@@ -290,7 +323,7 @@ def describe_file(config: Config, built: BuiltScene, capture: Capture, time_axis
         n_bins=time_axis.n_bins,
         bin_width_opl=time_axis.bin_width_opl,
         start_opl=time_axis.start_opl,
-        n_channels=3 if config.is_colored else 1,
+        n_channels=config.n_channels,
         bounce_indices=bounces.file_indices,
         max_bounces=config.render.max_bounces,
         split_bounces=config.render.split_bounces,

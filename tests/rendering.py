@@ -125,7 +125,7 @@ def render(
         Fields of ``PathOptions`` that no configuration has, such as ``hidden_fraction`` or ``replicas``.
     """
     validated = configured(config, overrides, folder)
-    backend = start_backend("llvm", colored=validated.is_colored)
+    backend = start_backend("llvm", colored=validated.is_colored, polarized=validated.render.polarized)
     from nlosrender.engine.path_engine import Budget, PathEngine
 
     built = pipeline.load_scene(validated)

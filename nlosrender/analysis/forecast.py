@@ -15,9 +15,8 @@ from nlosrender.files.capture_file import CaptureHeader
 from nlosrender.files.size import FileSize, forecast_size
 
 if TYPE_CHECKING:
-    from nlosrender.engine.path_engine import PathEngine
+    from nlosrender.engine.engines import Engine
     from nlosrender.engine.skipped import Skipped
-    from nlosrender.engine.virtual_lights.engine import VirtualLightEngine
 
 
 @dataclass(frozen=True)
@@ -52,7 +51,7 @@ def forecast_render(
     config: Config,
     backend: Backend,
     plan: Plan,
-    engine: PathEngine | VirtualLightEngine,
+    engine: Engine,
     header: CaptureHeader,
     warnings: tuple[str, ...],
     seconds_before: float,
@@ -109,7 +108,7 @@ def forecast_render(
 def forecast_file(
     config: Config,
     header: CaptureHeader,
-    engine: PathEngine | VirtualLightEngine,
+    engine: Engine,
     lit_shares: Sequence[float | None] | None = None,
 ) -> FileSize:
     """Return how large the file of a render will be.

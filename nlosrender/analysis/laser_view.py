@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from nlosrender.errors import FileError
 from nlosrender.files.reader import StoredCapture
+from nlosrender.files.stored_header import intensity
 
 Float64 = NDArray[np.float64]
 
@@ -48,10 +49,12 @@ def laser_view(capture: StoredCapture, laser: tuple[int, int]) -> LaserView:
     sizes = capture.header.sizes
     wall = np.zeros(capture.header.sensor_grid)
     bounces, time = np.zeros(len(capture.header.bounce_indices)), np.zeros(sizes["bin"])
+    # emitters seen directly would outshine all they light: they count among the bounces only
+    first = 1 if capture.header.first_bounce == 0 and len(bounces) > 1 else 0
     for rows, band in _bands(capture, laser):
-        wall[rows] = band.sum(axis=(0, 3))
+        wall[rows] = band[first:].sum(axis=(0, 3))
         bounces += band.sum(axis=(1, 2, 3))
-        time += band.sum(axis=(0, 1, 2))
+        time += band[first:].sum(axis=(0, 1, 2))
     return LaserView(laser, wall, bounces, time)
 
 
@@ -81,7 +84,7 @@ def point_histograms(
         One of the points does not exist, or the file is damaged.
     """
     block = capture.read_block(lasers=laser, sensors=pixel, dataset=dataset)
-    return block[:, :, 0, 0, 0, 0].mean(axis=0, dtype=np.float64)
+    return intensity(capture.header, block[:, :, 0, 0, 0, 0].astype(np.float64))
 
 
 def row_over_time(capture: StoredCapture, laser: tuple[int, int], row: int) -> Float64:
@@ -93,7 +96,7 @@ def row_over_time(capture: StoredCapture, laser: tuple[int, int], row: int) -> F
         The row or the laser point does not exist, or the file is damaged.
     """
     block = capture.read_block(lasers=laser, sensors=(row, None))
-    return block[:, :, 0, 0, 0].mean(axis=0, dtype=np.float64).sum(axis=0)
+    return intensity(capture.header, block[:, :, 0, 0, 0].astype(np.float64)).sum(axis=0)
 
 
 def frame_bins(time: Float64) -> list[int]:
@@ -127,7 +130,7 @@ def _bands(capture: StoredCapture, laser: tuple[int, int]) -> Iterator[tuple[sli
     for start in range(0, n_rows, step):
         rows = slice(start, min(start + step, n_rows))
         block = capture.read_block(lasers=laser, sensors=(rows, None))
-        yield rows, block[:, :, 0, 0].mean(axis=0, dtype=np.float64)
+        yield rows, intensity(capture.header, block[:, :, 0, 0].astype(np.float64))
 
 
 def _row_bytes(capture: StoredCapture) -> int:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
@@ -31,8 +32,9 @@ from nlosrender.analysis.theme import (
     power_of_ten,
     style,
 )
-from nlosrender.capture.bounces import FIRST_BOUNCE, LAST_FILE_BOUNCE
+from nlosrender.capture.bounces import FILE_BOUNCES, LINE_OF_SIGHT
 from nlosrender.errors import FileError
+from nlosrender.files.layout import data_unit
 from nlosrender.files.reader import StoredCapture, open_capture
 from nlosrender.files.replacement import check_writable, explained_write, partial_path, publish
 from nlosrender.files.stored_header import StoredHeader
@@ -45,7 +47,6 @@ if TYPE_CHECKING:
 FORMATS = (".png", ".pdf", ".svg")
 DECADES = 5  # shown of a logarithmic axis
 ROW_LINES = 1200  # of the row over time: more than the picture has pixels
-UNIT = r"J m$^{-2}$ sr$^{-1}$"
 
 
 def plot_capture(
@@ -121,7 +122,7 @@ def _draw(capture: StoredCapture, laser: tuple[int, int] | None, pixel: tuple[in
 
 def _subtitle(header: StoredHeader, view: LaserView) -> str:
     rows, columns = header.sensor_grid
-    parts = [header.scan_type, f"{columns} x {rows} sensor points"]
+    parts = [header.scan_type, f"{columns} x {rows} {'pixels' if _is_view(header) else 'sensor points'}"]
     if header.scan_type == "exhaustive":
         ly, lx = header.laser_grid
         parts.append(f"laser in row {view.laser[0]}, column {view.laser[1]} of {lx} x {ly}")
@@ -164,8 +165,8 @@ def _draw_histogram(axes: Axes, capture: StoredCapture, view: LaserView, pixel: 
     logarithmic = len(shown) > 1  # higher bounces are orders of magnitude darker
     factor, power = (1.0, "") if logarithmic else power_of_ten(float(histograms.max()))
     top = float(histograms.max()) / factor
-    title = f"sensor point in row {pixel[0]}, column {pixel[1]} (+)"
-    style(axes, title, "optical path length [m]", f"H per bin [{power}{UNIT}]")
+    title = f"{'pixel' if _is_view(header) else 'sensor point'} in row {pixel[0]}, column {pixel[1]} (+)"
+    style(axes, title, "optical path length [m]", f"{_quantity(header)} per bin [{power}{_unit(header)}]")
     for slot, color in zip(shown, line_colors(len(shown)), strict=True):
         label = _bounce_label(header, slot)
         axes.stairs(histograms[slot] / factor, edges, baseline=None, color=color, lw=1.3, label=label)
@@ -184,7 +185,12 @@ def _draw_bounces(axes: Axes, header: StoredHeader, view: LaserView) -> None:
     energy = view.bounces
     slots = range(len(energy))
     lit = [slot for slot in slots if energy[slot] > 0]
-    style(axes, "light of each bounce", "bounce", f"sum over wall and time [{UNIT}]")
+    style(
+        axes,
+        "light of each bounce",
+        "bounce",
+        f"sum over {'pixels' if _is_view(header) else 'wall'} and time [{_unit(header)}]",
+    )
     axes.bar(lit, energy[lit], color=line_colors(len(lit)), width=0.7)
     axes.set_xticks(slots, [_bounce_label(header, slot).removeprefix("bounce ") for slot in slots])
     axes.set_xlim(-1, len(energy))
@@ -216,26 +222,39 @@ def _draw_row(axes: Axes, capture: StoredCapture, view: LaserView) -> None:
     image = axes.imshow(
         light / factor, origin="lower", extent=extent, aspect="auto", cmap=COLORMAP, norm=scale, interpolation="nearest"
     )
-    color_bar(axes.figure, image, axes, f"H per bin [{power}{UNIT}]")
+    color_bar(axes.figure, image, axes, f"{_quantity(header)} per bin [{power}{_unit(header)}]")
+
+
+def _is_view(header: StoredHeader) -> bool:
+    return header.scan_type == LINE_OF_SIGHT
+
+
+def _quantity(header: StoredHeader) -> str:
+    return "radiance" if _is_view(header) else "H"
+
+
+def _unit(header: StoredHeader) -> str:
+    return re.sub(r"\^(-\d)", r"$^{\1}$", data_unit(header.scan_type))
 
 
 def _bounce_label(header: StoredHeader, slot: int) -> str:
     if header.bounces_known and not header.split_bounces:
         return "all bounces"
-    bounce = header.bounce_indices[slot] + FIRST_BOUNCE
+    bounce = header.bounce_indices[slot] + header.first_bounce
+    last = header.first_bounce + FILE_BOUNCES - 1
     limit = header.attributes.get("max_bounces")
-    more = bounce == LAST_FILE_BOUNCE and not (isinstance(limit, int) and limit <= LAST_FILE_BOUNCE)
+    more = bounce == last and not (isinstance(limit, int) and limit <= last)
     return f"bounce {bounce}{'+' if more else ''}"
 
 
 def _wall_extent(header: StoredHeader) -> tuple[tuple[float, float, float, float], str, str]:
     """Return (left, right, bottom, top) of the sensor grid, and labels for its axes; indices without a known size."""
-    size = header.sensor_grid_size
+    size = None if _is_view(header) else header.sensor_grid_size
     if size is not None and len(size) == 2 and all(np.isfinite(length) and length > 0 for length in size):
         width, height = size
         return (-width / 2, width / 2, -height / 2, height / 2), "wall x [m]", "wall y [m]"
     rows, columns = header.sensor_grid
-    return (-0.5, columns - 0.5, -0.5, rows - 0.5), "sensor column", "sensor row"
+    return (-0.5, columns - 0.5, -0.5, rows - 0.5), "column", "row"
 
 
 def _wall_position(

@@ -8,7 +8,6 @@ from collections.abc import Mapping
 from math import prod
 from pathlib import Path
 
-from nlosrender.capture.bounces import FIRST_BOUNCE
 from nlosrender.errors import FileError
 from nlosrender.files.reader import read_header
 from nlosrender.files.stored_header import StoredHeader
@@ -65,7 +64,7 @@ def _bounces(header: StoredHeader) -> dict[str, object]:
     known = header.bounces_known
     split = header.split_bounces
     return {
-        "bounces": [index + FIRST_BOUNCE for index in header.bounce_indices] if known and split else None,
+        "bounces": [index + header.first_bounce for index in header.bounce_indices] if known and split else None,
         "split_bounces": split,
         "max_bounces": header.attributes.get("max_bounces"),
     }

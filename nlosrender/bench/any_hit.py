@@ -14,17 +14,17 @@ SPREAD = 1024  # counters that the lanes share, so that they rarely wait for one
 
 
 def trace_any_hit(loaded: LoadedScene, positions: Float64, facing: Float64) -> tuple[int, float]:
-    """Trace the shadow ray of every pair of sensor point and patch that face each other.
+    """Trace the shadow ray of every pair of sensor point and patch that face each other, and do nothing else.
 
-    Neighbouring lanes are neighbouring sensor points looking at the same patch, as in the gather. A ray ends at the
-    patch's centre, where the gather takes a random point of the patch.
+    The rays are those of the gather, and in its order: neighbouring lanes are neighbouring sensor points looking at
+    the same point of the same patch, and neighbouring patches follow each other.
 
     Parameters
     ----------
     loaded
         Scene and sensor points.
     positions, facing
-        (n, 3) centres [engine units] and normals of the patches.
+        (n, 3) where the gather's rays end [engine units], and normals of the patches.
 
     Returns
     -------
@@ -34,8 +34,12 @@ def trace_any_hit(loaded: LoadedScene, positions: Float64, facing: Float64) -> t
     import drjit as dr
     import mitsuba as mi
 
+    from nlosrender.engine.connections import WALL_OFFSET
+    from nlosrender.engine.space_filling import z_order
+
     built, n_sensors = loaded.built, loaded.capture.n_sensors
-    sensors = _device_points(mi, loaded.capture.sensor_grid.positions.reshape(-1, 3) / built.unit)
+    points = loaded.capture.sensor_grid.positions.reshape(-1, 3) / built.unit
+    sensors = _device_points(mi, points[np.argsort(z_order(points), kind="stable")])
     centres, normals = _device_points(mi, positions), _device_points(mi, facing)
     step = max(1, RAYS_PER_LAUNCH // n_sensors)
     dr.eval(sensors, centres, normals)
@@ -44,7 +48,7 @@ def trace_any_hit(loaded: LoadedScene, positions: Float64, facing: Float64) -> t
         count = min(step, len(positions) - first) * n_sensors
         index = dr.arange(mi.UInt32, count)
         patch = index // n_sensors + dr.opaque(mi.UInt32, first)
-        origin = dr.gather(mi.Point3f, sensors, index % n_sensors) + mi.Vector3f(0, 0, 1e-4)
+        origin = dr.gather(mi.Point3f, sensors, index % n_sensors) + mi.Vector3f(0, 0, WALL_OFFSET)
         towards = dr.gather(mi.Point3f, centres, patch) - origin
         turned = (dr.dot(mi.Vector3f(dr.gather(mi.Point3f, normals, patch)), towards) < 0) & (towards.z > 0)
         ray = mi.Ray3f(origin, towards, mi.Float(1 - 1e-4), mi.Float(0), [])

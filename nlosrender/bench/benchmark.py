@@ -18,10 +18,11 @@ from nlosrender.bench.references import Reference, find_reference
 from nlosrender.bench.runs import LoadedScene, Timer, load
 from nlosrender.bench.scaling import measure_scaling
 from nlosrender.bench.scenes import BenchScene
+from nlosrender.bench.skips import measure_skips
 from nlosrender.files.provenance import package_versions
 
-PARTS = ("curves", "scaling", "rates", "process")
-SHARES = {"curves": 0.72, "scaling": 0.18, "rates": 0.06, "process": 0.04}  # of the time
+PARTS = ("curves", "scaling", "rates", "skips", "process")
+SHARES = {"curves": 0.72, "scaling": 0.16, "rates": 0.05, "skips": 0.03, "process": 0.04}  # of the time
 REFERENCE_SHARE = 0.4  # of a scene's time
 
 Progress = Callable[[str], None]  # told what is being measured
@@ -94,6 +95,7 @@ class Benchmark:
     scenes: list[SceneResult] = field(default_factory=list)
     scaling: list[dict[str, Any]] = field(default_factory=list)
     rates: list[dict[str, Any]] = field(default_factory=list)
+    skips: list[dict[str, Any]] = field(default_factory=list)
     process: dict[str, Any] | None = None
 
     def report(self) -> dict[str, Any]:
@@ -103,6 +105,7 @@ class Benchmark:
             "scenes": [result.report() for result in self.scenes],
             "scaling": self.scaling,
             "rates": self.rates,
+            "skips": self.skips,
             "process": self.process,
         }
 
@@ -160,6 +163,9 @@ def run_benchmark(
             for scene in third:
                 progress(f"gather and any-hit rate of {scene.name}")
                 benchmark.rates.append(gather_rate(load(scene)).report())
+        if "skips" in wanted:
+            progress("what skipped work saves")
+            benchmark.skips = [saving.report() for saving in measure_skips(third)]
         if "process" in wanted and third:
             progress(f"nlosrender render of {third[0].name}, whole process")
             benchmark.process = whole_process(third[0])

@@ -17,6 +17,7 @@ from typing import Any, Self
 
 import numpy as np
 
+from nlosrender.bench.meshes import write_ply
 from nlosrender.bench.race import FIRST_SAMPLES, Contender
 from nlosrender.bench.references import Reference
 from nlosrender.bench.runs import LoadedScene, Run
@@ -191,13 +192,3 @@ def _note_agreement(known: dict[str, Any], run: Run, reference: Reference, axes:
     products = (run.values * reference.values).sum(axis=axes, keepdims=True)
     known["products"] = known.get("products", 0.0) + products * run.samples
     known["samples"] = known.get("samples", 0) + run.samples
-
-
-def write_ply(path: Path, vertices: np.ndarray, faces: np.ndarray) -> None:
-    """Write vertices (n, 3) [m] and faces (m, 3) as an ASCII .ply file."""
-    header = ["ply", "format ascii 1.0", f"element vertex {len(vertices)}"]
-    header += [f"property float {axis}" for axis in "xyz"]
-    header += [f"element face {len(faces)}", "property list uchar int vertex_indices", "end_header"]
-    rows = [" ".join(f"{value:.9g}" for value in vertex) for vertex in vertices.tolist()]
-    rows += [" ".join(str(index) for index in (3, *face)) for face in faces.tolist()]
-    path.write_text("\n".join([*header, *rows]) + "\n", encoding="ascii")

@@ -56,6 +56,13 @@ def table(report: dict[str, Any]) -> str:
             f"{rate['gather_share_of_any_hit']:.0%}; of all pairs {rate['rays_left_out']:.0%} take no ray"
             + ("" if rate["traces_rays"] else " (nothing can occlude here)")
         )
+    if report["skips"]:
+        lines += ["", "skipped work: CPU seconds with and without the skip, and how far the results lie apart"]
+    for skip in report["skips"]:
+        lines.append(
+            f"  {skip['what']} ({skip['scene']}): {skip['seconds']:.2f} instead of {skip['seconds_without']:.2f} s, "
+            f"{skip['saved']:.0%} saved; {skip['difference']:.1e} apart"
+        )
     if report["process"]:
         lines += ["", _process_line(report["process"])]
     return "\n".join(lines)

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from nlosrender.bench.curve import power_law
-from nlosrender.bench.peer import write_ply
+from nlosrender.bench.meshes import grid_faces, write_ply
 from nlosrender.bench.runs import Timer, load, render
 from nlosrender.bench.scenes import BenchScene, closed_room, many_lasers, plate, wavy_sheet
 
@@ -105,7 +105,5 @@ def write_wavy_sheet(path: Path, n_triangles: int) -> None:
     along = np.linspace(-0.4, 0.4, n + 1)
     x, y = (side.ravel() for side in np.meshgrid(along, along))
     z = 0.05 * np.sin(2 * np.pi * WAVES * x / 0.8) * np.cos(2 * np.pi * WAVES * y / 0.8)
-    corner = (np.arange(n)[:, None] * (n + 1) + np.arange(n)).ravel()
-    lower = np.stack([corner, corner + n + 1, corner + 1], axis=1)
-    upper = np.stack([corner + 1, corner + n + 1, corner + n + 2], axis=1)
-    write_ply(path, np.stack([x, y, z], axis=1), np.concatenate([lower, upper]))
+    faces = grid_faces(n, n)[:, ::-1]  # facing -z
+    write_ply(path, np.stack([x, y, z], axis=1), faces)

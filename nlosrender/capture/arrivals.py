@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from nlosrender.capture.bounces import FIRST_BOUNCE, THIRD_BOUNCE, BounceAxis
 from nlosrender.capture.grids import Capture, PointGrid
 from nlosrender.capture.time_axis import TimeAxis, latest_arrival
+from nlosrender.capture.view_arrivals import earliest_view, latest_view
 from nlosrender.scene.hidden_geometry import Bounds, box_corners
 from nlosrender.scene.pose import Float64
 from nlosrender.scene.relay_wall import RelayWall
@@ -24,6 +25,8 @@ def earliest_arrival(capture: Capture, wall: RelayWall, hidden_bounds: Bounds | 
     A path to the hidden geometry is at least as long as the distance to its box. On a curved wall light also goes
     straight from wall to wall, in no less than the legs.
     """
+    if capture.is_line_of_sight:
+        return earliest_view(capture, hidden_bounds)
     laser_legs, sensor_legs = capture.laser_legs.reshape(-1), capture.sensor_legs.reshape(-1)
     if not wall.is_planar:
         opl = laser_legs + sensor_legs if capture.scan_type == "confocal" else laser_legs.min() + sensor_legs.min()
@@ -43,6 +46,8 @@ def latest_of_bounce(capture: Capture, wall: RelayWall, hidden_bounds: Bounds | 
     """
     if bounce is None:
         return math.inf
+    if capture.is_line_of_sight:
+        return latest_view(capture, hidden_bounds, bounce)
     if bounce <= THIRD_BOUNCE + 1:
         return latest_arrival(capture, wall, hidden_bounds, bounce)
     fourth, fifth = (latest_arrival(capture, wall, hidden_bounds, THIRD_BOUNCE + extra) for extra in (1, 2))
@@ -59,10 +64,10 @@ def filled_shares(
     no_light = wall.is_planar and hidden_bounds is None
     shares = []
     for slot in range(bounces.n_slots):
-        bounce = slot + FIRST_BOUNCE if bounces.split else bounces.max_bounces
-        if bounces.split and bounce == FIRST_BOUNCE + bounces.n_slots - 1:
+        bounce = slot + bounces.first if bounces.split else bounces.max_bounces
+        if bounces.split and slot == bounces.n_slots - 1:
             bounce = bounces.max_bounces  # the last slot also holds what comes after it
-        straight = wall.is_planar and bounce == FIRST_BOUNCE
+        straight = wall.is_planar and bounces.first == FIRST_BOUNCE and bounce == FIRST_BOUNCE
         shares.append(0.0 if no_light or straight else _filled_share(capture, wall, hidden_bounds, time_axis, bounce))
     return tuple(shares)
 
@@ -81,7 +86,7 @@ def window_warnings(
         )
         return
     last = latest_of_bounce(capture, wall, hidden_bounds, max_bounces)
-    third = latest_arrival(capture, wall, hidden_bounds, THIRD_BOUNCE)
+    third = math.inf if capture.is_line_of_sight else latest_arrival(capture, wall, hidden_bounds, THIRD_BOUNCE)
     if time_axis.start_opl > last:
         yield (
             f"time_axis: the window starts at {time_axis.start_opl:.6g} m, after the last light can arrive at "
@@ -98,7 +103,8 @@ def _filled_share(
     capture: Capture, wall: RelayWall, hidden_bounds: Bounds | None, time_axis: TimeAxis, bounce: int | None
 ) -> float:
     start, end = time_axis.start_opl, time_axis.end_opl
-    if bounce == THIRD_BOUNCE and wall.is_planar and hidden_bounds is not None:
+    walls_third = bounce == THIRD_BOUNCE and wall.is_planar and not capture.is_line_of_sight
+    if walls_third and hidden_bounds is not None:
         earliest, latest = _third_bounce_spans(capture, hidden_bounds)
     else:
         earliest = np.array([earliest_arrival(capture, wall, hidden_bounds)])

@@ -8,13 +8,16 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
+from nlosrender.capture.bounces import LINE_OF_SIGHT
+from nlosrender.errors import ConfigError, Problem
 from nlosrender.scene.pose import Float64
-from nlosrender.scene.relay_wall import EDGE_TOLERANCE, RelayWall
+from nlosrender.scene.relay_wall import RelayWall
+from nlosrender.scene.wall_coordinates import EDGE_TOLERANCE
 
 if TYPE_CHECKING:
     from nlosrender.config.capture import CaptureConfig, GridConfig
 
-SCAN_TYPES = ("single", "confocal", "exhaustive")
+SCAN_TYPES = ("single", "confocal", "exhaustive", LINE_OF_SIGHT)
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,9 +51,9 @@ class Capture:
         The scan type is unknown, the grids do not fit it, or the energy or the spot's radius is out of range.
     """
 
-    scan_type: str  # single, confocal or exhaustive
-    sensor_grid: PointGrid
-    laser_grid: PointGrid  # confocal: the sensor grid itself
+    scan_type: str  # single, confocal, exhaustive or line_of_sight
+    sensor_grid: PointGrid  # line_of_sight: the pixels, on the image plane
+    laser_grid: PointGrid  # confocal: the sensor grid itself; line_of_sight: one point that means nothing
     laser_position: Float64  # (3,) m
     sensor_position: Float64  # (3,) m
     account_first_and_last_bounces: bool
@@ -62,8 +65,8 @@ class Capture:
             raise ValueError(f"scan_type {self.scan_type!r}: need one of {', '.join(SCAN_TYPES)}")
         if self.scan_type == "confocal" and self.laser_grid is not self.sensor_grid:
             raise ValueError("a confocal capture has one grid: laser_grid must be sensor_grid")
-        if self.scan_type == "single" and self.n_lasers != 1:
-            raise ValueError(f"a single capture has one laser point, got {self.n_lasers}")
+        if self.scan_type in ("single", LINE_OF_SIGHT) and self.n_lasers != 1:
+            raise ValueError(f"a {self.scan_type} capture has one laser point, got {self.n_lasers}")
         if not (np.isfinite(self.laser_energy) and self.laser_energy > 0):
             raise ValueError(f"laser_energy: got {self.laser_energy!r}, need a finite number > 0 [J]")
         if not (np.isfinite(self.laser_spot_radius) and self.laser_spot_radius >= 0):
@@ -78,6 +81,11 @@ class Capture:
     def n_sensors(self) -> int:
         """Number of sensor points."""
         return self.sensor_grid.ny * self.sensor_grid.nx
+
+    @property
+    def is_line_of_sight(self) -> bool:
+        """Whether a camera sees the scene itself."""
+        return self.scan_type == LINE_OF_SIGHT
 
     @property
     def laser_legs(self) -> Float64:
@@ -158,16 +166,18 @@ def build_capture(capture_config: CaptureConfig, wall: RelayWall) -> Capture:
 
     Raises
     ------
+    ConfigError
+        A grid does not fit the wall: of a mesh only its file tells how large it is.
     ValueError
-        A grid or point does not fit the wall, or a value is out of range.
+        A point is off the wall, or a value is out of range.
     """
-    sensor_grid = _configured_grid(capture_config.sensor_grid, wall)
+    sensor_grid = _configured_grid(capture_config.sensor_grid, wall, "capture.sensor_grid")
     if capture_config.scan_type == "confocal":
         laser_grid = sensor_grid
     elif capture_config.scan_type == "exhaustive":
         if capture_config.laser_grid is None:
             raise ValueError("an exhaustive capture needs a laser_grid")
-        laser_grid = _configured_grid(capture_config.laser_grid, wall)
+        laser_grid = _configured_grid(capture_config.laser_grid, wall, "capture.laser_grid")
     else:
         laser_point = capture_config.laser_point
         laser_grid = single_point(wall, (0.0, 0.0) if laser_point is None else laser_point)
@@ -188,8 +198,11 @@ def _cell_centres(count: int) -> Float64:
     return (2 * np.arange(count) + 1 - count) / (2 * count)
 
 
-def _configured_grid(grid_config: GridConfig, wall: RelayWall) -> PointGrid:
-    return point_grid(wall, grid_config.nx, grid_config.ny, grid_config.width, grid_config.height)
+def _configured_grid(grid_config: GridConfig, wall: RelayWall, key: str) -> PointGrid:
+    try:
+        return point_grid(wall, grid_config.nx, grid_config.ny, grid_config.width, grid_config.height)
+    except ValueError as error:
+        raise ConfigError(Problem("", key, f"{error}.")) from error
 
 
 def _device_position(scene_position: ArrayLike | None, wall: RelayWall) -> Float64:

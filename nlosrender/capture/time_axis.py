@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from nlosrender.capture.bounces import THIRD_BOUNCE
 from nlosrender.capture.grids import Capture, PointGrid
+from nlosrender.capture.view_arrivals import MARGIN_INTERACTIONS, latest_view
 from nlosrender.errors import ConfigError, Problem
 from nlosrender.scene.hidden_geometry import Bounds, box_corners, joined_bounds
 from nlosrender.scene.pose import Float64
@@ -21,8 +22,6 @@ if TYPE_CHECKING:
 AUTO_BINS_MULTIPLE = 32
 AUTO_BINS_LIMIT = 65536
 MARGIN_BOUNCES = 2  # bounces above the third that "n_bins: auto" makes room for
-
-_WALL_SAMPLES = 65  # per wall coordinate; 64 steps meet every extreme point: edges, middle and quarter turns
 
 
 @dataclass(frozen=True)
@@ -143,14 +142,17 @@ def latest_arrival(capture: Capture, wall: RelayWall, hidden_bounds: Bounds | No
     The third bounce leg + |x_l - c| + |c - x_s| + leg is convex in c: over a box it is largest at a corner. Further
     bounces go from c to some c': each adds at most the diameter of all that reflects, for up to two of them. Light can
     come to a curved wall from the wall itself, so that the wall is part of the box then. No light arrives from a
-    planar wall without hidden geometry: the longest legs are returned.
+    planar wall without hidden geometry: the longest legs are returned. A camera waits for four interactions at most.
 
     Parameters
     ----------
     capture, wall, hidden_bounds, max_bounces
         As in ``resolve_time_axis``.
     """
-    wall_box = _wall_bounds(wall)
+    if capture.is_line_of_sight:
+        most = MARGIN_INTERACTIONS if max_bounces is None else min(max_bounces, MARGIN_INTERACTIONS)
+        return latest_view(capture, hidden_bounds, most)
+    wall_box = wall.bounds()
     reflecting = hidden_bounds if wall.is_planar else joined_bounds([hidden_bounds, wall_box])
     spot = 2 * capture.laser_spot_radius  # a point of the spot is up to one radius farther from both of its neighbours
     if reflecting is None:
@@ -175,10 +177,3 @@ def _opl_to(corners: Float64, grid: PointGrid, legs: Float64) -> Float64:
     """Return leg + distance between every corner and every point of the grid, (8, points) [m]."""
     points = grid.positions.reshape(-1, 3)
     return np.linalg.norm(corners[:, None] - points[None], axis=-1) + legs.reshape(-1)
-
-
-def _wall_bounds(wall: RelayWall) -> Bounds:
-    steps = np.linspace(-0.5, 0.5, _WALL_SAMPLES)
-    xy = np.stack(np.meshgrid(steps * wall.width, steps * wall.height), axis=-1)
-    points = wall.positions(xy).reshape(-1, 3)
-    return points.min(axis=0), points.max(axis=0)

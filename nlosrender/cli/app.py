@@ -17,6 +17,7 @@ from nlosrender.cli import (
     config_commands,
     export_command,
     file_commands,
+    frames_command,
     machine_commands,
     merge_command,
     paper_command,
@@ -39,6 +40,7 @@ merge_command.register(app)
 plan_command.register(app)
 config_commands.register(app)
 file_commands.register(app)
+frames_command.register(app)
 reconstruct_command.register(app)
 export_command.register(app)
 machine_commands.register(app)

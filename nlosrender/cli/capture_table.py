@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from nlosrender.capture.bounces import LINE_OF_SIGHT
+
 SHOWN_LENGTH = 160  # characters of one value in the table; --json has all of it
 
 
@@ -17,25 +19,26 @@ def summary_table(summary: dict[str, object]) -> str:
 def _rows(summary: dict[str, object]) -> list[tuple[str, str]]:
     """Return label and text of every line; an empty text means that the file does not say."""
     legs = {True: "included in time", False: "NOT included in time"}
+    is_view = summary["scan_type"] == LINE_OF_SIGHT
     checked = summary.get("violations")
     verdict = "matches the Z-NLOS layout, all samples finite" if checked == [] else "FAILED, see below"
     return [
         ("file", f"{summary['file']} ({_bytes(summary['size_on_disk'])})"),
         ("PART ONLY", _part(summary["part"])),
         ("scan type", _text(summary["scan_type"])),
-        ("sensor points", _grid(summary["sensor_grid"], summary["sensor_grid_size"])),
-        ("laser points", _grid(summary["laser_grid"], summary["laser_grid_size"])),
-        ("sensor at", _lengths(summary["sensor_position"])),
-        ("laser at", _lengths(summary["laser_position"])),
+        ("pixels" if is_view else "sensor points", _grid(summary["sensor_grid"], summary["sensor_grid_size"])),
+        ("laser points", "" if is_view else _grid(summary["laser_grid"], summary["laser_grid_size"])),
+        ("camera at" if is_view else "sensor at", _lengths(summary["sensor_position"])),
+        ("laser at", "" if is_view else _lengths(summary["laser_position"])),
         ("time axis", _time_axis(summary)),
         ("first and last legs", legs.get(summary["account_first_and_last_bounces"], "")),  # type: ignore[call-overload]
-        ("bounces", _bounces(summary)),
+        ("interactions" if is_view else "bounces", _bounces(summary)),
         ("channels", _text(summary["channels"])),
         ("frame", _text(summary["frame"])),
-        ("hidden volume", _hidden_volume(summary)),
+        ("scene" if is_view else "hidden volume", _hidden_volume(summary)),
         ("data", _storage(summary)),
         ("engine", _text(summary["engine"])),
-        ("samples per pair", _text(summary["samples"])),
+        ("samples per pixel" if is_view else "samples per pair", _text(summary["samples"])),
         ("seed", _text(summary["seed"])),
         ("error estimate", _percent(summary["error_estimate"])),
         ("outside the window", _text(summary["out_of_window_energy"])),

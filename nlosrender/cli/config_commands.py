@@ -120,10 +120,13 @@ def _print_verdict(problems: list[Problem], warnings: list[str]) -> None:
 def _summary(config: Config) -> str:
     """Return the capture in a few words: scan, sizes, bins, hidden items."""
     capture, n_bins = config.capture, config.time_axis.n_bins
-    parts = [capture.scan_type, f"{capture.sensor_grid.nx} x {capture.sensor_grid.ny} sensors"]
+    points = "pixels" if capture.is_line_of_sight else "sensors"
+    parts = [capture.scan_type, f"{capture.sensor_grid.nx} x {capture.sensor_grid.ny} {points}"]
     if capture.laser_grid is not None:
         parts.append(f"{capture.laser_grid.nx} x {capture.laser_grid.ny} lasers")
     parts.append(f"{n_bins} bins of {config.time_axis.bin_width_opl:g} m")
     n_hidden = len(config.scene.hidden_geometry)
     parts.append(f"{n_hidden} hidden item{'' if n_hidden == 1 else 's'}")
+    if config.scene.emitters:
+        parts.append(f"{len(config.scene.emitters)} emitter{'' if len(config.scene.emitters) == 1 else 's'}")
     return ", ".join(parts)

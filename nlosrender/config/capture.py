@@ -7,6 +7,7 @@ from typing import Any, Literal
 
 from pydantic import model_validator
 
+from nlosrender.config.camera import CameraConfig
 from nlosrender.config.fields import (
     BinCount,
     Coordinate,
@@ -21,7 +22,8 @@ from nlosrender.config.fields import (
 from nlosrender.config.refusal import Fault
 from nlosrender.config.section import Section
 
-ScanType = Literal["single", "confocal", "exhaustive"]
+ScanType = Literal["single", "confocal", "exhaustive", "line_of_sight"]
+_OF_THE_WALL = ("laser_grid", "laser_point", "laser_position", "sensor_position")  # what line_of_sight has none of
 
 
 class GridConfig(Section):
@@ -46,9 +48,12 @@ class CaptureConfig(Section):
     """The scan: laser points, sensor points, and where laser and sensor stand."""
 
     scan_type: ScanType
-    """single: one laser point; confocal: laser and sensor on the same point; exhaustive: every pair"""
+    """single: one laser point; confocal: laser and sensor on the same point; exhaustive: every pair;
+    line_of_sight: what a camera sees of a scene with emitters"""
     sensor_grid: GridConfig
-    """the measured points"""
+    """the measured points; line_of_sight: the camera's pixels, not set here"""
+    camera: CameraConfig | None = None
+    """line_of_sight: where the scene is seen from; null: the camera of scene.mitsuba"""
     laser_grid: GridConfig | None = None
     """the lit points of an exhaustive scan"""
     laser_point: Point2 | None = None
@@ -62,7 +67,20 @@ class CaptureConfig(Section):
     laser_spot_radius: LengthOrZero = 0.0
     """m, radius of the lit disc on the wall; 0: a point"""
     account_first_and_last_bounces: Flag = True
-    """count the legs laser to wall and wall to sensor in the path length"""
+    """count the legs laser to wall and wall to sensor in the path length; line_of_sight: the leg to the camera"""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _pixels(cls, raw: Any) -> Any:
+        """Make the camera's pixels the sensor grid."""
+        if not isinstance(raw, Mapping) or raw.get("scan_type") != "line_of_sight" or "sensor_grid" in raw:
+            return raw
+        camera = raw.get("camera")
+        pixels = {"nx": 1, "ny": 1}  # what the camera lacks is its own mistake
+        if isinstance(camera, Mapping):
+            sizes = {"nx": camera.get("width"), "ny": camera.get("height")}
+            pixels |= {key: size for key, size in sizes.items() if type(size) is int and size >= 1}
+        return {**raw, "sensor_grid": pixels}
 
     @model_validator(mode="before")
     @classmethod
@@ -71,7 +89,13 @@ class CaptureConfig(Section):
         return {**raw, "laser_point": [0.0, 0.0]} if is_single and raw.get("laser_point") is None else raw
 
     def rules(self) -> Iterator[Fault]:
-        """Yield the faults of laser points that do not fit the scan type."""
+        """Yield the faults of laser points and cameras that do not fit the scan type."""
+        if self.is_line_of_sight:
+            yield from self._line_of_sight_rules()
+            return
+        if self.camera is not None:
+            message = f"a camera is for scan_type: line_of_sight, got {self.scan_type}; remove one of the two."
+            yield Fault(("camera",), message, "key", (("scan_type",),))
         if self.scan_type == "exhaustive" and self.laser_grid is None:
             message = "missing, an exhaustive scan needs it, such as {nx: 4, ny: 3}."
             yield Fault(("laser_grid",), message, needs=(("scan_type",), ("laser_grid",)))
@@ -82,6 +106,26 @@ class CaptureConfig(Section):
         if self.scan_type != "single" and self.laser_point is not None:
             message = f"a laser point is for scan_type: single, got {self.scan_type}; remove one of the two."
             yield Fault(("laser_point",), message, "key", (("scan_type",),))
+
+    def _line_of_sight_rules(self) -> Iterator[Fault]:
+        wrong = [key for key in _OF_THE_WALL if getattr(self, key) is not None]
+        wrong += ["laser_energy"] if self.laser_energy != 1.0 else []
+        wrong += ["laser_spot_radius"] if self.laser_spot_radius != 0.0 else []
+        for key in wrong:
+            message = "a line_of_sight capture has no laser; remove it. Light comes from scene.emitters."
+            if key == "sensor_position":
+                message = "a line_of_sight capture has a camera instead; use capture.camera.position."
+            yield Fault((key,), message, "key", (("scan_type",),))
+        camera, grid = self.camera, self.sensor_grid
+        if grid.width or grid.height or (camera and (grid.nx, grid.ny) != (camera.width, camera.height)):
+            message = "the sensor points of a line_of_sight capture are the camera's pixels; remove it, and set "
+            message += "capture.camera.width and height."
+            yield Fault(("sensor_grid",), message, "key", (("scan_type",), ("camera",), ("sensor_grid",)))
+
+    @property
+    def is_line_of_sight(self) -> bool:
+        """Whether a camera sees the scene itself, not a relay wall."""
+        return self.scan_type == "line_of_sight"
 
     @property
     def n_lasers(self) -> int:

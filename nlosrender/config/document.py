@@ -9,13 +9,17 @@ from pydantic import Field, ValidationInfo, model_validator
 
 from nlosrender.config.capture import CaptureConfig, TimeAxisConfig
 from nlosrender.config.fields import Name
+from nlosrender.config.line_of_sight import line_of_sight_faults, relay_wall_faults
+from nlosrender.config.mitsuba_xml import read_mitsuba_xml
+from nlosrender.config.plugin_check import config_folder
 from nlosrender.config.refusal import Fault, KeyPath, shown
-from nlosrender.config.relay_wall import EDGE_TOLERANCE
+from nlosrender.config.relay_wall import EDGE_TOLERANCE, RelayWallConfig
 from nlosrender.config.render import OutputConfig, RenderConfig
 from nlosrender.config.scene import SceneConfig
 from nlosrender.config.section import Section
 from nlosrender.config.sweep import SweepConfig
 
+STOKES_COMPONENTS = 4
 MAX_BINS = 2**40  # 4 TiB of float32: beyond it a grid or bin count is a slip of the pen
 _WALL: KeyPath = ("scene", "relay_wall")
 _WALL_SHAPE = tuple((*_WALL, key) for key in ("type", "width", "height", "radius", "center", "normal"))
@@ -51,13 +55,18 @@ class Config(Section):
         output = filled.get("output", {})
         if isinstance(output, Mapping) and isinstance(filled["name"], str):
             filled["output"] = {"path": f"{filled['name']}.hdf5", **output}
-        return _grids_on_patch(filled)
+        return _film_of_scene(_grids_on_patch(filled), validation)
 
     def rules(self) -> Iterator[Fault]:
         """Yield the faults between sections."""
-        yield from self._points_off_the_wall()
-        yield from self._devices_behind_the_wall()
-        yield from self._laser_spot()
+        if self.capture.is_line_of_sight:
+            yield from line_of_sight_faults(self.scene, self.capture, self.render)
+        else:
+            yield from relay_wall_faults(self.scene, self.capture, self.render)
+            if self.scene.relay_wall is not None:
+                yield from self._points_off_the_wall(self.scene.relay_wall)
+                yield from self._devices_behind_the_wall(self.scene.relay_wall)
+                yield from self._laser_spot(self.scene.relay_wall)
         pairs = self.capture.sensor_grid.n_points * self.capture.n_lasers
         n_bins = 1 if self.time_axis.n_bins == "auto" else self.time_axis.n_bins
         if pairs * n_bins > MAX_BINS:
@@ -68,8 +77,8 @@ class Config(Section):
             )
             yield Fault(path, message, needs=(("time_axis", "n_bins"), ("capture", "sensor_grid"), _LASER_GRID))
 
-    def _points_off_the_wall(self) -> Iterator[Fault]:
-        extent, wall = self.scene.relay_wall.extent, self.scene.relay_wall.type
+    def _points_off_the_wall(self, relay_wall: RelayWallConfig) -> Iterator[Fault]:
+        extent, wall = relay_wall.extent, relay_wall.type
         grids = {"sensor_grid": self.capture.sensor_grid, "laser_grid": self.capture.laser_grid}
         for key, grid in grids.items():
             sizes = (grid.width, grid.height) if grid else (None, None)
@@ -86,8 +95,7 @@ class Config(Section):
             )
             yield Fault(("capture", "laser_point"), message, needs=(("capture", "laser_point"), *_WALL_SHAPE))
 
-    def _devices_behind_the_wall(self) -> Iterator[Fault]:
-        wall = self.scene.relay_wall
+    def _devices_behind_the_wall(self, wall: RelayWallConfig) -> Iterator[Fault]:
         if wall.type != "rectangle":
             return
         for key in ("laser_position", "sensor_position"):
@@ -100,11 +108,11 @@ class Config(Section):
                 message = f"got {shown(position)}, {where}; need a point on the side its normal looks to."
                 yield Fault(("capture", key), message, needs=(("capture", key), *_WALL_SHAPE))
 
-    def _laser_spot(self) -> Iterator[Fault]:
+    def _laser_spot(self, wall: RelayWallConfig) -> Iterator[Fault]:
         path: KeyPath = ("capture", "laser_spot_radius")
         radius = self.capture.laser_spot_radius
-        if radius > 0 and self.scene.relay_wall.type != "rectangle":
-            message = f"got {shown(radius)} on a {self.scene.relay_wall.type} wall; need 0 there, or a rectangle wall."
+        if radius > 0 and wall.type != "rectangle":
+            message = f"got {shown(radius)} on a {wall.type} wall; need 0 there, or a rectangle wall."
             yield Fault(path, message, needs=(path, (*_WALL, "type")))
         if not self.render.laser_sampling and radius == 0:
             message = "got false with a laser that is a point, which no path finds by chance; "
@@ -115,7 +123,30 @@ class Config(Section):
     @property
     def is_colored(self) -> bool:
         """Whether three channels are rendered: ``render.color``, or for ``auto`` what the scene needs."""
+        if self.render.polarized:
+            return False
         return self.render.color == "rgb" or (self.render.color == "auto" and self.scene.is_colored)
+
+    @property
+    def n_channels(self) -> int:
+        """Channels that are rendered: grey, three colours or four Stokes components."""
+        return STOKES_COMPONENTS if self.render.polarized else 3 if self.is_colored else 1
+
+
+def _film_of_scene(raw: dict[str, Any], validation: ValidationInfo) -> dict[str, Any]:
+    """Make the film of a Mitsuba scene the sensor grid where no camera is given."""
+    scene, capture = raw.get("scene"), raw.get("capture")
+    name = scene.get("mitsuba") if isinstance(scene, Mapping) else None
+    if not isinstance(name, str) or not isinstance(capture, Mapping) or capture.get("camera") is not None:
+        return raw
+    if capture.get("scan_type") != "line_of_sight" or "sensor_grid" in capture:
+        return raw
+    try:
+        _, size = read_mitsuba_xml(config_folder(validation) / name)
+    except ValueError:  # the scene's own fault, told with its place
+        return raw
+    grid = {} if size is None else {"sensor_grid": {"nx": size[0], "ny": size[1]}}
+    return {**raw, "capture": {**capture, **grid}}
 
 
 def _grids_on_patch(raw: dict[str, Any]) -> dict[str, Any]:

@@ -137,6 +137,15 @@ def _quoted_number(value: object) -> str:
     return "Write the number without quotes."
 
 
+def _brightness(value: object) -> Any:
+    numbers = [as_finite(item) for item in value] if isinstance(value, (list, tuple)) else [as_finite(value)]
+    if len(numbers) != (3 if isinstance(value, (list, tuple)) else 1) or any(
+        number is None or not 0 <= number <= _MOST_JOULES for number in numbers
+    ):
+        raise refuse(value, f"a number from 0 to {_MOST_JOULES:g}, or [r, g, b]", _quoted_number(value))
+    return tuple(numbers) if isinstance(value, (list, tuple)) else numbers[0]
+
+
 def _flag(value: object) -> bool:
     if not isinstance(value, bool):
         raise refuse(value, "true or false")
@@ -244,11 +253,18 @@ GridCount = Annotated[
         {"type": "integer", "minimum": 1},
     ),
 ]
-BounceCount = Annotated[
+BounceCount = Annotated[  # from 2 for a relay wall, where the document says so
     int,
     Checked(
-        _bounded_integer("an integer >= 2 or null for no limit", 2, _MOST_BOUNCES, "3 is the third bounce."),
-        {"type": "integer", "minimum": 2, "maximum": _MOST_BOUNCES},
+        _bounded_integer("an integer >= 2 or null for no limit", 0, _MOST_BOUNCES, "3 is the third bounce."),
+        {"type": "integer", "minimum": 0, "maximum": _MOST_BOUNCES},
+    ),
+]
+FieldOfView = Annotated[
+    float,
+    Checked(
+        _number("an angle between 0 and 180 degrees (both excluded)", lambda x: 0 < x < 180),
+        {"type": "number", "exclusiveMinimum": 0, "exclusiveMaximum": 180},
     ),
 ]
 Seed = Annotated[
@@ -259,6 +275,10 @@ Seed = Annotated[
     ),
 ]
 Vector3 = tuple[float, float, float]
+Brightness = Annotated[
+    float | Vector3,
+    Checked(_brightness, {"anyOf": [{"type": "number", "minimum": 0}, _array(3, minimum=0)]}),
+]
 Point2 = Annotated[
     tuple[float, float],
     Checked(_vector(2, "2 finite numbers [x, y]", lambda v: True, most=LONGEST), _array(2)),

@@ -9,7 +9,8 @@ from typing import Annotated, Literal
 from pydantic import Field
 
 from nlosrender.config.bsdf import WHITE_DIFFUSE, BsdfMapping
-from nlosrender.config.fields import Direction, Flag, Length, Point3
+from nlosrender.config.fields import Angles3, Direction, Flag, Length, Point3, Positive
+from nlosrender.config.hidden_geometry import MeshFilename
 from nlosrender.config.refusal import Fault, shown
 from nlosrender.config.section import Section, pose_faults
 from nlosrender.config.vectors import height_above
@@ -96,4 +97,33 @@ class CylinderWallConfig(_Wall):
         return 2 * math.pi * self.radius, self.height
 
 
-RelayWallConfig = Annotated[RectangleWallConfig | SphereWallConfig | CylinderWallConfig, Field(discriminator="type")]
+class MeshWallConfig(Section):
+    """A mesh from a file, lit on the side of its faces' normals; wall coordinates are its (u, v) in metres."""
+
+    type: Literal["mesh"]
+    filename: MeshFilename
+    """a .ply or .obj file with texture coordinates (u, v) from 0 to 1; relative names start at the YAML's folder"""
+    scale: Positive = 1.0
+    """m per unit of the file"""
+    rotate_deg: Angles3 = (0.0, 0.0, 0.0)
+    """degrees about x, y, z, in this order"""
+    translate: Point3 = (0.0, 0.0, 0.0)
+    """m, scene coordinates"""
+    flip_normals: Flag = False
+    """true: the wall is lit on the other side"""
+    width: Length | None = None
+    """m, what u from 0 to 1 is in wall coordinates; null: the mesh's mean extent along u"""
+    height: Length | None = None
+    """m, what v from 0 to 1 is in wall coordinates; null: the mesh's mean extent along v"""
+    bsdf: BsdfMapping = Field(default_factory=lambda: WHITE_DIFFUSE)
+    """any Mitsuba BSDF; default {type: diffuse, reflectance: 1.0}"""
+
+    @property
+    def extent(self) -> tuple[float, float]:
+        """Extent of the wall coordinates (x, y) [m]; infinite where only the file tells."""
+        return self.width or math.inf, self.height or math.inf
+
+
+RelayWallConfig = Annotated[
+    RectangleWallConfig | SphereWallConfig | CylinderWallConfig | MeshWallConfig, Field(discriminator="type")
+]

@@ -12,6 +12,7 @@ from nlosrender.config.fields import (
     BounceCount,
     Checked,
     Flag,
+    LengthOrZero,
     MemoryLimit,
     OpenUnit,
     Positive,
@@ -53,7 +54,8 @@ class RenderConfig(Section):
     engine: Engine = "auto"
     """auto: the cheapest engine right for the scene; path: path tracer; virtual_lights: third bounce without noise"""
     max_bounces: BounceCount | None = 7
-    """highest bounce, counting both points on the wall: 3 is the third bounce; null: no limit"""
+    """highest bounce, counting both points on the wall: 3 is the third bounce; null: no limit; line_of_sight: number
+    of surface interactions, from 0"""
     split_bounces: Flag = True
     """give each bounce an index of its own in the file; false: all in index 1"""
     spp: SampleCount | None = None
@@ -66,6 +68,8 @@ class RenderConfig(Section):
     """connect paths to the laser point; false: find the laser spot by chance (needs capture.laser_spot_radius)"""
     hidden_geometry_sampling: Flag = True
     """sample points on the hidden geometry beside the BSDF"""
+    temporal_kernel_opl: LengthOrZero = 0.0
+    """m of optical path, full width of a kernel that spreads each path in time: less noise, a bias; 0: a histogram"""
     russian_roulette: Flag = True
     """end paths of low weight early, without bias"""
     seed: Seed = 0
@@ -74,6 +78,8 @@ class RenderConfig(Section):
     """llvm: processor, cuda: NVIDIA GPU, auto: the GPU where there is one"""
     color: Literal["auto", "grey", "rgb"] = "auto"
     """auto: three channels only when the scene has colours"""
+    polarized: Flag = False
+    """four grey channels, the Stokes components I, Q, U, V, instead of colours"""
     memory_limit: MemoryLimit = "auto"
     """auto, or a size such as 600MB, 8GB, 2GiB"""
 
@@ -88,6 +94,9 @@ class RenderConfig(Section):
         if self.spp is not None and self.target_error is not None:
             message = f"got {shown(self.target_error)} beside spp {self.spp}; they exclude each other, keep one."
             yield Fault(("target_error",), message, "key", (("spp",), ("target_error",)))
+        if self.polarized and self.color == "rgb":
+            message = "got true beside color rgb; polarised light is rendered in grey: use color auto or grey."
+            yield Fault(("polarized",), message, "key", (("color",), ("polarized",)))
 
     @property
     def memory_limit_bytes(self) -> int | None:

@@ -8,7 +8,9 @@ from typing import Any
 from pydantic import model_validator
 
 from nlosrender.config.bsdf import is_colored
+from nlosrender.config.emitters import EmitterConfig, PointLamp, SpotLamp
 from nlosrender.config.hidden_geometry import HiddenItemConfig
+from nlosrender.config.mitsuba_xml import MitsubaXml, is_colored_xml, read_mitsuba_xml
 from nlosrender.config.refusal import Fault
 from nlosrender.config.relay_wall import RelayWallConfig
 from nlosrender.config.section import Section
@@ -17,24 +19,22 @@ from nlosrender.config.section import Section
 class SceneConfig(Section):
     """What is rendered; coordinates in metres, right-handed."""
 
-    relay_wall: RelayWallConfig
-    """the visible surface, told by its type"""
+    relay_wall: RelayWallConfig | None = None
+    """the visible surface, told by its type; every scan but line_of_sight needs it"""
     hidden_geometry: tuple[HiddenItemConfig, ...] = ()
     """a list of items, told apart by their types; empty: H is zero"""
+    emitters: tuple[EmitterConfig, ...] = ()
+    """line_of_sight: what flashes at t = 0, a list of items told apart by their types"""
+    mitsuba: MitsubaXml | None = None
+    """line_of_sight: a Mitsuba scene as .xml, in m; its shapes, emitters and camera join what is given here"""
 
     @model_validator(mode="before")
     @classmethod
     def _name_items(cls, raw: Any) -> Any:
-        items = raw.get("hidden_geometry") if isinstance(raw, Mapping) else None
-        if not isinstance(items, (list, tuple)):
+        if not isinstance(raw, Mapping):
             return raw
-        named = [
-            {"name": f"{item['type']}-{index}", **item}
-            if isinstance(item, Mapping) and isinstance(item.get("type"), str)
-            else item
-            for index, item in enumerate(items)
-        ]
-        return {**raw, "hidden_geometry": named}
+        lists = {key: raw[key] for key in ("hidden_geometry", "emitters") if isinstance(raw.get(key), (list, tuple))}
+        return {**raw, **{key: [_named(item, index) for index, item in enumerate(lists[key])] for key in lists}}
 
     def rules(self) -> Iterator[Fault]:
         """Yield the faults between items, and between items and the wall."""
@@ -45,11 +45,42 @@ class SceneConfig(Section):
             if first != index:
                 message = f"got {item.name}, the name of hidden_geometry.{first} as well, need a name of its own."
                 yield Fault((*path, "name"), message, needs=((*path, "name"), ("hidden_geometry", first, "name")))
-            if item.type == "room" and self.relay_wall.type != "rectangle":
-                message = f"got a room in front of a {self.relay_wall.type} wall; a room needs a rectangle relay wall."
+            wall = "no" if self.relay_wall is None else f"a {self.relay_wall.type}"
+            if item.type == "room" and wall != "a rectangle":
+                message = f"got a room in front of {wall} wall; a room needs a rectangle relay wall."
                 yield Fault((*path, "type"), message, needs=(path, ("relay_wall", "type")))
 
     @property
     def is_colored(self) -> bool:
         """Whether a BSDF differs between colour channels, or may: textures and measured spectra count as coloured."""
-        return is_colored(self.relay_wall.bsdf) or any(is_colored(item.bsdf) for item in self.hidden_geometry)
+        if self.relay_wall is not None and is_colored(self.relay_wall.bsdf):
+            return True
+        if self.mitsuba is not None and is_colored_xml(read_mitsuba_xml(self.mitsuba)[0]):
+            return True
+        shaped = [item for item in self.emitters if not isinstance(item, (PointLamp, SpotLamp))]
+        lights = [
+            item.intensity if isinstance(item, (PointLamp, SpotLamp)) else item.radiance for item in self.emitters
+        ]
+        if any(isinstance(light, tuple) and len(set(light)) > 1 for light in lights):
+            return True
+        return any(is_colored(item.bsdf) for item in (*self.hidden_geometry, *shaped))
+
+    @property
+    def wall(self) -> RelayWallConfig:
+        """The relay wall of a scene that needs one.
+
+        Raises
+        ------
+        ValueError
+            There is none: a line-of-sight capture.
+        """
+        if self.relay_wall is None:
+            raise ValueError("scene.relay_wall: a line_of_sight capture has none")
+        return self.relay_wall
+
+
+def _named(item: Any, index: int) -> Any:
+    """Give an item its default name."""
+    if isinstance(item, Mapping) and isinstance(item.get("type"), str):
+        return {"name": f"{item['type']}-{index}", **item}
+    return item

@@ -26,7 +26,7 @@ name: {name}  # default: the name of this file
 
 scene:
   relay_wall:                    # the visible surface
-    type: rectangle              # rectangle | sphere | cylinder
+    type: rectangle              # rectangle | sphere | cylinder | mesh
     width: 2.0                   # m, along the wall's x axis (up x normal)
     height: 2.0                  # m, along the wall's y axis (up)
     center: [0, 0, 0]            # m; default [0, 0, 0]
@@ -36,6 +36,9 @@ scene:
   # A curved wall; inside: true (default) = lit from within; width, height: default extent of the grids.
   # relay_wall: {{type: sphere, center: [0, 0, 0], radius: 1.0, inside: true, width: 2.0, height: 1.0}}
   # relay_wall: {{type: cylinder, center: [0, 0, 0], axis: [0, 1, 0], radius: 1.0, height: 2.0, inside: true}}
+  # A mesh with texture coordinates, which are its wall coordinates; width, height: what 0..1 is in m; default null.
+  # relay_wall: {{type: mesh, filename: wall.ply, scale: 1, rotate_deg: [0, 0, 0], translate: [0, 0, 0],
+  #              flip_normals: false, width: null, height: null}}
 
   hidden_geometry:               # a list; default [] (nothing hidden)
     - name: plate                # default: type and index, here rectangle-0
@@ -56,8 +59,18 @@ scene:
     # to_world: a 4x4 matrix, or translate, scale, rotate: {{axis: [0, 1, 0], angle_deg: 90}}, applied in order.
     # - {{type: mitsuba, shape: {{type: cube, to_world: [{{scale: 0.2}}, {{translate: [0, 0, 1]}}]}}}}
 
+  # What a camera sees of the scene itself (capture.scan_type: line_of_sight): no relay_wall, but emitters that flash at
+  # t = 0: any item as above with a radiance [W m^-2 sr^-1], or a point or a spot with an intensity [W sr^-1].
+  # emitters:
+  # - {{name: lamp, type: rectangle, width: 0.5, height: 0.4, center: [0, 2, 0], normal: [0, -1, 0], radiance: 10.0}}
+  # - {{type: point, position: [0, 1, 2], intensity: [1.0, 0.9, 0.8]}}
+  # - {{type: spot, position: [0, 1, 2], look_at: [0, 0, 0], intensity: 1.0, cutoff_deg: 20, beam_deg: null}}
+  # mitsuba: scene.xml           # a whole Mitsuba scene in m; its camera is used where capture has none
+
 capture:
-  scan_type: {scan_type}{pad}# single | confocal | exhaustive
+  scan_type: {scan_type}{pad}# single | confocal | exhaustive | line_of_sight
+  # camera:                      # line_of_sight, instead of everything about sensors and lasers below
+  #   {{position: [0, 1, 4], look_at: [0, 1, 0], up: [0, 1, 0], fov_deg: 40, width: 64, height: 48}}  # pixels
   sensor_grid:                   # the measured points: cell centres (i + 0.5) / n
     nx: 32                       # integer >= 1
     ny: 32                       # integer >= 1
@@ -84,10 +97,12 @@ render:
   time_limit_s: null             # s, > 0; stop after this time; default null: no limit
   laser_sampling: true           # connect paths to the laser point; false needs laser_spot_radius > 0; default true
   hidden_geometry_sampling: true # sample points on the hidden geometry; default true
+  temporal_kernel_opl: 0.0       # m, width of a kernel in time that smooths the noise of paths; default 0: a histogram
   russian_roulette: true         # end weak paths early, without bias; default true
   seed: 0                        # 0..4294967295; default 0
   backend: auto                  # auto | llvm | cuda; default auto
   color: auto                    # auto | grey | rgb; default auto: rgb only where the scene has colours
+  polarized: false               # true: I, Q, U, V of polarised light instead of colours
   memory_limit: auto             # auto | "600MB" | "8GB" | "2GiB"; default auto
 
 output:

@@ -15,9 +15,6 @@ from nlosrender.config.yaml_tree import Document
 from nlosrender.errors import Problem, nearest
 
 _NOT_A_MAPPING = ("model_type", "model_attributes_type", "dict_type", "mapping_type")
-_LATER: dict[KeyPath, str] = {
-    ("scene", "mitsuba"): " This version does not take whole Mitsuba scenes; use hidden_geometry items of type mitsuba."
-}
 
 
 def locate(location: tuple[str | int, ...]) -> tuple[KeyPath, type[BaseModel]]:
@@ -109,7 +106,7 @@ def _unknown_key(path: KeyPath, section: type[BaseModel]) -> str:
         return f"unknown key. Did you mean {close}?"
     elsewhere = _homes(Config, key, ())
     move = f" It belongs in {elsewhere[0]}." if elsewhere else ""
-    return f"unknown key, known here: {', '.join(known)}.{_LATER.get(path, move)}"
+    return f"unknown key, known here: {', '.join(known)}.{move}"
 
 
 def _homes(section: type[BaseModel], key: str, path: tuple[str, ...]) -> list[str]:

@@ -20,7 +20,14 @@ from nlosrender.config.vectors import length
 
 def config_warnings(config: Config) -> tuple[str, ...]:
     """Return one sentence for each thing in a valid config that is pointless or surprising."""
-    return (*_dark_scene(config), *_behind_the_wall(config), *_bounces(config), *_file(config))
+    if config.capture.is_line_of_sight:
+        return (*_dark_view(config), *_budget(config))
+    return (*_dark_scene(config), *_behind_the_wall(config), *_bounces(config), *_budget(config), *_file(config))
+
+
+def _dark_view(config: Config) -> Iterator[str]:
+    if not config.scene.emitters and config.scene.mitsuba is None:
+        yield "scene.emitters is empty: nothing shines, the picture is black."
 
 
 def _dark_scene(config: Config) -> Iterator[str]:
@@ -29,7 +36,7 @@ def _dark_scene(config: Config) -> Iterator[str]:
         yield "scene.hidden_geometry is empty: only light that stays on the relay wall is left, none on a flat one."
     if items and all(_is_black(item.bsdf) for item in items):
         yield "every hidden item has reflectance 0: nothing comes back from the hidden scene."
-    if _is_black(config.scene.relay_wall.bsdf):
+    if _is_black(config.scene.wall.bsdf):
         yield "scene.relay_wall.bsdf has reflectance 0: H is zero everywhere."
 
 
@@ -68,8 +75,11 @@ def _bounding_sphere(item: HiddenItemConfig) -> tuple[tuple[float, float, float]
 
 
 def _bounces(config: Config) -> Iterator[str]:
-    if config.render.max_bounces == 2 and config.scene.relay_wall.type == "rectangle":
+    if config.render.max_bounces == 2 and config.scene.wall.type == "rectangle":
         yield "render.max_bounces is 2: no light goes straight from a point of a flat wall to another, H is zero."
+
+
+def _budget(config: Config) -> Iterator[str]:
     if config.render.spp is None and config.render.target_error is None and config.render.time_limit_s is not None:
         yield "render.time_limit_s alone: the error is whatever the time allows; the file says how large it is."
 

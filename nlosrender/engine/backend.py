@@ -46,7 +46,7 @@ def cuda_available() -> bool:
         return False
 
 
-def start_backend(wanted: BackendName = "auto", *, colored: bool = False) -> Backend:
+def start_backend(wanted: BackendName = "auto", *, colored: bool = False, polarized: bool = False) -> Backend:
     """Choose LLVM or CUDA, and activate the Mitsuba variant.
 
     Parameters
@@ -55,6 +55,8 @@ def start_backend(wanted: BackendName = "auto", *, colored: bool = False) -> Bac
         ``auto`` takes CUDA where a device is present, otherwise LLVM.
     colored
         Render three channels; otherwise one.
+    polarized
+        Carry Stokes vectors, in grey.
 
     Raises
     ------
@@ -67,7 +69,7 @@ def start_backend(wanted: BackendName = "auto", *, colored: bool = False) -> Bac
         )
     name: Literal["llvm", "cuda"] = "cuda" if wanted == "cuda" or (wanted == "auto" and cuda_available()) else "llvm"
     library = "CUDA driver" if name == "cuda" else _load_llvm()
-    variant = f"{name}_ad_{'rgb' if colored else 'mono'}"
+    variant = f"{name}_ad_{'mono_polarized' if polarized else 'rgb' if colored else 'mono'}"
     try:
         import mitsuba
 

@@ -13,9 +13,12 @@ from nlosrender.capture.bounces import FIRST_BOUNCE
 from nlosrender.engine.device_arrays import WallPoints
 from nlosrender.engine.histogram import DeviceHistogram
 from nlosrender.engine.transport import PathSettings, Transport
+from nlosrender.scene.build import BuiltScene
 
 LEAST_COSINE = 1e-2  # between a ray and a surface's normal
 RAY_OFFSET = 2e-5  # engine units; float32 positions of a scene of size 1 are good to 1e-7
+WALL_OFFSET = 1e-20  # engine units: points of a planar wall have z = 0 exactly, and rays leave it on the right side
+HEIGHT_SHARE = 0.25  # of a surface's height over a planar wall: the ray offset never carries a ray beyond the wall
 
 
 @dr.syntax
@@ -30,19 +33,28 @@ def connect_to_lasers(
     bounce: mi.UInt32,
     opl: mi.Float,
     throughput: mi.Spectrum,
+    origin: mi.Point3f,
+    leg: mi.Vector3f,
 ) -> None:
-    """Laser sampling: connect the vertex to every laser of the lane and deposit (Royo et al. 2022, section 4)."""
+    """Laser sampling: connect the vertex to every laser of the lane and deposit (Royo et al. 2022, section 4).
+
+    The vertex lies at ``origin`` plus ``leg``: closer to a laser point than float32 tells positions apart, only the leg
+    says where it is.
+    """
     slot = _slot(settings, bounce)
     # one place in the spot for all lasers: what a path draws must not depend on how many lasers a batch has
     in_spot = mi.Vector3f(0)
     if dr.hint(settings.finds_spot, mode="scalar"):
         in_spot = _on_disc(generator, active) * settings.spot_radius
     if dr.hint(transport.lasers_per_lane == 1, mode="scalar"):
-        _connect(settings, transport, histogram, in_spot, lane, mi.UInt32(0), slot, si, active, opl, throughput)
+        first = mi.UInt32(0)
+        _connect(settings, transport, histogram, in_spot, lane, first, slot, si, active, opl, throughput, origin, leg)
     else:
         laser = mi.UInt32(0)
         while dr.hint(laser < transport.n_lasers, exclude=[settings, transport, histogram]):
-            _connect(settings, transport, histogram, in_spot, lane, laser, slot, si, active, opl, throughput)
+            _connect(
+                settings, transport, histogram, in_spot, lane, laser, slot, si, active, opl, throughput, origin, leg
+            )
             laser += 1
 
 
@@ -58,6 +70,8 @@ def _connect(
     active: mi.Bool,
     opl: mi.Float,
     throughput: mi.Spectrum,
+    origin: mi.Point3f,
+    leg: mi.Vector3f,
 ) -> None:
     built = transport.built
     context = mi.BSDFContext()
@@ -67,21 +81,29 @@ def _connect(
         lit.p = lit.p + lit.to_world(in_spot)
         # what a spot loses over the wall's edge lights nothing
         active = active & built.wall_shape.ray_test(mi.Ray3f(lit.p + 1e-2 * lit.n, -lit.n), active=active)
-    to_laser = lit.p - si.p
+    to_laser = (lit.p - origin) - leg
     distance2 = dr.squared_norm(to_laser)
     distance = dr.sqrt(distance2)
     direction = to_laser / distance
     bsdf = si.bsdf()
-    reflected, pdf = bsdf.eval_pdf(context, si, si.to_local(direction), active)
-    emitted = built.wall_bsdf.eval(context, lit, lit.to_local(-direction), active)  # includes the laser point's cosine
+    wo, towards = si.to_local(direction), lit.to_local(-direction)
+    reflected, pdf = bsdf.eval_pdf(context, si, wo, active)
+    reflected = si.to_world_mueller(reflected, -wo, si.wi)
+    # light comes from the laser at wi and leaves along wo, which matters to polarised light alone
+    from_laser = mi.BSDFContext(mi.TransportMode.Importance) if mi.is_polarized else context
+    emitted = built.wall_bsdf.eval(from_laser, lit, towards, active)  # includes the laser point's cosine
+    emitted = lit.to_world_mueller(emitted, -lit.wi, towards)
     value = throughput * reflected * emitted / distance2
     if settings.finds_spot:
         # balance heuristic against finding the same point of the spot by the next ray
         share = dr.select(si.shape == mi.ShapePtr(built.wall_shape), 1 - settings.hidden_fraction, 1.0)
         cosine = dr.maximum(dr.dot(lit.n, -direction), 0)
         value *= _balance(distance2, share * pdf * cosine * dr.pi * settings.spot_radius**2)
-    active = active & dr.any(value > 0)  # not in place: the caller's mask serves the other lasers, too
-    active &= ~built.scene.ray_test(connection_segment(si, direction, lit.p), coherent=False, active=active)
+    active = active & dr.any(
+        mi.unpolarized_spectrum(value) > 0
+    )  # not in place: the caller's mask serves the other lasers, too
+    if settings.needs_visibility:
+        active &= ~built.scene.ray_test(connection_segment(built, si, direction, lit), coherent=False, active=active)
     bins = delay_bin(transport, points, opl + distance)
     histogram.deposit(lane, laser, slot, bins, value, active)
 
@@ -147,32 +169,56 @@ def _on_disc(generator: mi.PCG32, active: mi.Bool) -> mi.Vector3f:
     return mi.Vector3f(point.x, point.y, 0)
 
 
-def offset_origin(si: mi.SurfaceInteraction3f, direction: mi.Vector3f) -> mi.Point3f:
-    """Return where a ray that leaves a surface in ``direction`` starts: a little off the surface, on the ray's side."""
+def offset_origin(built: BuiltScene, si: mi.SurfaceInteraction3f, direction: mi.Vector3f) -> mi.Point3f:
+    """Return where a ray that leaves a surface in ``direction`` starts: a little off the surface, on the ray's side.
+
+    Points of a planar wall need no offset, and surfaces close to it one that stays before it: nothing is too near to
+    the wall to be met, or to be lit.
+    """
     scale = RAY_OFFSET * (1 + dr.max(dr.abs(si.p)))
-    return si.p + si.n * dr.mulsign(mi.Float(scale), dr.dot(si.n, direction))
+    side = dr.dot(si.n, direction)
+    if not built.wall.is_planar:
+        return si.p + si.n * dr.mulsign(mi.Float(scale), side)
+    scale = dr.minimum(scale, HEIGHT_SHARE * dr.abs(si.p.z) / dr.maximum(dr.abs(si.n.z), HEIGHT_SHARE))
+    origin = si.p + si.n * dr.mulsign(mi.Float(scale), side)
+    on_wall = si.shape == mi.ShapePtr(built.wall_shape)
+    origin.z = dr.select(on_wall, dr.mulsign(mi.Float(WALL_OFFSET), direction.z), origin.z)
+    return origin
 
 
-def on_tangent_plane(
-    si: mi.SurfaceInteraction3f, origin: mi.Point3f, direction: mi.Vector3f, all_flat: bool
-) -> mi.Point3f:
-    """Return where a ray from ``origin`` itself meets the surface that was found by the ray offset from it.
+def off_the_wall(built: BuiltScene, wall_point: mi.SurfaceInteraction3f) -> mi.Point3f:
+    """Return where a ray starts that leaves a laser or sensor point on the lit side."""
+    return wall_point.p + wall_point.n * (WALL_OFFSET if built.wall.is_planar else RAY_OFFSET)
+
+
+def leg_to_tangent_plane(
+    built: BuiltScene, si: mi.SurfaceInteraction3f, origin: mi.Point3f, direction: mi.Vector3f
+) -> mi.Vector3f:
+    """Return the way from ``origin`` to the surface that a ray found which started at the ray offset from it.
 
     The offset shortens the way to a surface close by: 4e-5 m of a 2 m wall are 4 % of H 1 mm in front of it. Where
     the ray grazes the surface, or the surface is curved or lies within the offset, the point that was found has to do.
-    ``all_flat`` tells that the scene has no curved surfaces, and saves asking the one that was found.
     """
     along = dr.dot(si.n, direction)
-    way = dr.dot(si.n, si.p - origin) / along
+    found = si.p - origin
+    way = dr.dot(si.n, found) / along
     trusted = (dr.abs(along) > LEAST_COSINE) & (way > 0) & si.is_valid()
-    if not all_flat:
+    if not built.all_flat:  # otherwise there is no need to ask the surface that was found
         trusted &= si.shape.is_mesh()
-    return dr.select(trusted, origin + direction * way, si.p)
+    return dr.select(trusted, direction * way, found)
 
 
-def connection_segment(si: mi.SurfaceInteraction3f, direction: mi.Vector3f, point: mi.Point3f) -> mi.Ray3f:
-    """Ray from the surface to ``point``, which lies in ``direction``, ending just before it."""
-    origin = offset_origin(si, direction)
+def connection_segment(
+    built: BuiltScene, si: mi.SurfaceInteraction3f, direction: mi.Vector3f, wall_point: mi.SurfaceInteraction3f
+) -> mi.Ray3f:
+    """Ray between a surface and a point of the wall, which lies in ``direction`` from it.
+
+    From a planar wall, where it needs no offset, to the ray offset from the surface; else from the surface, ending
+    just before the wall.
+    """
+    origin, point = offset_origin(built, si, direction), wall_point.p
     # aimed from the offset origin: a parallel ray would pass beside the point, behind the wall at oblique incidence
     distance = dr.norm(point - origin)
+    if built.wall.is_planar:
+        return mi.Ray3f(off_the_wall(built, wall_point), (origin - point) / distance, distance, mi.Float(0), [])
     return mi.Ray3f(origin, (point - origin) / distance, distance - 2 * RAY_OFFSET * (1 + distance), mi.Float(0), [])

@@ -14,8 +14,13 @@ from numpy.typing import NDArray
 
 from nlosrender.capture.grids import Capture
 from nlosrender.capture.time_axis import TimeAxis
-from nlosrender.scene.build import BuiltScene
+from nlosrender.errors import RenderError
+from nlosrender.scene.build import WALL_ID, BuiltScene
 from nlosrender.scene.pose import Float64
+
+MESH_LIFT = 1e-4  # engine units: less than any fold of a mesh wall, far more than the rounding of its points
+MESH_NUDGE = 1e-6  # engine units: off the edges of its triangles, where rays may slip through
+SAME_FACE = 1 - 1e-5  # least cosine between the normals of a face in float32 and float64
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,7 +66,10 @@ def _wall_points(
     point = mi.Point3f((positions / built.unit).T.astype(np.float32))
     normal = mi.Vector3f(normals.T.astype(np.float32))
     # The wall's own intersection gives shading frame and texture coordinates for every wall type and BSDF.
-    interaction = built.wall_shape.ray_intersect(mi.Ray3f(point + 1e-2 * normal, -normal))
+    if built.wall_shape.class_name() == "Mesh":
+        interaction = _on_mesh(built, point, normal)
+    else:
+        interaction = built.wall_shape.ray_intersect(mi.Ray3f(point + 1e-2 * normal, -normal))
     interaction.p = point  # the exact grid point, not where a float32 ray met the wall
     to_device = device - positions
     to_device /= np.maximum(np.linalg.norm(to_device, axis=-1, keepdims=True), 1e-300)
@@ -74,3 +82,26 @@ def _wall_points(
     )
     dr.eval(points.interaction, points.delay_bins, points.delay_fraction)
     return points
+
+
+def _on_mesh(built: BuiltScene, point: mi.Point3f, normal: mi.Vector3f) -> mi.SurfaceInteraction3f:
+    """Return where points of a mesh wall lie on the faces with these normals.
+
+    Only a scene can intersect a mesh: one of the wall alone. Points on an edge are looked for beside it, too.
+    """
+    alone = mi.load_dict({"type": "scene", WALL_ID: built.wall_shape})
+    frame = mi.Frame3f(normal)
+    interaction, found = dr.zeros(mi.SurfaceInteraction3f, dr.width(point)), mi.Bool(False)
+    for along, across in ((0, 0), (1, 0), (-1, 0), (0, 1), (0, -1)):
+        beside = point + MESH_NUDGE * (along * frame.s + across * frame.t)
+        hit = alone.ray_intersect(mi.Ray3f(beside + MESH_LIFT * normal, -normal))
+        is_own = hit.is_valid() & (dr.dot(hit.n, normal) > SAME_FACE)
+        interaction = dr.select(is_own & ~found, hit, interaction)
+        found = found | is_own
+    if not dr.all(found):
+        missing = np.array(point).T[~np.array(found)][0] * built.unit
+        raise RenderError(
+            f"the wall's mesh is so fine at ({missing[0]:.6g}, {missing[1]:.6g}, {missing[2]:.6g}) m of its frame that "
+            "float32 does not find the point on it; use larger triangles there"
+        )
+    return interaction

@@ -9,16 +9,16 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import drjit as dr
 
-from nlosrender.capture.bounces import THIRD_BOUNCE, BounceAxis
+from nlosrender.capture.bounces import FIRST_BOUNCE, THIRD_BOUNCE, BounceAxis
 from nlosrender.capture.grids import Capture
 from nlosrender.capture.plan import Batch, Plan, Tile
+from nlosrender.engine.engines import Engine, SamplingEngine
 from nlosrender.engine.histogram import Histogram, relative_l2_error
 from nlosrender.engine.memory import n_pairs
-from nlosrender.engine.path_engine import PathEngine
 from nlosrender.engine.sampling import DEFAULT_TARGET, FIRST_SAMPLES, Budget
 from nlosrender.engine.skipped import traces_paths
 from nlosrender.engine.virtual_lights.engine import VirtualLightEngine
@@ -41,9 +41,7 @@ class TimeEstimate:
     lit_shares: tuple[float | None, ...] | None = None  # per bounce slot: bins with light in the pilot; None: no pilot
 
 
-def estimate_render_time(
-    engine: PathEngine | VirtualLightEngine, plan: Plan, budget: Budget, lanes: int
-) -> TimeEstimate:
+def estimate_render_time(engine: Engine, plan: Plan, budget: Budget, lanes: int) -> TimeEstimate:
     """Run a pilot of about ``PILOT_SECONDS`` per technique and extrapolate it to the whole capture.
 
     Parameters
@@ -88,7 +86,7 @@ def estimate_render_time(
     return TimeEstimate(seconds, basis if parts else "nothing to compute", lit_shares)
 
 
-def pilot_batch(engine: PathEngine | VirtualLightEngine, plan: Plan) -> Batch:
+def pilot_batch(engine: Engine, plan: Plan) -> Batch:
     """Return the middle of the plan's middle batch: as many sensor points as a pilot can take, then as many lasers."""
     batch = plan.batches[len(plan.batches) // 2]
     most = PILOT_BYTES / (plan.bytes_per_batch / max(b.sensors.size for b in plan.batches))
@@ -124,7 +122,7 @@ def _middle(tile: Tile, most: int) -> Tile:
 
 
 def _path_seconds(
-    paths: PathEngine, plan: Plan, pilot: Batch, budget: Budget, lanes: int, known_squares: float
+    paths: SamplingEngine, plan: Plan, pilot: Batch, budget: Budget, lanes: int, known_squares: float
 ) -> tuple[float | None, Histogram]:
     """Return the seconds of path tracing, None when the pilot is nothing but noise, and what the pilot saw."""
     paths.render(pilot, Budget(spp=1))  # compiles
@@ -165,6 +163,8 @@ def _lit_shares(pilot: Histogram, bounces: BounceAxis) -> tuple[float | None, ..
     """Return the share of bins with light per bounce slot; the third bounce's is known better from geometry."""
     if not bounces.split:
         return None
+    if bounces.first != FIRST_BOUNCE:
+        return tuple(float((pilot.mean[:, slot] > 0).mean()) for slot in range(bounces.n_slots))
     shares = [float((pilot.mean[:, slot] > 0).mean()) for slot in range(bounces.n_slots)]
     third = bounces.slot(THIRD_BOUNCE)
     return tuple(None if slot == third else share for slot, share in enumerate(shares))
@@ -177,18 +177,22 @@ def _light_seconds(engine: VirtualLightEngine, plan: Plan, pilot: Batch, budget:
     settling = time.perf_counter() - begun
     part = _middle(pilot.sensors, max(1, pilot.sensors.size // 4))
     quarter = Batch(part, part if engine.capture.scan_type == "confocal" else pilot.lasers)
-    fineness, rounds = settled.fineness or FIRST_COARSENESS, settled.rounds or 0
-    third = engine.third.gather(pilot, fineness)  # compiles
-    seconds = _extrapolated(engine, plan, pilot, quarter, lambda batch: engine.third.pair(batch, fineness))
-    further = engine.further
-    if further is not None and rounds:
-        further.accumulate(pilot, further.histogram(pilot, plan.replicas), 0)
+    fineness = settled.fineness or FIRST_COARSENESS
+    third = engine.third.gather(pilot, fineness)
+    if traces_paths(engine):
+        seconds = _extrapolated(engine, plan, pilot, quarter, lambda batch: engine.third.pair(batch, fineness))
+    else:  # all that a render does, with one round of walks; the other rounds add up
+        once = replace(settled, rounds=1, target_error=None, time_limit_s=None)
+        engine.render(quarter, once)  # compiles
+        seconds = _extrapolated(engine, plan, pilot, quarter, lambda batch: engine.render(batch, once))
+    further, rounds = engine.further, settled.rounds or 0
+    if further is not None and rounds > 1:
 
         def walk(batch: Batch) -> None:
             further.accumulate(batch, further.histogram(batch, plan.replicas), 0)
             dr.sync_thread()
 
-        seconds += rounds * _extrapolated(engine, plan, pilot, quarter, walk)
+        seconds += (rounds - 1) * _extrapolated(engine, plan, pilot, quarter, walk)
     return settling + seconds, third.squares
 
 

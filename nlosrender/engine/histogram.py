@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nlosrender.capture.relative_error import relative_l2_error
+from nlosrender.engine.temporal_kernel import TemporalKernel
 
 
 @dataclass(frozen=True)
@@ -52,10 +53,18 @@ class HistogramShape:
 
 
 class DeviceHistogram:
-    """Deposits of a batch, summed per lane in float64."""
+    """Deposits of a batch, summed per lane in float64.
 
-    def __init__(self, shape: HistogramShape):
-        self.shape = shape
+    Parameters
+    ----------
+    shape
+        Its sizes.
+    kernel
+        Spreads what was summed over time before statistics are taken; None: nothing is spread.
+    """
+
+    def __init__(self, shape: HistogramShape, kernel: TemporalKernel | None = None):
+        self.shape, self.kernel = shape, kernel
         self.sums = dr.zeros(mi.Float64, shape.size)
         dr.make_opaque(self.sums)
 
@@ -74,8 +83,10 @@ class DeviceHistogram:
         entry = dr.select(inside, mi.UInt32(bins), mi.UInt32(shape.n_bins))
         row = (lane * shape.lasers + laser) * shape.slots + slot
         for channel in range(shape.channels):
+            # a Mueller matrix meets unpolarised light: its first column is a Stokes vector
+            carried = value[channel, 0][0] if mi.is_polarized else value[channel]
             index = (row * shape.channels + channel) * shape.row + entry
-            dr.scatter_add(self.sums, mi.Float64(value[channel]), index, active, dr.ReduceMode.NoConflicts)
+            dr.scatter_add(self.sums, mi.Float64(carried), index, active, dr.ReduceMode.NoConflicts)
 
     def statistics(
         self, samples_per_lane: int, scale: float = 1.0, slots: range | None = None
@@ -123,7 +134,11 @@ class DeviceHistogram:
         own = (slot >= 0) & (slot < shape.slots)
         row = ((sensor * shape.lasers + laser) * shape.slots + mi.UInt32(slot)) * shape.channels + channel
         start = row * shape.row + entry
-        return [dr.gather(mi.Float64, self.sums, start + r * size, own) * scale for r in range(shape.replicas)]
+        replicas = [dr.gather(mi.Float64, self.sums, start + r * size, own) * scale for r in range(shape.replicas)]
+        if self.kernel is not None:
+            dr.eval(replicas)
+            replicas = [self.kernel.smoothed(replica, shape.row) for replica in replicas]
+        return replicas
 
     def relative_error(self, samples_per_lane: int, known_squares: float = 0.0) -> float:
         """Return the estimated relative L2 error of H inside the time window.

@@ -9,7 +9,7 @@ from dataclasses import replace
 from nlosrender.capture.grids import Capture
 from nlosrender.capture.plan import BYTES_PER_SUM, MOST_SUMS, Batch, Plan
 from nlosrender.engine.backend import batch_memory, physical_memory
-from nlosrender.engine.path_engine import PathEngine
+from nlosrender.engine.engines import Engine
 from nlosrender.engine.skipped import traces_paths
 from nlosrender.engine.virtual_lights.engine import VirtualLightEngine
 from nlosrender.engine.virtual_lights.third_bounce import FIRST_COARSENESS, REFINEMENT
@@ -18,7 +18,7 @@ from nlosrender.errors import RenderError
 PATCH_BYTES = 400  # float64 on the host, while they are cut and joined, and float32 on the device
 
 
-def batch_bytes(engine: PathEngine | VirtualLightEngine, plan: Plan) -> int:
+def batch_bytes(engine: Engine, plan: Plan) -> int:
     """Return the memory of the largest batch [bytes]: histograms, their statistics and copies.
 
     Raises
@@ -28,8 +28,7 @@ def batch_bytes(engine: PathEngine | VirtualLightEngine, plan: Plan) -> int:
     """
     largest = max(plan.batches, key=lambda batch: n_pairs(engine.capture, batch))
     paths = engine.paths if isinstance(engine, VirtualLightEngine) else engine
-    bounces = engine.options.bounces
-    entries = paths.shape(largest, max(1, bounces.n_slots - 1) if bounces.split else 1).size
+    entries = paths.shape(largest, paths.n_slots).size
     gathered = 0
     if isinstance(engine, VirtualLightEngine):
         fewest = min(plan.batches, key=lambda batch: batch.sensors.size)
@@ -41,9 +40,7 @@ def batch_bytes(engine: PathEngine | VirtualLightEngine, plan: Plan) -> int:
     return max(plan.bytes_per_batch, gathered * BYTES_PER_SUM)
 
 
-def memory_warnings(
-    engine: PathEngine | VirtualLightEngine, plan: Plan, memory_limit: int | None, lanes: int
-) -> Iterator[str]:
+def memory_warnings(engine: Engine, plan: Plan, memory_limit: int | None, lanes: int) -> Iterator[str]:
     """Yield what is surprising about the memory of a render.
 
     Parameters

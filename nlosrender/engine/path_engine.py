@@ -27,8 +27,11 @@ from nlosrender.engine.sampling import (
     settled_by_pilot,
 )
 from nlosrender.engine.second_bounce import deposit_second_bounce
+from nlosrender.engine.strata import Strata
 from nlosrender.engine.surface_sampler import SurfaceSampler
+from nlosrender.engine.temporal_kernel import TemporalKernel
 from nlosrender.engine.transport import LaneRandomness, PathSettings, Transport
+from nlosrender.engine.virtual_lights.occlusion import nothing_occludes
 from nlosrender.errors import RenderError
 from nlosrender.scene.build import BuiltScene
 
@@ -47,6 +50,7 @@ class PathOptions:
     channels: int = 1
     seed: int = 0
     replicas: int = 2
+    temporal_kernel_bins: float = 0.0  # full width of the kernel in time [bins]; 0: a plain histogram
     hidden_fraction: float | None = None  # share of hidden geometry sampling on the wall; None: chosen from the scene
 
 
@@ -88,11 +92,13 @@ class PathEngine:
             laser_sampling=options.laser_sampling,
             russian_roulette=options.russian_roulette,
             spot_radius=capture.laser_spot_radius / built.unit,
+            needs_visibility=not self._sees_everything(),
             has_transmission=any(bool(flag & mi.BSDFFlags.Transmission) for flag in flags),
         )
         self.integrator = load_path_integrator(self.settings)
         # Throughput is per (engine unit)^2: H falls with the square of a scene's size.
         self.scale = capture.laser_energy / built.unit**2
+        self.kernel = TemporalKernel(options.temporal_kernel_bins) if options.temporal_kernel_bins > 0 else None
         self.compile_seconds = 0.0
 
     def render(
@@ -122,7 +128,7 @@ class PathEngine:
             The batch is too large for 32-bit indices, or the result is not finite.
         """
         bounces = self.options.bounces
-        shape = self.shape(batch, max(1, bounces.n_slots - 1) if bounces.split else 1)
+        shape = self.shape(batch, self.n_slots)
         if shape.size > MOST_SUMS:
             raise RenderError(
                 f"a batch of {shape.size:.2e} sums is more than 32-bit indices reach; lower render.memory_limit"
@@ -135,7 +141,7 @@ class PathEngine:
             axes = (shape.channels, bounces.n_slots, shape.lasers, shape.sensors, shape.row)
             mean, variance, per_lane = np.zeros(axes), np.zeros(axes), 0
         if not self.built.wall.is_planar:
-            mean[:, :1] += self._second_bounce(batch, transport)
+            mean[:, :1] += self.second_bounce(batch)
         if not (np.isfinite(mean).all() and np.isfinite(variance).all()):
             raise RenderError("the path engine produced a value that is not finite; please report the configuration")
         return Histogram(mean[..., :-1], variance[..., :-1], mean[..., -1], per_lane * shape.replicas)
@@ -157,15 +163,21 @@ class PathEngine:
         if not self._has_bounces:
             return budget
         pilot = pilot_of(self.capture)
-        bounces = self.options.bounces
-        slots = max(1, bounces.n_slots - 1) if bounces.split else 1
-        shape = replace(self.shape(pilot, slots), replicas=pilot_replicas(self.options.replicas, pilot.sensors.size))
+        shape = replace(
+            self.shape(pilot, self.n_slots), replicas=pilot_replicas(self.options.replicas, pilot.sensors.size)
+        )
         transport = self.transport(pilot, shape)
 
         def look(schedule: Schedule) -> int:
             return self._accumulate(pilot, shape, transport, schedule, lambda share: None)[2]
 
         return settled_by_pilot(budget, shape.replicas, look, known_squares)
+
+    @property
+    def n_slots(self) -> int:
+        """Bounce slots that are sampled: all but that of the second bounce, which is computed."""
+        bounces = self.options.bounces
+        return max(1, bounces.n_slots - 1) if bounces.split else 1
 
     @property
     def _has_bounces(self) -> bool:
@@ -175,13 +187,20 @@ class PathEngine:
     def _accumulate(
         self, batch: Batch | Pilot, shape: HistogramShape, transport: Transport, schedule: Schedule, progress: Progress
     ) -> tuple[np.ndarray, np.ndarray, int]:
+        stage, strata = range(0), Strata.of_stage(range(0), mi.UInt32(0))
+
         def launch(histogram: DeviceHistogram, randomness: LaneRandomness, more: int) -> LaneRandomness:
-            return self.integrator.accumulate(transport, histogram, randomness, more)
+            nonlocal stage, strata
+            if stage != schedule.stage:
+                stage, strata = schedule.stage, Strata.of_stage(schedule.stage, randomness.sequence[0])
+            randomness, strata = self.integrator.accumulate(transport, histogram, randomness, strata, more)
+            return randomness
 
         bounces, points = self.options.bounces, self.sensor_indices(batch)
         first = 1 if bounces.split else 0  # the second bounce has slot 0
         slots = range(-first, bounces.n_slots - first)
-        result = accumulate(shape, points, self.options.seed, launch, schedule, progress, self.scale, slots)
+        seed, kernel = self.options.seed, self.kernel
+        result = accumulate(shape, points, seed, launch, schedule, progress, self.scale, slots, kernel)
         self.compile_seconds += result.compile_seconds
         return result.mean, result.variance, result.per_lane
 
@@ -214,17 +233,11 @@ class PathEngine:
             bins_per_unit=dr.opaque(mi.Float, self.built.unit / self.time_axis.bin_width_opl),
         )
 
-    def _second_bounce(self, batch: Batch, transport: Transport) -> np.ndarray:
+    def second_bounce(self, batch: Batch) -> np.ndarray:
         """Return the second bounce (channel, 1, laser, sensor, row): exact, so one replica computes it."""
         shape = replace(self.shape(batch, 1), replicas=1)
-        lanes = dr.arange(mi.UInt32, shape.lanes)
-        single = replace(
-            transport,
-            sensors=transport.sensors.gather(lanes),
-            first_laser=dr.gather(mi.UInt32, transport.first_laser, lanes),
-        )
         histogram = DeviceHistogram(shape)
-        deposit_second_bounce(single, histogram)
+        deposit_second_bounce(self.transport(batch, shape), histogram)
         return histogram.on_host(histogram.total(self.scale))
 
     def sensor_indices(self, batch: Batch | Pilot) -> np.ndarray:
@@ -249,6 +262,16 @@ class PathEngine:
         if only_hidden and distance > 0 and self.sampler.area < NEAR_RATIO * math.pi * distance**2:
             return 1.0
         return 0.0 if self._surrounded_share() > SURROUNDED else 0.5
+
+    def _sees_everything(self) -> bool:
+        """Return whether a surface that faces a point of the wall is never hidden from it."""
+        shapes = self.built.hidden_shapes
+        # what lights a back side passes through the object; shading normals may light a little of it
+        through = mi.BSDFFlags.Transmission | mi.BSDFFlags.BackSide
+        if any(bool(shape.bsdf().flags() & through) for shape in shapes):
+            return False
+        smooth = any(shape.is_mesh() and shape.has_vertex_normals() for shape in shapes)
+        return not smooth and nothing_occludes(self.built)
 
     def _surrounded_share(self) -> float:
         """Return the cosine-weighted share of directions from the sensor points that meet hidden geometry."""

@@ -16,9 +16,11 @@ import drjit as dr
 import mitsuba as mi
 
 from nlosrender.capture.bounces import FIRST_BOUNCE, BounceAxis
-from nlosrender.engine.connections import connect_to_lasers, deposit_spot, offset_origin, on_tangent_plane
+from nlosrender.engine.connections import connect_to_lasers, deposit_spot, leg_to_tangent_plane, offset_origin
+from nlosrender.engine.direct_paths import are_direct, trace_direct_paths
 from nlosrender.engine.histogram import DeviceHistogram
 from nlosrender.engine.low_discrepancy import recurrence_steps
+from nlosrender.engine.strata import Strata, first_coordinate
 from nlosrender.engine.transport import HIGHEST_SURVIVAL, LaneRandomness, PathSettings, Transport
 
 PLUGIN_NAME = "nlos_path"
@@ -30,8 +32,9 @@ def trace_paths(
     transport: Transport,
     histogram: DeviceHistogram,
     randomness: LaneRandomness,
+    strata: Strata,
     n_samples: mi.UInt32,
-) -> LaneRandomness:
+) -> tuple[LaneRandomness, Strata]:
     """Trace ``n_samples`` more paths per lane and deposit what they carry; return the advanced random state.
 
     Throughput is in units of radiance per (engine unit)^-2; the caller scales by energy and unit.
@@ -42,12 +45,14 @@ def trace_paths(
     context = mi.BSDFContext()
     lane = dr.arange(mi.UInt32, dr.width(sensors.delay_bins))
     q = settings.hidden_fraction  # probability of hidden geometry sampling at a wall vertex
-    steps = recurrence_steps(3) if 0 < q < 1 else (*recurrence_steps(2), 1)  # the third chooses the technique
+    steps = recurrence_steps(2) if 0 < q < 1 else (*recurrence_steps(1), 1)  # the second chooses the technique
+    stride = strata.stride
     max_bounces, last_vertex = settings.bounces.max_bounces, settings.last_vertex
 
     # ---- State -------------------------------------------------------------------------------------------------
     generator = mi.PCG32(randomness.generator)
-    seq_u, seq_v, seq_t = (mi.UInt32(start) for start in randomness.sequence)
+    at = mi.UInt64(strata.at)
+    seq_v, seq_t = (mi.UInt32(start) for start in randomness.sequence[1:])
     started = mi.UInt32(0)  # paths begun by this lane
     alive = mi.Bool(False)  # a ray is under way
     ray = dr.zeros(mi.Ray3f)
@@ -70,17 +75,20 @@ def trace_paths(
         # ---- Intersect -----------------------------------------------------------------------------------------
         si = scene.ray_intersect(ray, mi.RayFlags.All, coherent=False, active=alive)
         hit = alive & si.is_valid()
-        si.p = dr.select(has_target, si.p, on_tangent_plane(si, origin, ray.d, built.all_flat))
-        distance2 = dr.squared_norm(si.p - origin)
+        leg = dr.select(has_target, si.p - origin, leg_to_tangent_plane(built, si, origin, ray.d))
+        si.p = origin + leg
+        distance2 = dr.squared_norm(leg)
         distance = dr.sqrt(distance2)
         if dr.hint(q > 0, mode="scalar"):
             # occluded: the ray met something in front of the sampled point
             hit &= ~has_target | sampler.reached(si, target, target_shape, target_primitive)
         on_wall = si.shape == wall
+        if dr.hint(built.wall.is_planar, mode="scalar"):
+            si.p.z = dr.select(on_wall, 0, si.p.z)  # exactly: rays that leave the wall there need no offset
         density = mi.Float(bsdf_density)
         if dr.hint(q > 0, mode="scalar"):
             # not along the ray: its offset origin matters where hidden geometry comes close to the wall
-            cosine = dr.abs(dr.dot(si.n, si.p - origin)) / distance
+            cosine = dr.abs(dr.dot(si.n, leg)) / distance
             jacobian = dr.select(sampler.covers(si, wall), distance2 / dr.maximum(cosine, 1e-9), 0)
             density += hidden_density * jacobian
         opl += medium * distance
@@ -106,7 +114,7 @@ def trace_paths(
 
         throughput = dr.select(hit, throughput * value / density, 0)
         bounce += 1
-        hit &= dr.any(throughput != 0)
+        hit &= dr.any(mi.unpolarized_spectrum(throughput) != 0)
 
         # ---- Connect to the lasers and deposit ---------------------------------------------------------------------
         if dr.hint(settings.laser_sampling, mode="scalar"):
@@ -115,7 +123,9 @@ def trace_paths(
                 in_reach &= bounce >= settings.first_bounce
             if dr.hint(settings.goes_on and max_bounces is not None, mode="scalar"):
                 in_reach &= bounce <= max_bounces
-            connect_to_lasers(settings, transport, histogram, generator, lane, si, in_reach, bounce, opl, throughput)
+            connect_to_lasers(
+                settings, transport, histogram, generator, lane, si, in_reach, bounce, opl, throughput, origin, leg
+            )
 
         # ---- Continue, or start the next path ----------------------------------------------------------------------
         go_on = mi.Bool(hit)
@@ -128,25 +138,26 @@ def trace_paths(
         alive = go_on | start
         if dr.hint(settings.goes_on, mode="scalar"):
             vertex = dr.select(start, sensors.interaction, si)
-            throughput = dr.select(start, mi.Spectrum(1), throughput)
+            throughput = dr.select(start, _at_sensor(sensors.interaction), throughput)
             opl = dr.select(start, 0, opl)
             bounce = dr.select(start, mi.UInt32(FIRST_BOUNCE), bounce)
             medium = dr.select(start, 1, medium)
         else:
             vertex = sensors.interaction
-            throughput, opl, bounce, medium = mi.Spectrum(1), mi.Float(0), mi.UInt32(FIRST_BOUNCE), mi.Float(1)
+            throughput = _at_sensor(sensors.interaction)
+            opl, bounce, medium = mi.Float(0), mi.UInt32(FIRST_BOUNCE), mi.Float(1)
         on_wall = vertex.shape == wall
 
         # ---- Sample the next direction -----------------------------------------------------------------------------
-        seq_u = dr.select(start, seq_u + steps[0], seq_u)
-        seq_v = dr.select(start, seq_v + steps[1], seq_v)
-        seq_t = dr.select(start, seq_t + steps[2], seq_t)
-        bits_u, bits_v, bits_t = mi.UInt32(seq_u), mi.UInt32(seq_v), mi.UInt32(seq_t)
+        bits_u, bits_v, bits_t = first_coordinate(at), mi.UInt32(seq_v), mi.UInt32(seq_t)
         if dr.hint(settings.goes_on, mode="scalar"):
             # A lane draws only what its path uses: numbers drawn while it idles would depend on how launches are cut.
-            bits_u = dr.select(start, seq_u, generator.next_uint32(go_on))
+            bits_u = dr.select(start, bits_u, generator.next_uint32(go_on))
             bits_v = dr.select(start, seq_v, generator.next_uint32(go_on))
             bits_t = dr.select(start, seq_t, generator.next_uint32(go_on))
+        at = dr.select(start, at + stride, at)
+        seq_v = dr.select(start, seq_v + steps[0], seq_v)
+        seq_t = dr.select(start, seq_t + steps[1], seq_t)
         u, v, t = _unit_interval(bits_u), _unit_interval(bits_v), _unit_interval(bits_t)
         has_target = alive & on_wall & (t < q)
         by_bsdf = alive & ~has_target
@@ -160,11 +171,12 @@ def trace_paths(
             lobe = generator.next_float32(by_bsdf)
             bs, weight = bsdf.sample(context, vertex, lobe, mi.Point2f(u, v), by_bsdf)
             wo = bs.wo
+            weight = vertex.to_world_mueller(weight, -wo, vertex.wi)
             is_delta = by_bsdf & mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
             share = dr.select(on_wall, 1 - q, 1.0)
             bsdf_density = dr.select(is_delta, share, share * bs.pdf)
             value = dr.select(is_delta, weight, weight * bs.pdf)
-            survival = dr.select(by_bsdf, dr.minimum(dr.max(weight), HIGHEST_SURVIVAL), 1)
+            survival = dr.select(by_bsdf, dr.minimum(dr.max(mi.unpolarized_spectrum(weight)), HIGHEST_SURVIVAL), 1)
             if dr.hint(settings.has_transmission, mode="scalar"):
                 medium = dr.select(by_bsdf & (bs.eta > 0), medium * bs.eta, medium)
         if dr.hint(q > 0, mode="scalar"):
@@ -175,9 +187,9 @@ def trace_paths(
                 dark = start & (dr.dot(sample.n, target - vertex.p) >= 0)
                 while dr.hint(dark & (started < n_samples), exclude=[sampler, sensors, vertex]):
                     started += 1
-                    seq_u += steps[0]
-                    seq_v += steps[1]
-                    again = sampler.sample(seq_u, _unit_interval(seq_v), dark)
+                    again = sampler.sample(first_coordinate(at), _unit_interval(seq_v), dark)
+                    at += stride
+                    seq_v += steps[0]
                     target, target_shape, target_primitive = again.p, again.shape, again.primitive
                     dark = dr.dot(again.n, target - vertex.p) >= 0
                 alive &= ~dark
@@ -186,6 +198,7 @@ def trace_paths(
             direction = to_target * dr.rsqrt(dr.squared_norm(to_target))
             local = vertex.to_local(direction)
             f, pdf = wall_bsdf.eval_pdf(context, vertex, local, has_target)
+            f = vertex.to_world_mueller(f, -local, vertex.wi)
             wo = dr.select(has_target, local, wo)
             value = dr.select(has_target, f, value)
             bsdf_density = dr.select(has_target, (1 - q) * pdf, bsdf_density)
@@ -195,16 +208,28 @@ def trace_paths(
             survival = dr.select(start | (bounce < settings.first_bounce), 1, survival)
             alive &= generator.next_float32(alive & ~start) < survival
             value /= dr.maximum(survival, 1e-9)
-        alive &= dr.any(value != 0)
+        alive &= dr.any(mi.unpolarized_spectrum(value) != 0)
         world = vertex.to_world(wo)
         origin = mi.Point3f(vertex.p)
-        ray_origin = offset_origin(vertex, world)
+        ray_origin = offset_origin(built, vertex, world)
         if dr.hint(q > 0, mode="scalar"):
             # from the offset origin: a parallel ray would land beside the target, in another triangle of a fine mesh
             world = dr.select(has_target, dr.normalize(target - ray_origin), world)
         ray = mi.Ray3f(ray_origin, world)
 
-    return LaneRandomness(generator, [seq_u, seq_v, seq_t])
+    return LaneRandomness(generator, [randomness.sequence[0], seq_v, seq_t]), Strata(at, stride)
+
+
+def _at_sensor(point: mi.SurfaceInteraction3f) -> mi.Spectrum:
+    """Return the throughput paths start with: polarised, the turn from the implicit Stokes frame to the sensor's.
+
+    The reference direction is the sensor's horizontal: across the ray from the sensor and the wall's y axis.
+    """
+    if not mi.is_polarized:
+        return mi.Spectrum(1)
+    out = point.to_world(point.wi)
+    horizontal = dr.normalize(dr.cross(-out, mi.Vector3f(0, 1, 0)))
+    return mi.Spectrum(mi.mueller.rotate_stokes_basis_m(out, mi.mueller.stokes_basis(out), horizontal))
 
 
 def _unit_interval(bits: mi.UInt32) -> mi.Float:
@@ -233,16 +258,24 @@ def _plugin_class(variant: str) -> type:
                 laser_sampling=bool(properties.get("laser_sampling", True)),
                 russian_roulette=bool(properties.get("russian_roulette", True)),
                 spot_radius=float(properties.get("spot_radius", 0.0)),
+                needs_visibility=bool(properties.get("needs_visibility", True)),
                 has_transmission=bool(properties.get("has_transmission", False)),
             )
 
         def accumulate(
-            self, transport: Transport, histogram: DeviceHistogram, randomness: LaneRandomness, n_samples: int
-        ) -> LaneRandomness:
+            self,
+            transport: Transport,
+            histogram: DeviceHistogram,
+            randomness: LaneRandomness,
+            strata: Strata,
+            n_samples: int,
+        ) -> tuple[LaneRandomness, Strata]:
             """Trace ``n_samples`` more paths per lane into ``histogram``; return the advanced random state."""
-            advanced = trace_paths(self.settings, transport, histogram, randomness, dr.opaque(mi.UInt32, n_samples))
-            dr.eval(histogram.sums, advanced.generator, advanced.sequence)
-            return advanced
+            trace = trace_direct_paths if are_direct(self.settings, transport.sampler) else trace_paths
+            count = dr.opaque(mi.UInt32, n_samples)
+            advanced, strata = trace(self.settings, transport, histogram, randomness, strata, count)
+            dr.eval(histogram.sums, advanced.generator, advanced.sequence, strata.at)
+            return advanced, strata
 
         def to_string(self) -> str:
             return f"NlosPathIntegrator[{self.settings}]"
@@ -264,6 +297,7 @@ def load_path_integrator(settings: PathSettings) -> mi.Integrator:
             "laser_sampling": settings.laser_sampling,
             "russian_roulette": settings.russian_roulette,
             "spot_radius": settings.spot_radius,
+            "needs_visibility": settings.needs_visibility,
             "has_transmission": settings.has_transmission,
         }
     )

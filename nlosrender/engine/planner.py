@@ -8,10 +8,13 @@ from nlosrender.capture.bounces import THIRD_BOUNCE
 from nlosrender.capture.grids import Capture
 from nlosrender.capture.time_axis import TimeAxis
 from nlosrender.config.render import RenderConfig
+from nlosrender.engine.engines import Engine
+from nlosrender.engine.line_of_sight.engine import LineOfSightEngine
 from nlosrender.engine.path_engine import PathEngine, PathOptions
 from nlosrender.engine.virtual_lights.engine import VirtualLightEngine, is_lambertian
-from nlosrender.engine.virtual_lights.tessellator import can_tessellate
+from nlosrender.engine.virtual_lights.tessellator import can_tessellate, wall_sees_itself
 from nlosrender.scene.build import BuiltScene
+from nlosrender.scene.view import BuiltView
 
 # Engine units: a surface this near to a laser or sensor point is seen under a large angle however finely it is cut.
 TOUCHING = 2e-3
@@ -19,8 +22,13 @@ MAX_TRIANGLES = 5_000_000  # of all meshes: merging them takes about 1 kB each o
 
 
 def choose_engine(
-    render: RenderConfig, built: BuiltScene, capture: Capture, time_axis: TimeAxis, options: PathOptions, lanes: int
-) -> PathEngine | VirtualLightEngine:
+    render: RenderConfig,
+    built: BuiltScene | BuiltView,
+    capture: Capture,
+    time_axis: TimeAxis,
+    options: PathOptions,
+    lanes: int,
+) -> Engine:
     """Return the engine for a scene (backend started), which knows the reason in plain words.
 
     ``auto`` takes the virtual lights where they are known to be right; asked for by name, they also take rough
@@ -33,9 +41,13 @@ def choose_engine(
     built, capture, time_axis, options, lanes
         As for the engines.
     """
+    if isinstance(built, BuiltView):
+        return LineOfSightEngine(built, capture, time_axis, options)
     reason = "asked for" if render.engine == "path" else _obstacle(render, capture, built)
     if reason is None and render.engine == "auto" and not all(is_lambertian(s.bsdf()) for s in built.hidden_shapes):
         reason = "some hidden surfaces are not Lambertian"
+    if reason is None and render.engine == "auto" and wall_sees_itself(built) and built.wall_shape.is_mesh():
+        reason = "the relay wall is a mesh that sees itself: the edges between its triangles take very many patches"
     if reason is not None:
         return PathEngine(built, capture, time_axis, options, reason=reason)
     engine = VirtualLightEngine(built, capture, time_axis, options, lanes)
@@ -48,18 +60,22 @@ def choose_engine(
 
 def _obstacle(render: RenderConfig, capture: Capture, built: BuiltScene) -> str | None:
     """Return why the virtual lights cannot render a scene; None when they can."""
+    if render.polarized:
+        return "only paths carry polarised light"
     if render.spp is not None:
         return "spp counts paths"
+    if render.temporal_kernel_opl > 0:
+        return "a temporal kernel smooths the noise of paths"
     if render.max_bounces is not None and render.max_bounces < THIRD_BOUNCE:
         return "there is no third bounce to compute"
     if not (render.laser_sampling and render.hidden_geometry_sampling):
         return "a technique of the path engine is switched off"
     if capture.laser_spot_radius > 0:
         return "the laser has a spot"
-    if built.hidden_bounds is None:
+    if built.hidden_bounds is None and not wall_sees_itself(built):
         return "there is no hidden geometry"
     if not can_tessellate(built):
-        return "the wall is curved, or a hidden shape is neither a mesh nor a sphere or cylinder"
+        return "a hidden shape is neither a mesh nor a sphere or cylinder"
     if bool(built.wall_bsdf.flags() & mi.BSDFFlags.Delta):
         return "the relay wall has a mirror lobe"
     hard = mi.BSDFFlags.Delta | mi.BSDFFlags.Transmission | mi.BSDFFlags.Null

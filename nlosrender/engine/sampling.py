@@ -16,14 +16,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nlosrender.engine.histogram import DeviceHistogram, HistogramShape
+from nlosrender.engine.temporal_kernel import TemporalKernel
 from nlosrender.engine.transport import LaneRandomness
 
 FIRST_SAMPLES = 32  # per lane, before the first look at the error
 LAUNCH_SECONDS = 0.5  # launches are kept this short, for the progress bar and Ctrl-C
 DEFAULT_TARGET = 0.01  # where neither an error nor samples are asked for
 SETTLED_SHARE = 0.9  # of the target error: the pilot's estimate has an error of its own
-PILOT_ERROR = 3.0  # times the goal: when a pilot has seen enough
-PILOT_LANES = 2048
+PILOT_ERROR = 1.5  # times the goal: when a pilot has seen enough. Low-discrepancy numbers beat the 1 / sqrt(N) beyond
+PILOT_LANES = 512
 
 Progress = Callable[[float], None]
 Launch = Callable[[DeviceHistogram, LaneRandomness, int], LaneRandomness]
@@ -67,6 +68,7 @@ def accumulate(
     progress: Progress,
     scale: float = 1.0,
     slots: range | None = None,
+    kernel: TemporalKernel | None = None,
 ) -> Sampled:
     """Launch until the schedule has enough.
 
@@ -86,8 +88,10 @@ def accumulate(
         What sums are multiplied by.
     slots
         Bounce slots of the result, as for ``DeviceHistogram.statistics``.
+    kernel
+        As for ``DeviceHistogram``.
     """
-    histogram = DeviceHistogram(shape)
+    histogram = DeviceHistogram(shape, kernel)
     lane = dr.arange(mi.UInt32, shape.lanes)
     point = dr.gather(mi.UInt32, mi.UInt32(points), lane % shape.sensors)
     randomness = LaneRandomness.seeded(seed, point * shape.replicas + lane // shape.sensors)
@@ -146,13 +150,16 @@ class Schedule:
         self.limit = math.ceil(budget.spp / replicas) if budget.spp is not None else None
         self.errors: list[tuple[int, float]] = []  # (samples per lane, relative L2 error)
         self.speed = math.inf  # samples per lane and second
+        self.stage = range(0)  # samples that are going to be complete, whatever the launches
         self._next_look = FIRST_SAMPLES
 
     def next_samples(self, done: int, seconds: float) -> int:
         """Return the samples per lane of the next launch; 0 when the budget is met."""
         budget = self.budget
         if done == 0:
-            return min(FIRST_SAMPLES, self.limit or FIRST_SAMPLES)
+            first = min(FIRST_SAMPLES, self.limit or FIRST_SAMPLES)
+            self.stage = range(first if budget.time_limit_s is not None or self.limit is None else self.limit)
+            return first
         if budget.time_limit_s is not None and seconds >= budget.time_limit_s:
             return 0
         if self.limit is not None:
@@ -166,7 +173,12 @@ class Schedule:
         launch = max(1.0, self.speed * LAUNCH_SECONDS)
         if budget.time_limit_s is not None:
             launch = min(launch, max(1.0, self.speed * (budget.time_limit_s - seconds)))
-        return int(min(goal - done, launch if math.isfinite(launch) else 4 * done))
+        more = int(min(goal - done, launch if math.isfinite(launch) else 4 * done))
+        if budget.time_limit_s is not None:  # there may be no other launch
+            self.stage = range(done, done + more)
+        elif done == self.stage.stop:
+            self.stage = range(done, goal)
+        return more
 
     def wants_error(self, done: int) -> bool:
         """Return whether to look at the error now: at sample counts fixed by the errors seen so far."""

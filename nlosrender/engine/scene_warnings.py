@@ -9,11 +9,12 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from nlosrender.capture.arrivals import sampled_indices, window_warnings
+from nlosrender.capture.arrivals import window_warnings
 from nlosrender.capture.bounces import THIRD_BOUNCE
 from nlosrender.capture.grids import Capture, PointGrid
 from nlosrender.capture.time_axis import TimeAxis
-from nlosrender.engine.path_engine import PathEngine
+from nlosrender.engine.engines import Engine
+from nlosrender.engine.near_wall_warnings import near_wall_warnings, points_above_wall
 from nlosrender.engine.surface_sampler import SAMPLEABLE_PLUGINS, facing_triangles
 from nlosrender.engine.virtual_lights.engine import VirtualLightEngine
 from nlosrender.engine.virtual_lights.tessellator import MAX_PATCHES
@@ -21,10 +22,11 @@ from nlosrender.engine.virtual_lights.third_bounce import FIRST_COARSENESS, REFI
 from nlosrender.scene.build import BuiltScene, wall_box
 from nlosrender.scene.hidden_geometry import Surface
 from nlosrender.scene.pose import Float64
+from nlosrender.scene.view import BuiltView
 
 POINTS_PER_SURFACE = 64
 MOST_RAYS = 1_000_000  # of all surfaces together: a warning must not take longer than a small render
-RAY_MARGIN = 2e-5  # share of a ray's length, and engine units above the wall, that are left out
+RAY_MARGIN = 2e-5  # share of a ray's length that is left out
 GRAZING = 1e-2  # cosine below which a ray may slip past the limb of a round shape within its margin
 FINEST_BIN = 2e-6  # engine units; float32 path lengths of a scene of size 1 are good to about 5e-7
 
@@ -37,7 +39,7 @@ class _SurfacePoints:
     normals: Float64  # (n, 3), any length; zero where both sides reflect
 
 
-def scene_warnings(engine: PathEngine | VirtualLightEngine) -> tuple[str, ...]:
+def scene_warnings(engine: Engine) -> tuple[str, ...]:
     """Return one sentence for each thing in a scene that is pointless or surprising.
 
     Parameters
@@ -47,11 +49,21 @@ def scene_warnings(engine: PathEngine | VirtualLightEngine) -> tuple[str, ...]:
     """
     built, capture, time_axis = engine.built, engine.capture, engine.time_axis
     max_bounces = engine.options.bounces.max_bounces
+    window = window_warnings(capture, built.wall, built.hidden_bounds, time_axis, max_bounces)
+    if isinstance(built, BuiltView):
+        return (*_view_warnings(built), *window, *_bin_warnings(engine, time_axis))
     return (
+        *built.warnings,
         *_surface_warnings(built, capture, max_bounces),
-        *window_warnings(capture, built.wall, built.hidden_bounds, time_axis, max_bounces),
+        *window,
+        *near_wall_warnings(engine, built, capture),
         *_bin_warnings(engine, time_axis),
     )
+
+
+def _view_warnings(built: BuiltView) -> Iterator[str]:
+    if not built.scene.emitters():
+        yield "nothing in the scene shines: the picture is black. Add scene.emitters."
 
 
 def _surface_warnings(built: BuiltScene, capture: Capture, max_bounces: int | None) -> Iterator[str]:
@@ -125,13 +137,6 @@ def _surface_points(built: BuiltScene, shape: mi.Shape) -> _SurfacePoints:
     return _SurfacePoints(points, normals)
 
 
-def _wall_points(built: BuiltScene, grid: PointGrid) -> Float64:
-    """Return a sample of a grid's points, just above the wall (n, 3) [engine units]."""
-    index = sampled_indices(grid)
-    positions, normals = grid.positions.reshape(-1, 3)[index], grid.normals.reshape(-1, 3)[index]
-    return positions / built.unit + RAY_MARGIN * normals
-
-
 def _turned_to(surface: _SurfacePoints, wall_points: Float64, least_cosine: float = 0.0) -> NDArray[np.bool_]:
     """Return (wall points, surface points) whether they see each other's reflecting side, were nothing between."""
     towards = wall_points[:, None] - surface.points[None]
@@ -142,17 +147,19 @@ def _turned_to(surface: _SurfacePoints, wall_points: Float64, least_cosine: floa
 
 def _any_visible(built: BuiltScene, surfaces: list[_SurfacePoints], grid: PointGrid) -> NDArray[np.bool_]:
     """Return for each surface whether any of its points is seen from any of a sample of the grid's points."""
-    wall_points = _wall_points(built, grid)
+    wall_points = points_above_wall(built, grid)
     step = max(1, len(surfaces) * len(wall_points) * POINTS_PER_SURFACE // MOST_RAYS)
     origins, targets, owners = [], [], []
+    seen = np.zeros(len(surfaces), dtype=bool)
     for owner, surface in enumerate(surfaces):
         wall, point = np.nonzero(_turned_to(surface, wall_points, GRAZING))
+        if not len(wall):  # rays that all graze tell nothing, such as those to a plate almost on the wall
+            seen[owner] = _turned_to(surface, wall_points).any()
         wall, point = wall[::step], point[::step]
         origins.append(wall_points[wall])
         targets.append(surface.points[point])
         owners.append(np.full(len(wall), owner))
     start, end = np.concatenate(origins), np.concatenate(targets)
-    seen = np.zeros(len(surfaces), dtype=bool)
     if len(start):
         ray = mi.Ray3f(
             mi.Point3f(start.T.astype(np.float32)),
@@ -166,7 +173,7 @@ def _any_visible(built: BuiltScene, surfaces: list[_SurfacePoints], grid: PointG
     return seen
 
 
-def _bin_warnings(engine: PathEngine | VirtualLightEngine, time_axis: TimeAxis) -> Iterator[str]:
+def _bin_warnings(engine: Engine, time_axis: TimeAxis) -> Iterator[str]:
     finest = FINEST_BIN * engine.built.unit
     if time_axis.bin_width_opl < finest:
         yield (

@@ -33,6 +33,8 @@ def deposit_second_bounce(transport: Transport, histogram: DeviceHistogram) -> N
         emitted = built.wall_bsdf.eval(context, lit, lit.to_local(-direction), apart)
         value = received * emitted / dr.square(dr.maximum(distance, COINCIDENT))
         active = apart & dr.any(value > 0)
-        active &= ~built.scene.ray_test(connection_segment(sensor, direction, lit.p), coherent=False, active=active)
+        active &= ~built.scene.ray_test(
+            connection_segment(built, sensor, direction, lit), coherent=False, active=active
+        )
         histogram.deposit(lane, laser, mi.UInt32(0), delay_bin(transport, points, distance), value, active)
         laser += 1

@@ -6,6 +6,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from nlosrender.capture.bounces import THIRD_BOUNCE
+from nlosrender.engine.engines import Engine
+from nlosrender.engine.line_of_sight.engine import LineOfSightEngine
 from nlosrender.engine.path_engine import PathEngine
 from nlosrender.engine.virtual_lights.engine import VirtualLightEngine
 
@@ -18,7 +20,7 @@ class Skipped:
     why: str
 
 
-def skipped_work(engine: PathEngine | VirtualLightEngine, *, scene_is_colored: bool) -> tuple[Skipped, ...]:
+def skipped_work(engine: Engine, *, scene_is_colored: bool) -> tuple[Skipped, ...]:
     """Return what ``engine`` skips.
 
     Parameters
@@ -28,6 +30,8 @@ def skipped_work(engine: PathEngine | VirtualLightEngine, *, scene_is_colored: b
     scene_is_colored
         Whether something in the scene has a colour.
     """
+    if isinstance(engine, LineOfSightEngine):
+        return tuple(_of_view(engine, scene_is_colored))
     paths = engine.paths if isinstance(engine, VirtualLightEngine) else engine
     built, options = engine.built, engine.options
     skipped = []
@@ -36,7 +40,7 @@ def skipped_work(engine: PathEngine | VirtualLightEngine, *, scene_is_colored: b
     if options.bounces.max_bounces is not None:
         highest = options.bounces.max_bounces
         skipped.append(Skipped(f"bounces above {highest}", f"render.max_bounces is {highest}"))
-    if isinstance(engine, VirtualLightEngine) and not engine.settings.needs_visibility:
+    if not engine.settings.needs_visibility:
         skipped.append(
             Skipped("visibility rays", "one convex object stands alone before a planar wall: nothing lies between")
         )
@@ -45,10 +49,24 @@ def skipped_work(engine: PathEngine | VirtualLightEngine, *, scene_is_colored: b
         if dark:
             why = "they face away from the whole wall or lie behind it: no ray is sent to them"
             skipped.append(Skipped(f"{dark} of {built.n_triangles} triangles", why))
-    if options.channels == 1:
-        why = "render.color is grey" if scene_is_colored else "everything in the scene is grey"
-        skipped.append(Skipped("colour", why))
+    skipped += _colour(options.channels, scene_is_colored)
     return (*skipped, *(_techniques(paths) if traces_paths(engine) else ()))
+
+
+def _of_view(engine: LineOfSightEngine, scene_is_colored: bool) -> Iterator[Skipped]:
+    highest = engine.options.bounces.max_bounces
+    if highest is not None:
+        yield Skipped(f"paths of more than {highest} surface interactions", f"render.max_bounces is {highest}")
+    if not engine.settings.polarized:
+        yield Skipped("polarisation", "render.polarized is false")
+    elif scene_is_colored:
+        yield Skipped("colour", "polarised light is rendered in grey")
+    yield from _colour(engine.options.channels, scene_is_colored)
+
+
+def _colour(channels: int, scene_is_colored: bool) -> Iterator[Skipped]:
+    if channels == 1:
+        yield Skipped("colour", "render.color is grey" if scene_is_colored else "everything in the scene is grey")
 
 
 def _techniques(paths: PathEngine) -> Iterator[Skipped]:
@@ -65,9 +83,11 @@ def _techniques(paths: PathEngine) -> Iterator[Skipped]:
         yield Skipped("hidden geometry sampling (MIS)", why)
 
 
-def traces_paths(engine: PathEngine | VirtualLightEngine) -> bool:
+def traces_paths(engine: Engine) -> bool:
     """Return whether the path engine has anything to do: not when patches and walks give all bounces asked for."""
     if isinstance(engine, VirtualLightEngine):
         return engine.has_further_bounces and engine.further is None
+    if isinstance(engine, LineOfSightEngine):
+        return True
     highest = engine.options.bounces.max_bounces
     return highest is None or highest >= THIRD_BOUNCE

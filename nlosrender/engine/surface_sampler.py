@@ -13,6 +13,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from nlosrender.engine.space_filling import z_order
 from nlosrender.scene.build import WALL_ID, BuiltScene, wall_box
 from nlosrender.scene.pose import Float64
 
@@ -29,6 +30,7 @@ class SurfaceSample:
     shape: mi.ShapePtr
     n: mi.Normal3f  # geometric normal; on triangles not of unit length
     primitive: mi.UInt32  # triangle within the shape; ANALYTIC for a shape without triangles
+    barycentric: mi.Point2f  # within the triangle
 
 
 class SurfaceSampler:
@@ -57,6 +59,9 @@ class SurfaceSampler:
             self.dark_behind &= _is_one_sided(shape) and not (shape.is_mesh() and shape.has_vertex_normals())
             if shape.is_mesh():
                 triangles, kept = facing_triangles(built, shape)
+                # neighbours in the table are neighbours in space: so are points with near first coordinates
+                order = np.argsort(z_order(triangles.mean(axis=1)), kind="stable")
+                triangles, kept = triangles[order], kept[order]
                 corners.append(triangles)
                 owners.append(np.full(len(kept), index, np.uint32))
                 primitives.append(kept)
@@ -111,18 +116,32 @@ class SurfaceSampler:
         shape = dr.gather(mi.ShapePtr, self._shapes, dr.gather(mi.UInt32, self._owner, entry, active), active)
         is_triangle = entry < self.n_triangles
         point, normal, primitive = mi.Point3f(0), mi.Normal3f(0), mi.UInt32(ANALYTIC)
+        within = mi.Point2f(0)
         if self.n_triangles:
             on_triangle = active & is_triangle
             a, b, c = (self._corner(k, entry, on_triangle) for k in range(3))
             root = dr.sqrt(u)  # uniform on the triangle: (1 - sqrt u, sqrt u (1 - v), sqrt u v)
-            point = a + (b - a) * (root * (1 - v)) + (c - a) * (root * v)
+            within = mi.Point2f(root * (1 - v), root * v)
+            point = a + (b - a) * within.x + (c - a) * within.y
             normal = mi.Normal3f(dr.cross(b - a, c - a))
             primitive = dr.select(on_triangle, dr.gather(mi.UInt32, self._primitive, entry, on_triangle), ANALYTIC)
         if self.has_analytic:
             on_analytic = active & ~is_triangle
             at, facing = self._on_analytic(shape, entry, mi.Point2f(u, v), on_analytic)
             point, normal = dr.select(on_analytic, at, point), dr.select(on_analytic, facing, normal)
-        return SurfaceSample(point, shape, normal, primitive)
+        return SurfaceSample(point, shape, normal, primitive, within)
+
+    def surface(self, sample: SurfaceSample, direction: mi.Vector3f, active: mi.Bool) -> mi.SurfaceInteraction3f:
+        """Return the surface at sampled points of triangles as a ray in ``direction`` finds it; no ray is traced."""
+        hit = dr.zeros(mi.PreliminaryIntersection3f)
+        hit.t = mi.Float(1)
+        hit.prim_uv, hit.prim_index = sample.barycentric, sample.primitive
+        ray = mi.Ray3f(sample.p - direction, direction)
+        si = sample.shape.compute_surface_interaction(ray, hit, mi.RayFlags.All, active)
+        si.initialize_sh_frame()
+        si.t, si.shape, si.p = mi.Float(1), sample.shape, sample.p
+        si.wi = si.to_local(-direction)
+        return si
 
     def reached(
         self, si: mi.SurfaceInteraction3f, point: mi.Point3f, shape: mi.ShapePtr, primitive: mi.UInt32

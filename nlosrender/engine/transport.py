@@ -25,6 +25,7 @@ class PathSettings:
     laser_sampling: bool
     russian_roulette: bool
     spot_radius: float  # of the laser on the wall [engine units]; 0 = a point
+    needs_visibility: bool  # something may lie between a vertex and a laser or sensor point
     has_transmission: bool  # some BSDF refracts: the optical path length needs the medium's index
 
     @property

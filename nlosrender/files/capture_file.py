@@ -8,7 +8,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import ArrayLike
 
-from nlosrender.capture.bounces import FILE_BOUNCES, FIRST_BOUNCE, LAST_FILE_BOUNCE
+from nlosrender.capture.bounces import FILE_BOUNCES, LINE_OF_SIGHT, first_bounce_of
 from nlosrender.files.layout import FRAMES, SCAN_TYPES, Float64
 from nlosrender.scene.pose import Pose
 
@@ -23,7 +23,7 @@ class CaptureHeader:
     Parameters
     ----------
     scan_type
-        ``single``, ``confocal`` or ``exhaustive``.
+        ``single``, ``confocal``, ``exhaustive`` or ``line_of_sight``, whose sensor points are a camera's pixels.
     sensor_positions, sensor_normals
         (Ny, Nx, 3) sensor points [m] and unit normals.
     laser_positions, laser_normals
@@ -35,7 +35,7 @@ class CaptureHeader:
     n_bins, bin_width_opl, start_opl
         Time axis: number of bins, their width [m of optical path] and where bin 0 starts [m].
     n_channels
-        1 (grey) or 3 (red, green, blue).
+        1 (grey), 3 (red, green, blue) or 4 (Stokes components).
     bounce_indices
         For each in-memory bounce slot its index on the file's bounce axis (``BounceAxis.file_indices``).
     max_bounces
@@ -101,6 +101,11 @@ class CaptureHeader:
         return self.scan_type == "confocal"
 
     @property
+    def first_bounce(self) -> int:
+        """The bounce that index 0 of the file's bounce axis holds."""
+        return first_bounce_of(self.scan_type)
+
+    @property
     def sizes(self) -> dict[str, int]:
         """Length of every in-memory axis, by name; confocal captures have 1 x 1 lasers."""
         laser_y, laser_x = (1, 1) if self.confocal else self.laser_positions.shape[:2]
@@ -119,8 +124,9 @@ class CaptureHeader:
         """Return what the in-memory bounce index ``slot`` holds, in words."""
         if not self.split_bounces:
             return "all bounces"
-        bounce = self.bounce_indices[slot] + FIRST_BOUNCE
-        more = bounce == LAST_FILE_BOUNCE and (self.max_bounces is None or self.max_bounces > bounce)
+        index = self.bounce_indices[slot]
+        bounce = index + self.first_bounce
+        more = index == FILE_BOUNCES - 1 and (self.max_bounces is None or self.max_bounces > bounce)
         return f"bounce {bounce}" + (" and above" if more else "")
 
     def _freeze(self, name: str, value: object) -> None:
@@ -144,10 +150,9 @@ class CaptureHeader:
 
     def _check_laser_grid(self) -> None:
         rows, columns = self.laser_positions.shape[:2]
-        if self.scan_type == "single":
-            _require(
-                (rows, columns) == (1, 1), "laser_positions", f"{rows} x {columns} points", "one (scan type single)"
-            )
+        if self.scan_type in ("single", LINE_OF_SIGHT):
+            need = f"one (scan type {self.scan_type})"
+            _require((rows, columns) == (1, 1), "laser_positions", f"{rows} x {columns} points", need)
         if self.confocal:
             same = np.array_equal(self.laser_positions, self.sensor_positions)
             _require(same, "laser_positions", "other points", "the sensor points (scan type confocal)")
@@ -172,7 +177,8 @@ class CaptureHeader:
         )
 
     def _check_bounces(self) -> None:
-        _require(self.n_channels in (1, 3), "n_channels", self.n_channels, "1 (grey) or 3 (red, green, blue)")
+        need = "1 (grey), 3 (red, green, blue) or 4 (Stokes components)"
+        _require(self.n_channels in (1, 3, 4), "n_channels", self.n_channels, need)
         indices = tuple(self.bounce_indices)
         ascending = all(a < b for a, b in pairwise(indices))
         inside = all(_is_int(index) and 0 <= index < FILE_BOUNCES for index in indices)
@@ -188,10 +194,10 @@ class CaptureHeader:
         self._freeze("bounce_indices", indices)
         limit = self.max_bounces
         _require(
-            limit is None or (_is_int(limit) and limit >= FIRST_BOUNCE),
+            limit is None or (_is_int(limit) and limit >= self.first_bounce),
             "max_bounces",
             limit,
-            f"None or an integer >= {FIRST_BOUNCE}",
+            f"None or an integer >= {self.first_bounce}",
         )
 
     def _check_hidden_bounds(self) -> None:

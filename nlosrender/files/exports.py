@@ -20,6 +20,7 @@ from nlosrender.capture.bounces import FIRST_BOUNCE
 from nlosrender.errors import FileError
 from nlosrender.files.exports_mat import write_fk, write_lct, write_phasor_mat
 from nlosrender.files.exports_tal import write_tal
+from nlosrender.files.layout import STOKES
 from nlosrender.files.reader import StoredCapture, open_capture
 from nlosrender.files.replacement import check_writable, explained_write, partial_path, publish
 from nlosrender.files.scan import Scan, chosen_bounces, read_scan
@@ -82,7 +83,9 @@ def _general_losses(capture: StoredCapture, indices: tuple[int, ...]) -> list[st
         numbers = ", ".join(str(index + FIRST_BOUNCE) for index in indices)
         losses.append(f"bounces {numbers} are summed: the format does not keep them apart")
     if header.sizes["channel"] > 1:
-        losses.append(f"the {header.sizes['channel']} channels are averaged")
+        stokes = header.attributes.get("channels") == STOKES
+        kept = "of the Stokes components the intensity alone is kept"
+        losses.append(kept if stokes else f"the {header.sizes['channel']} channels are averaged")
     if header.has_variance:
         losses.append("the variance is left out")
     return losses

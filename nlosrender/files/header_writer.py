@@ -5,13 +5,27 @@ from __future__ import annotations
 import h5py
 import numpy as np
 
-from nlosrender.capture.bounces import FIRST_BOUNCE, LAST_FILE_BOUNCE, THIRD_BOUNCE
+from nlosrender.capture.bounces import (
+    FILE_BOUNCES,
+    FIRST_BOUNCE,
+    LAST_FILE_BOUNCE,
+    LINE_OF_SIGHT,
+    THIRD_BOUNCE,
+)
 from nlosrender.files import layout
 from nlosrender.files.attributes import set_attributes
 from nlosrender.files.capture_file import CaptureHeader
 from nlosrender.scene.pose import Pose
 
-CHANNELS = {3: "rgb"}  # grey has no name: it is what every file without the attribute holds
+_VIEW_TEXT = {
+    "sensor_points": "centres of a camera's pixels on an image plane, which takes the relay wall's place in this file; "
+    "rows ascend upwards in the picture, columns to the right; cameraPosition is the camera's",
+    "laser_points": "none: emitters in the scene flash at t = 0; the laser's datasets mean nothing",
+}
+_STOKES_TEXT = (
+    "I, Q, U, V of the light that reaches camera or sensor, as Mitsuba's stokes integrator defines them; reference: "
+    "to the right in the picture (ray direction x camera's up), or ray from the sensor x relay wall's y axis"
+)
 
 
 def write_header(file: h5py.File, header: CaptureHeader) -> None:
@@ -73,13 +87,23 @@ def root_attributes(header: CaptureHeader) -> dict[str, object]:
         "max_bounces": "no limit" if header.max_bounces is None else header.max_bounces,
         "split_bounces": header.split_bounces,
     }
-    if header.n_channels in CHANNELS:
-        attributes["channels"] = CHANNELS[header.n_channels]
+    if header.scan_type == LINE_OF_SIGHT:
+        attributes |= _VIEW_TEXT | {
+            "first_and_last_legs": "included: surface -> camera counts in the optical path length"
+            if legs
+            else "NOT included: optical path lengths run from the emitter to the last surface only"
+        }
+    if header.n_channels in layout.CHANNELS:
+        attributes["channels"] = layout.CHANNELS[header.n_channels]
+    if attributes.get("channels") == layout.STOKES:
+        attributes["stokes_frame"] = _STOKES_TEXT
     return attributes
 
 
 def sample_attributes(header: CaptureHeader) -> dict[str, object]:
     """Return the attributes of ``data`` (and of ``variance``): axes, bounces, unit."""
+    if header.scan_type == LINE_OF_SIGHT:
+        return _view_sample_attributes(header)
     if not header.split_bounces:
         bounces = f"the sum of all bounces is in index {header.bounce_indices[0]}"
     else:
@@ -93,6 +117,23 @@ def sample_attributes(header: CaptureHeader) -> dict[str, object]:
         "bounce_indices": np.asarray(header.bounce_indices, dtype=np.int32),
         "axes": " ".join(layout.file_axes(header.confocal)),
         "unit": layout.DATA_UNIT,
+    }
+
+
+def _view_sample_attributes(header: CaptureHeader) -> dict[str, object]:
+    if not header.split_bounces:
+        bounces = f"the sum of all paths is in index {header.bounce_indices[0]}"
+    else:
+        last = FILE_BOUNCES - 1
+        bounces = "index k of the bounce axis holds the paths with k surface interactions (0: an emitter seen directly)"
+        bounces += f"; those with more than {last} are added into index {last}"
+    return {
+        "bounces": bounces,
+        "bounce_indices": np.asarray(header.bounce_indices, dtype=np.int32),
+        "axes": " ".join(layout.file_axes(header.confocal)),
+        "unit": layout.data_unit(header.scan_type),
+        "quantity": "of a pixel's steady radiance the share that arrives in the bin: the sum over bins, and what falls "
+        "outside the time window, is the steady picture",
     }
 
 

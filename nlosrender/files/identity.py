@@ -16,7 +16,7 @@ from nlosrender.files.provenance import package_versions
 # told by the Mitsuba variant.
 NOT_THE_CAPTURE = (("output", "path"), ("render", "memory_limit"), ("render", "backend"))
 PACKAGES = ("nlosrender", "mitsuba", "drjit")  # whose versions the samples depend on
-FILE_KEY = "filename"  # of meshes, textures, spectra
+FILE_KEYS = ("filename", "mitsuba")  # of meshes, textures, spectra; of a whole scene
 
 
 def capture_identity(resolved_config: Mapping[str, Any], part: str, variant: str, replicas: int) -> dict[str, Any]:
@@ -105,7 +105,7 @@ def _shown(value: Any) -> str:
 def _with_content(tree: Any) -> Any:
     if isinstance(tree, Mapping):
         return {
-            key: _content(value) if key == FILE_KEY and isinstance(value, str) else _with_content(value)
+            key: _content(value) if key in FILE_KEYS and isinstance(value, str) else _with_content(value)
             for key, value in tree.items()
         }
     return [_with_content(item) for item in tree] if isinstance(tree, (list, tuple)) else tree

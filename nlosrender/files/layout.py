@@ -14,7 +14,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from nlosrender.capture.bounces import FILE_BOUNCES
+from nlosrender.capture.bounces import FILE_BOUNCES, LINE_OF_SIGHT
 from nlosrender.scene.pose import Pose
 
 Float64 = NDArray[np.float64]
@@ -23,7 +23,7 @@ T = TypeVar("T")
 FORMAT_VERSION = 1  # of the attributes this program adds; the layout itself has no version
 FLOAT = "<f4"
 INTEGER = "<i4"
-SCAN_TYPES = ("single", "confocal", "exhaustive")
+SCAN_TYPES = ("single", "confocal", "exhaustive", LINE_OF_SIGHT)
 FRAMES = ("znlos", "scene")
 
 MEMORY_AXES = ("channel", "bounce", "laser_y", "laser_x", "sensor_y", "sensor_x", "bin")
@@ -69,7 +69,15 @@ DATASETS: tuple[DatasetSpec, ...] = (
 SPECS: Mapping[str, DatasetSpec] = {spec.name: spec for spec in DATASETS}
 
 ROOT_TEXT = {"data order": "column-major", "engine": "nlosrender"}  # attributes of the file
+STOKES = "stokes"
+CHANNELS = {3: "rgb", 4: STOKES}  # grey has no name: it is what every file without the attribute holds
 DATA_UNIT = "J m^-2 sr^-1"  # radiance leaving a sensor point, integrated over the bin, for one pulse
+VIEW_UNIT = "W m^-2 sr^-1"  # line_of_sight: of a pixel's steady radiance the share that arrives in the bin
+
+
+def data_unit(scan_type: str) -> str:
+    """Return the unit of the samples."""
+    return VIEW_UNIT if scan_type == LINE_OF_SIGHT else DATA_UNIT
 
 
 def file_axes(confocal: bool) -> tuple[str, ...]:

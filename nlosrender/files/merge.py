@@ -179,4 +179,5 @@ def _attributes(shards: Sequence[Shard], sums: Sums, output: Path) -> dict[str, 
 def _bounces(shard: Shard) -> BounceAxis:
     attributes = shard.header.attributes
     limit = attributes.get("max_bounces")
-    return BounceAxis(limit if isinstance(limit, int) else None, bool(attributes.get("split_bounces")))
+    highest = limit if isinstance(limit, int) else None
+    return BounceAxis(highest, bool(attributes.get("split_bounces")), shard.header.first_bounce)

@@ -11,11 +11,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from nlosrender.capture.bounces import FIRST_BOUNCE, THIRD_BOUNCE
+from nlosrender.capture.bounces import FIRST_BOUNCE, LINE_OF_SIGHT, THIRD_BOUNCE
 from nlosrender.errors import FileError
 from nlosrender.files.layout import ZNLOS_FROM_LOCAL, Float64
 from nlosrender.files.reader import StoredCapture
-from nlosrender.files.stored_header import Numbers, StoredHeader
+from nlosrender.files.stored_header import Numbers, StoredHeader, intensity
 from nlosrender.scene.hidden_geometry import Bounds, box_corners
 from nlosrender.scene.pose import euler_xyz
 
@@ -67,9 +67,15 @@ def read_scan(capture: StoredCapture) -> Scan:
     Raises
     ------
     FileError
-        Positions are missing or not finite, or the file counts the legs but does not say where laser and sensor stand.
+        It is no capture of a relay wall. Positions are missing or not finite, or the file counts the legs but does not
+        say where laser and sensor stand.
     """
     header, stored = capture.header, capture.positions
+    if header.scan_type == LINE_OF_SIGHT:
+        raise FileError(
+            f"{capture.path}: is a line_of_sight capture, a camera's pictures over time: there is no relay wall to "
+            "reconstruct from or to export. See `nlosrender frames`."
+        )
     wall_from_file = _wall_from_file(header)
     if wall_from_file is None:
         wall_from_file = np.eye(4)
@@ -131,7 +137,7 @@ def light_bands(
 ) -> Iterator[tuple[slice, Float32]]:
     """Yield (rows, (row, Nx, bin)): the light of one laser point, a few rows of sensor points at a time.
 
-    Bounces are summed and colours averaged.
+    Bounces are summed and colours averaged; of polarised light it is the intensity.
 
     Raises
     ------
@@ -144,7 +150,7 @@ def light_bands(
     for start in range(0, sizes["sensor_y"], step):
         rows = slice(start, min(start + step, sizes["sensor_y"]))
         block = capture.read_block(lasers=laser, sensors=(rows, None), bounces=bounces)
-        light = block[:, :, 0, 0].mean(axis=0).sum(axis=0)
+        light = intensity(capture.header, block[:, :, 0, 0]).sum(axis=0)
         if not np.isfinite(light).all():
             raise FileError(f"{capture.path}: data holds numbers that are not finite; see `nlosrender info --check`")
         yield rows, light

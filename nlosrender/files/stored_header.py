@@ -6,17 +6,21 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from math import prod
 from pathlib import Path
+from typing import TypeVar
 
 import h5py
 import numpy as np
+from numpy.typing import NDArray
 
-from nlosrender.capture.bounces import FILE_BOUNCES
+from nlosrender.capture.bounces import FILE_BOUNCES, LINE_OF_SIGHT, first_bounce_of
 from nlosrender.errors import FileError
 from nlosrender.files import layout
 from nlosrender.files.attributes import get_attributes
 
 Numbers = tuple[float, ...]
+T = TypeVar("T", np.float32, np.float64)
 MAX_CHUNK_BYTES = 2**30  # unpacked; a few kilobytes in a file may claim 4 GiB
+MOST_BOUNCES = 64  # on the axis of a file from elsewhere; ours have 6
 
 
 @dataclass(frozen=True)
@@ -49,6 +53,11 @@ class StoredHeader:
     data_attributes: Mapping[str, object]
 
     @property
+    def first_bounce(self) -> int:
+        """The bounce that index 0 of the bounce axis holds."""
+        return first_bounce_of(self.scan_type)
+
+    @property
     def n_bins(self) -> int:
         """Number of bins."""
         return self.sizes["bin"]
@@ -69,6 +78,13 @@ class StoredHeader:
         return self.sensor_grid if self.confocal else (self.sizes["laser_y"], self.sizes["laser_x"])
 
 
+def intensity(header: StoredHeader, block: NDArray[T]) -> NDArray[T]:
+    """Return a block (channel, ...) in grey: colours averaged, of Stokes components the first."""
+    if header.attributes.get("channels") == layout.STOKES:
+        return block[0]
+    return block.mean(axis=0)
+
+
 def header_of(file: h5py.File, path: Path) -> StoredHeader:
     """Read the metadata of an open file.
 
@@ -81,6 +97,8 @@ def header_of(file: h5py.File, path: Path) -> StoredHeader:
     confocal = samples.ndim == len(layout.CONFOCAL_AXES)
     sizes = {"laser_y": 1, "laser_x": 1} | dict(zip(layout.file_axes(confocal), samples.shape, strict=True))
     attributes, data_attributes = get_attributes(file), get_attributes(samples)
+    if sizes["bounce"] > MOST_BOUNCES:
+        raise FileError(f"{path}: has {sizes['bounce']} bounces, a capture has {FILE_BOUNCES}. {_NOT_ZNLOS}")
     indices = _bounce_indices(data_attributes, sizes["bounce"])
     split = attributes.get("split_bounces")
     width = _exact_or_stored(file, path, "deltaT")
@@ -230,7 +248,8 @@ def _scan_type(attributes: Mapping[str, object], confocal: bool, sizes: Mapping[
     if sizes["laser_y"] * sizes["laser_x"] > 1:
         return "exhaustive"
     # an exhaustive capture may have a single laser point too
-    return "exhaustive" if attributes.get("scan_type") == "exhaustive" else "single"
+    stored = attributes.get("scan_type")
+    return str(stored) if stored in ("exhaustive", LINE_OF_SIGHT) else "single"
 
 
 _NOT_ZNLOS = "Is this a Z-NLOS capture, as `nlosrender render` writes it?"

@@ -8,7 +8,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from nlosrender.capture.bounces import FILE_BOUNCES, THIRD_BOUNCE
+from nlosrender.capture.bounces import FILE_BOUNCES, LINE_OF_SIGHT, THIRD_BOUNCE
 from nlosrender.capture.bounces import FIRST_BOUNCE as FIRST
 from nlosrender.files import layout
 from nlosrender.files.attributes import get_attributes
@@ -58,8 +58,8 @@ def _samples(samples: h5py.Dataset, sizes: Mapping[str, int]) -> list[str]:
     found = _number(samples, layout.DATA, layout.FLOAT)
     if sizes["bounce"] != FILE_BOUNCES:
         found.append(f"data: bounce axis of length {sizes['bounce']}, need {FILE_BOUNCES}")
-    if sizes["channel"] not in (1, 3):
-        found.append(f"data: {sizes['channel']} channels, need 1 or 3")
+    if sizes["channel"] not in (1, 3, 4):
+        found.append(f"data: {sizes['channel']} channels, need 1, 3 or 4")
     return found
 
 
@@ -135,11 +135,12 @@ def _attributes(file: h5py.File, samples: h5py.Dataset) -> list[str]:
         for name, text in layout.ROOT_TEXT.items()
         if attributes.get(name) != text
     ]
-    if data_attributes.get("third_bounce") != THIRD_BOUNCE - FIRST:
+    is_view = attributes.get("scan_type") == LINE_OF_SIGHT  # whose bounces are counted otherwise
+    if not is_view and data_attributes.get("third_bounce") != THIRD_BOUNCE - FIRST:
         stored = data_attributes.get("third_bounce", "missing")
         found.append(f"attribute 'third_bounce' of data: {stored}, need {THIRD_BOUNCE - FIRST}")
-    if samples.shape[0] == 3 and "channels" not in attributes:
-        found.append("attribute 'channels': missing, need the names of the three channels")
+    if samples.shape[0] > 1 and "channels" not in attributes:
+        found.append("attribute 'channels': missing, need the names of the channels")
     return found
 
 

@@ -82,7 +82,7 @@ class _Desk:
     def prepared(self, job: Job) -> tuple[Engine, Cutter]:
         """Return what renders and what cuts; the backend is started."""
         # in every thread: Mitsuba's variant belongs to the thread
-        backend = start_backend(job.backend, colored=job.config.is_colored)
+        backend = start_backend(job.backend, colored=job.config.is_colored, polarized=job.config.render.polarized)
         key = tree_hash(dict(job.identity))
         if key != self.key or self.engine is None or self.cutter is None:
             self.key, self.engine, self.cutter = "", None, None  # only one fits the memory

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import TYPE_CHECKING, Protocol, TypeAlias
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,11 +20,9 @@ from nlosrender.files.sums import Sums, sums_of
 from nlosrender.rendering.report import Progress, Stopwatch
 
 if TYPE_CHECKING:
+    from nlosrender.engine.engines import Engine
     from nlosrender.engine.histogram import Histogram
-    from nlosrender.engine.path_engine import Budget, PathEngine
-    from nlosrender.engine.virtual_lights.engine import VirtualLightEngine
-
-    Engine: TypeAlias = PathEngine | VirtualLightEngine
+    from nlosrender.engine.path_engine import Budget
 
 
 def render_unit(engine: Engine, unit: Unit, budget: Budget, progress: Progress = lambda share: None) -> Histogram:
@@ -113,7 +111,10 @@ def finished_unit(
     lasers = (1, 1) if confocal else unit.lasers.shape
     channels, slots, _, _, n_bins = histogram.mean.shape
     axes = (channels, slots, *lasers, *unit.sensors.shape, n_bins)
-    sums = sums_of(histogram.mean, histogram.variance, histogram.outside, histogram.samples, seconds)
+    # of Stokes components the intensity: the others have signs, and are no energy
+    light = slice(0, 1) if layout.CHANNELS.get(channels) == layout.STOKES else slice(None)
+    mean, variance, outside = histogram.mean[light], histogram.variance[light], histogram.outside[light]
+    sums = sums_of(mean, variance, outside, histogram.samples, seconds)
     stored = {layout.DATA: histogram.mean} | ({layout.VARIANCE: histogram.variance} if store_variance else {})
     with np.errstate(over="ignore"):  # what overflows float32 is refused where it is cut into chunks
         samples = {name: values.astype(np.float32).reshape(axes) for name, values in stored.items()}

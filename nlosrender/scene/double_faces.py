@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -20,11 +22,36 @@ def without_double_faces(mesh: TriangleMesh, *, both_sides: bool) -> TriangleMes
     both_sides
         The surface reflects from its back, too: triangles that face opposite ways are doubles as well.
     """
-    corners = mesh.vertices[mesh.faces] + 0.0  # + 0.0: -0.0 and 0.0 are one place
+    twins = first_of_doubles(mesh.vertices[mesh.faces], both_sides=both_sides)
+    mask = twins == np.arange(len(twins))
+    return mesh if mask.all() else mesh.subset(mask)
+
+
+def doubles_of_earlier(corners: Sequence[NDArray[np.floating]], both_sides: bool) -> list[NDArray[np.bool_]]:
+    """Return for every mesh which of its triangles lie exactly where one of an earlier mesh does.
+
+    Parameters
+    ----------
+    corners
+        (m, 3, 3) of each mesh, in one frame. A mesh's own double faces do not count.
+    both_sides
+        As for ``without_double_faces``.
+    """
+    everything = np.concatenate(corners)
+    owners = np.repeat(np.arange(len(corners)), [len(part) for part in corners])
+    twins = first_of_doubles(everything, both_sides=both_sides)
+    doubles = owners > owners[twins]
+    return np.split(doubles, np.cumsum([len(part) for part in corners])[:-1])
+
+
+def first_of_doubles(corners: NDArray[np.floating], *, both_sides: bool) -> NDArray[np.intp]:
+    """Return for each of the triangles (m, 3, 3) the first one with the same corners; itself where there is none."""
+    corners = corners.astype(np.float64) + 0.0  # + 0.0: -0.0 and 0.0 are one place
     keys = _keys(corners)
+    twins = np.arange(len(keys))
     _, first, group = np.unique(keys, return_index=True, return_inverse=True)
     if len(first) == len(keys):
-        return mesh
+        return twins
     suspects = np.flatnonzero(np.bincount(group)[group] > 1)  # the same key may be chance: look closely at these few
     order = np.lexsort(np.moveaxis(corners[suspects], -1, 0)[::-1], axis=-1)
     sorted_corners = np.take_along_axis(corners[suspects], order[..., None], axis=1).reshape(len(suspects), 9)
@@ -32,11 +59,9 @@ def without_double_faces(mesh: TriangleMesh, *, both_sides: bool) -> TriangleMes
         # an even permutation keeps the side a triangle faces
         even = np.isin(order @ [9, 3, 1], [0 * 9 + 1 * 3 + 2, 1 * 9 + 2 * 3 + 0, 2 * 9 + 0 * 3 + 1])
         sorted_corners = np.column_stack([sorted_corners, even])
-    _, kept = np.unique(sorted_corners, axis=0, return_index=True)
-    mask = np.ones(len(keys), dtype=bool)
-    mask[suspects] = False
-    mask[suspects[kept]] = True
-    return mesh if mask.all() else mesh.subset(mask)
+    _, kept, same = np.unique(sorted_corners, axis=0, return_index=True, return_inverse=True)
+    twins[suspects] = suspects[kept[np.ravel(same)]]
+    return twins
 
 
 def _keys(corners: NDArray[np.float64]) -> NDArray[np.uint64]:

@@ -9,22 +9,31 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
 from nlosrender.scene.letters import letters_mesh
 from nlosrender.scene.pose import Float64, Pose, euler_xyz
 from nlosrender.scene.primitives import box_mesh, rectangle_mesh, room_mesh
-from nlosrender.scene.relay_wall import RelayWall
 from nlosrender.scene.transforms import transform_matrix
 from nlosrender.scene.triangle_mesh import TriangleMesh
 
 if TYPE_CHECKING:
     from nlosrender.config.hidden_geometry import CylinderConfig, HiddenItemConfig, MeshConfig, SphereConfig
+    from nlosrender.config.relay_wall import MeshWallConfig
 
 MESH_PLUGINS = ("ply", "obj")
 Bounds = tuple[Float64, Float64]  # smallest and largest coordinates, (3,) and (3,) m
+Radiance = float | tuple[float, float, float]  # grey or [r, g, b], W m^-2 sr^-1
+
+
+class HasPose(Protocol):
+    """What has a frame of its own, such as a relay wall."""
+
+    @property
+    def pose(self) -> Pose:
+        """Pose of the frame in the scene."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,21 +75,26 @@ class Surface:
     shape: TriangleMesh | MeshFile | ShapeDescription
     bsdf: Mapping[str, object]  # Mitsuba dict
     face_normals: bool  # flat shading: a file's shading normals are not used
+    radiance: Radiance | None = None  # that its front side emits; None: it emits nothing
 
     def bounds(self) -> Bounds | None:
         """Return a box around the surface in the local frame [m], or None when a file or plugin must be asked."""
         return None if isinstance(self.shape, MeshFile) else self.shape.bounds()
 
 
-def hidden_surfaces(hidden_geometry_configs: Sequence[HiddenItemConfig], wall: RelayWall) -> tuple[Surface, ...]:
+def hidden_surfaces(
+    hidden_geometry_configs: Sequence[HiddenItemConfig], frame: HasPose, keys: Sequence[str] | None = None
+) -> tuple[Surface, ...]:
     """Place every item of the hidden geometry in the relay wall's local frame.
 
     Parameters
     ----------
     hidden_geometry_configs
         ``scene.hidden_geometry``; poses in scene coordinates [m], degrees.
-    wall
-        The relay wall that defines the local frame.
+    frame
+        The relay wall, or whatever else defines the local frame.
+    keys
+        Where each is configured; None: in ``scene.hidden_geometry``.
 
     Returns
     -------
@@ -94,15 +108,15 @@ def hidden_surfaces(hidden_geometry_configs: Sequence[HiddenItemConfig], wall: R
     """
     surfaces = []
     for index, item in enumerate(hidden_geometry_configs):
-        key = f"scene.hidden_geometry.{index}"
+        key = f"scene.hidden_geometry.{index}" if keys is None else keys[index]
         try:
-            shape = _shape(item, wall)
+            shape = _shape(item, frame)
         except ValueError as error:
             raise ValueError(f"{key}: {error}") from error
         name = item.name or f"{item.type}-{index}"
         # Generated meshes are flat; analytic shapes bring their own normals; only files have a choice.
         face_normals = _wants_face_normals(item) if isinstance(shape, MeshFile) else isinstance(shape, TriangleMesh)
-        surfaces.append(Surface(name, key, shape, item.bsdf, face_normals))
+        surfaces.append(Surface(name, key, shape, item.bsdf, face_normals, getattr(item, "radiance", None)))
     return tuple(surfaces)
 
 
@@ -129,7 +143,7 @@ def box_corners(box: Bounds) -> Float64:
     return np.where(choice == 0, low, high)
 
 
-def _shape(item: HiddenItemConfig, wall: RelayWall) -> TriangleMesh | MeshFile | ShapeDescription:
+def _shape(item: HiddenItemConfig, wall: HasPose) -> TriangleMesh | MeshFile | ShapeDescription:
     if item.type == "rectangle":
         pose = Pose.from_normal_up(item.center, item.normal, item.up)
         return rectangle_mesh(item.width, item.height, _local_pose(pose, wall))
@@ -143,7 +157,7 @@ def _shape(item: HiddenItemConfig, wall: RelayWall) -> TriangleMesh | MeshFile |
         return room_mesh(item.size)  # defined in the wall's local frame
     if item.type == "mesh":
         kind = Path(item.filename).suffix.lower().lstrip(".")
-        return MeshFile(str(item.filename), wall.pose.inverse_matrix() @ _mesh_matrix(item), kind)
+        return MeshFile(str(item.filename), wall.pose.inverse_matrix() @ mesh_matrix(item), kind)
     if item.type == "sphere":
         center = wall.pose.to_local(item.center).tolist()
         return _round_shape(item, type="sphere", center=center)
@@ -177,11 +191,11 @@ def _wants_face_normals(item: HiddenItemConfig) -> bool:
     return bool(item.face_normals if item.type == "mesh" else item.type == "mitsuba" and item.shape.get("face_normals"))
 
 
-def _local_pose(pose: Pose, wall: RelayWall) -> Pose:
+def _local_pose(pose: Pose, wall: HasPose) -> Pose:
     return Pose(wall.pose.rotation.T @ pose.rotation, wall.pose.to_local(pose.origin))
 
 
-def _mesh_matrix(item: MeshConfig) -> Float64:
+def mesh_matrix(item: MeshConfig | MeshWallConfig) -> Float64:
     """Return scale, then rotations about x, y and z, then translation, as one (4, 4) matrix."""
     matrix = np.eye(4)
     matrix[:3, :3] = euler_xyz(item.rotate_deg) * item.scale
@@ -189,7 +203,7 @@ def _mesh_matrix(item: MeshConfig) -> Float64:
     return matrix
 
 
-def _half_axis(item: CylinderConfig, wall: RelayWall) -> Float64:
+def _half_axis(item: CylinderConfig, wall: HasPose) -> Float64:
     axis = wall.pose.direction_to_local(item.axis)
     length = float(np.linalg.norm(axis))
     if not np.isfinite(length) or length < 1e-12:

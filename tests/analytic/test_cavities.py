@@ -50,6 +50,18 @@ def bounce_energy(k: int) -> float:
     return ALBEDO**k / (4 * np.pi**2 * RADIUS**2)
 
 
+def third_bounce_in_a_sphere(x: float, y: float, edges: Array, n: int) -> Array:
+    """Quadrature of the third bounce from the laser point (x, y) to each of 5 x 3 sensor points, (15, bins)."""
+    laser, cells = laser_on_sphere(x, y), sphere_cells([0, 0, 0], RADIUS, n)
+    share = np.full(len(cells.points), bounce_energy(3) / len(cells.points))
+    first = np.linalg.norm(cells.points - laser, axis=-1)
+    rows = [
+        binned(share, first + np.linalg.norm(cells.points - sensor, axis=-1), edges)
+        for sensor in sphere_points(5, 3).reshape(-1, 3)
+    ]
+    return np.array(rows)
+
+
 def test_the_second_bounce_in_a_sphere_is_one_exact_bin() -> None:
     """H_2 = rho^2 / (4 pi^2 R^2) for every pair, in the bin of the chord, without noise."""
     config = sphere_room(scan="exhaustive", sensors=(5, 3), bins=(0.0, 0.047, 40), max_bounces=2)
@@ -107,6 +119,29 @@ def test_every_bounce_of_a_sphere_has_its_energy(russian_roulette: bool) -> None
         assert noise.max() < (0.2 if russian_roulette else 1e-5) * bounce_energy(k)
 
 
+@pytest.mark.parametrize("scan", ["single", "confocal", pytest.param("exhaustive", marks=pytest.mark.slow)])
+def test_virtual_lights_give_every_bounce_of_a_sphere_its_energy(scan: str) -> None:
+    """The wall's own cells and walks from the wall: H_k = rho^k / (4 pi^2 R^2) with nothing else in the sphere.
+
+    In a sphere every pair of cells exchanges the same, so that the third bounce has no discretisation error at all.
+    Bounces above come from walks that all sensor points share: their errors go together, and the mean has them in full.
+    """
+    config = sphere_room(scan=scan, bins=(0.0, 50.0, 1), spp=None, target_error=0.02, max_bounces=5)
+    config["render"]["engine"] = "virtual_lights"
+    if scan == "exhaustive":
+        config["capture"]["laser_grid"] = {"nx": 2, "ny": 4}
+    result = render(config)
+    # float32: areas of spherical triangles, four cosines and distances, each good to 1e-7
+    np.testing.assert_allclose(result.bounce(3), bounce_energy(3), rtol=1e-5)
+    if scan != "confocal":
+        np.testing.assert_allclose(result.bounce(2), bounce_energy(2), rtol=1e-5)
+    for k in (4, 5):
+        sigma = float(np.sqrt(result.bounce_variance(k)).mean())
+        replicas = result.plan.replicas
+        assert abs(result.bounce(k).mean() - bounce_energy(k)) < t_limit(2, replicas - 1) * sigma
+        assert sigma < 0.1 * bounce_energy(k)
+
+
 @pytest.mark.parametrize("russian_roulette", [True, False])
 def test_all_bounces_of_a_sphere_sum_to_the_geometric_series(russian_roulette: bool) -> None:
     """Without a limit: sum over k of rho^k / (4 pi^2 R^2) = rho^2 / (1 - rho) / (4 pi^2 R^2); no path is cut off."""
@@ -129,16 +164,19 @@ def test_the_third_bounce_of_a_pair_in_a_sphere_is_that_of_quadrature() -> None:
     """Per bin: the even point between the two has |l - x| + |x - s| distributed as over equal-area cells."""
     config = sphere_room(bins=(0.0, 0.1, 40), spp=65536, max_bounces=3, capture={"laser_point": [0.4, 0.3]})
     result = render(config, replicas=REPLICAS)
-    laser, cells = laser_on_sphere(0.4, 0.3), sphere_cells([0, 0, 0], RADIUS, 500)
-    edges = 0.1 * np.arange(41)
-    share = np.full(len(cells.points), bounce_energy(3) / len(cells.points))
-    first = np.linalg.norm(cells.points - laser, axis=-1)
-    rows = [
-        binned(share, first + np.linalg.norm(cells.points - sensor, axis=-1), edges)
-        for sensor in sphere_points(5, 3).reshape(-1, 3)
-    ]
-    reference = np.array(rows).reshape(result.total.shape)
+    reference = third_bounce_in_a_sphere(0.4, 0.3, 0.1 * np.arange(41), 500).reshape(result.total.shape)
     assert_agrees(result.bounce(3), result.bounce_variance(3), reference, replicas=REPLICAS, floor=2e-3)
+
+
+def test_the_third_bounce_of_virtual_lights_in_a_sphere_is_that_of_quadrature() -> None:
+    """Per bin, to the error asked for, of a wall that is cut into cells itself."""
+    config = sphere_room(bins=(0.0, 0.1, 40), spp=None, target_error=0.01, max_bounces=3)
+    config["render"]["engine"] = "virtual_lights"
+    config["capture"]["laser_point"] = [0.4, 0.3]
+    third = render(config).bounce(3)
+    reference = third_bounce_in_a_sphere(0.4, 0.3, 0.1 * np.arange(41), 1000).reshape(third.shape)
+    # the error asked for, and that of quadrature in 1000 x 1000 cells: 4 mm of bins of 10 cm
+    assert np.linalg.norm(third - reference) < 0.02 * np.linalg.norm(reference)
 
 
 def test_arrival_times_in_a_sphere_are_sums_of_chords() -> None:

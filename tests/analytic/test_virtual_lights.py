@@ -243,31 +243,39 @@ def test_patches_cover_every_surface_once(coarseness: float) -> None:
 
 
 @pytest.mark.parametrize(
-    "delays", [(3.2, 3.4, 3.9), (2.0, 2.0, 6.5), (0.7, 5.1, 5.1), (4.25, 4.25, 4.25), (0.1, 2.9, 7.3)]
+    "delays",
+    [(3.2, 3.4, 3.9), (2.0, 2.0, 6.5), (0.7, 5.1, 5.1), (4.25, 4.25, 4.25), (0.1, 2.9, 7.3), (1.5, 9.0, 26.5)],
 )
-def test_a_triangle_is_spread_over_its_bins_by_area(delays: tuple[float, float, float]) -> None:
-    """The share of each bin is the part of the triangle whose (linear) delay falls into it."""
+# whole blocks of bins, a part of one, more than one; windows that begin after the light or end before it
+@pytest.mark.parametrize(("n_bins", "whole"), [(8, 0), (11, 2), (40, 9), (13, -3), (5, -2), (7, -40), (6, 50)])
+def test_a_triangle_is_spread_over_its_bins_by_area(
+    delays: tuple[float, float, float], n_bins: int, whole: int
+) -> None:
+    """The share of each bin is the part of the triangle whose (linear) delay falls into it; the rest is outside."""
     start_backend("llvm")
     import drjit as dr
     import mitsuba as mi
 
-    from nlosrender.engine.histogram import DeviceHistogram, HistogramShape
-    from nlosrender.engine.virtual_lights.gather import spread_triangle
+    from nlosrender.engine.histogram import HistogramShape
+    from nlosrender.engine.virtual_lights.block_histogram import BlockHistogram
+    from nlosrender.engine.virtual_lights.spread import spread_triangle
 
-    histogram = DeviceHistogram(HistogramShape(1, 1, 1, 1, 1, 8))
-    corners = [mi.Float(delay) for delay in (delays[1], delays[0], delays[2])]
+    histogram = BlockHistogram(HistogramShape(1, 1, 1, 1, 1, n_bins), np.zeros(1, np.int64))
+    # opaque: one kernel per window serves all
+    corners = [dr.opaque(mi.Float, delay) for delay in (delays[1], delays[0], delays[2])]
     zero = mi.UInt32(0)
-    spread_triangle(histogram, zero, zero, mi.Vector3f(*corners), mi.Int32(0), mi.Spectrum(2.0), mi.Bool(True))
-    dr.eval(histogram.sums)
-    shares = histogram.sums.numpy()
+    spread_triangle(
+        histogram, zero, zero, mi.Vector3f(*corners), dr.opaque(mi.Int32, whole), mi.Spectrum(2.0), mi.Bool(True)
+    )
+    shares = histogram.on_host().ravel()
     # midpoints of n^2 equal parts: strips along an edge misplace at most 1 / n of the area
     n = 2000
     i, j = np.meshgrid(np.arange(n), np.arange(n))
     keep = i + j < n
     u, v = (i[keep] + 1 / 3) / n, (j[keep] + 1 / 3) / n
     delay = delays[0] + u * (delays[1] - delays[0]) + v * (delays[2] - delays[0])
-    expected = np.histogram(delay, bins=np.arange(9.0))[0] / keep.sum()
-    assert shares[:8] == pytest.approx(2 * expected, abs=4 / n)
+    expected = np.histogram(delay + whole, bins=np.arange(n_bins + 1.0))[0] / keep.sum()
+    assert shares[:-1] == pytest.approx(2 * expected, abs=4 / n)
     assert shares.sum() == pytest.approx(2.0, rel=1e-6)
 
 

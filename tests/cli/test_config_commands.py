@@ -120,11 +120,9 @@ def test_schema_describes_every_section() -> None:
     bins = schema["$defs"]["TimeAxisConfig"]["properties"]
     assert bins["bin_width_opl"]["exclusiveMinimum"] == 0
     assert "10 ps" in bins["bin_width_opl"]["description"]
-    assert set(schema["$defs"]["SceneConfig"]["properties"]["relay_wall"]["discriminator"]["mapping"]) == {
-        "rectangle",
-        "sphere",
-        "cylinder",
-    }
+    wall, nothing = schema["$defs"]["SceneConfig"]["properties"]["relay_wall"]["anyOf"]
+    assert set(wall["discriminator"]["mapping"]) == {"rectangle", "sphere", "cylinder", "mesh"}
+    assert nothing == {"type": "null"}
 
 
 @pytest.mark.parametrize("command", ["new", "validate", "schema"])

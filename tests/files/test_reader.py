@@ -229,3 +229,13 @@ def test_metadata_of_many_chunks_is_quick(tmp_path: Path) -> None:
     start = time.monotonic()
     assert summarise(path)["scan_type"] == "confocal"
     assert time.monotonic() - start < 0.5
+
+
+def test_a_file_with_a_bounce_axis_out_of_all_proportion_is_no_capture(tmp_path: Path) -> None:
+    """A billion bounces would take gigabytes for their numbers alone."""
+    path = tmp_path / "long.hdf5"
+    with h5py.File(path, "w") as file:
+        file.create_dataset("data", shape=(1, 10, 10**9, 3, 5), dtype="<f4", chunks=(1, 10, 1, 3, 5))
+        file["deltaT"] = np.float32(0.003)
+    with pytest.raises(FileError, match="1000000000 bounces, a capture has 6"):
+        read_header(path)

@@ -123,7 +123,7 @@ def test_data_of_another_type_and_bounce_axis(tmp_path: Path) -> None:
     found = validate_file(tmp_path / "a.hdf5")
     assert "data: float64, need 32-bit floating point" in found
     assert "data: bounce axis of length 4, need 6" in found
-    assert "data: 2 channels, need 1 or 3" in found
+    assert "data: 2 channels, need 1, 3 or 4" in found
     assert "data: nan at index (1, 6, 2, 1, 4)" in found
 
 
@@ -133,4 +133,4 @@ def test_colour_without_names(tmp_path: Path, header_of: Callable, write_capture
     write_capture(path, header_of(n_channels=3))
     with h5py.File(path, "r+") as file:
         del file.attrs["channels"]
-    assert validate_file(path) == ["attribute 'channels': missing, need the names of the three channels"]
+    assert validate_file(path) == ["attribute 'channels': missing, need the names of the channels"]

@@ -185,3 +185,37 @@ def test_impossible_meshes_are_errors_that_name_what_is_wrong(
     """The first vertex or face that cannot be is in the message."""
     with pytest.raises(ConfigError, match=message):
         of_mesh(write_ply(tmp_path / "bad.ply", vertices, faces), "path")
+
+
+@pytest.mark.parametrize("engine", BOTH)
+def test_an_item_on_top_of_another_counts_once(engine: str, tmp_path: Path, ledger: Ledger) -> None:
+    """Part of a second item lies exactly on the first: that part is left out, whatever its reflectance."""
+    beside = QUAD + np.array([0.0, 0.5, 0.0])
+    halves = np.concatenate([QUAD, beside]), np.concatenate([TOWARDS_WALL[:, [2, 0, 1]], TOWARDS_WALL + 4])
+    place = {"type": "mesh", "translate": [0.1, 0.0, 0.9], "face_normals": True}
+    first, both, rest = (
+        place | {"filename": str(write_ply(tmp_path / f"{name}.ply", *mesh))}
+        for name, mesh in (("first", (QUAD, TOWARDS_WALL)), ("both", halves), ("rest", (beside, TOWARDS_WALL)))
+    )
+    grey = {"bsdf": {"type": "diffuse", "reflectance": 0.25}}
+    settings = {"engine": engine, "max_bounces": 3, "sensors": (3, 2)}
+    overlaid = render(scene(first, both | grey, **settings))
+    apart = render(scene(first, rest | grey, **settings))
+    assert apart.mean.sum() > 0
+    ledger.check(
+        f"an item on top of another counts once ({engine})", relative_difference(overlaid.mean, apart.mean), 1e-6
+    )
+
+
+def test_an_item_that_is_wholly_on_another_is_refused(tmp_path: Path) -> None:
+    """Nothing of it would be left."""
+    item = {"type": "rectangle", "width": 0.3, "height": 0.2, "center": [0, 0, 1], "normal": [0, 0, -1]}
+    with pytest.raises(ConfigError, match=r"hidden_geometry.1.*exactly where earlier items are"):
+        render(scene(item, dict(item), engine="path", max_bounces=3))
+
+
+def test_sheets_that_face_opposite_ways_in_one_place_are_left_alone() -> None:
+    """Two boxes that share a side have such faces, and nobody sees them."""
+    boxes = [{"type": "box", "center": [x, 0, 1], "size": [0.2, 0.2, 0.2]} for x in (-0.1, 0.1)]
+    together = render(scene(*boxes, engine="virtual_lights", max_bounces=3, sensors=(3, 2)))
+    assert together.mean.sum() > 0

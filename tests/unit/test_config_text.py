@@ -209,7 +209,7 @@ def test_the_starter_names_every_key(scan_type) -> None:
         for value in vars(module).values()
         if isinstance(value, type) and issubclass(value, BaseModel) and "type" in value.model_fields
     ]
-    assert len(sections) == 6 + 8 + 3
+    assert len(sections) == 6 + 8 + 4
     for section in sections:
         for key in section.model_fields:
             assert re.search(rf"\b{key}:", text), f"{section.__name__}.{key}"

@@ -155,12 +155,12 @@ def prepared(config):
 
 
 def skipped(*hidden, wall=None, **render) -> dict[str, str]:
-    from nlosrender.engine.skipped import skipped_work
-
     scene = flat_wall(*hidden, **{"spp": None, "engine": "auto", **render})
     scene["scene"]["relay_wall"] = wall or scene["scene"]["relay_wall"]
     config = configured(scene)
     _, _, engine = prepared(config)
+    from nlosrender.engine.skipped import skipped_work  # the backend has to be started before
+
     items = skipped_work(engine, scene_is_colored=config.scene.is_colored)
     return {item.what: item.why for item in items}
 
@@ -175,7 +175,7 @@ TUBE = {"type": "cylinder", "center": [0, 0, 0], "axis": [0, 1, 0], "radius": 1.
         ("second bounce", ((PLATE,), {}), ((PLATE,), {"wall": TUBE})),
         ("bounces above 4", ((PLATE,), {"max_bounces": 4}), ((PLATE,), {"max_bounces": None})),
         ("visibility rays", ((PLATE,), {}), ((PLATE, BALL), {})),
-        ("visibility rays", ((PLATE,), {}), ((PLATE,), {"engine": "path"})),
+        ("visibility rays", ((PLATE,), {"engine": "path"}), ((PLATE, BALL), {"engine": "path"})),
         ("2 of 12 triangles", ((BOX_ITEM,), {}), ((PLATE,), {})),
         ("colour", ((PLATE,), {}), (({**PLATE, "bsdf": RED},), {})),
         ("colour", (({**PLATE, "bsdf": RED},), {"color": "grey"}), ((PLATE,), {"color": "rgb"})),

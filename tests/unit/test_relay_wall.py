@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from nlosrender.scene.pose import Pose
-from nlosrender.scene.relay_wall import CylinderWall, RectangleWall, SphereWall, cylinder_pose, relay_wall_from_config
+from nlosrender.scene.relay_wall import RectangleWall, relay_wall_from_config
+from nlosrender.scene.round_walls import CylinderWall, SphereWall, cylinder_pose
 
 WALLS = {
     "rectangle": RectangleWall(Pose.identity(), 1.2, 0.7),

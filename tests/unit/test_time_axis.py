@@ -9,7 +9,8 @@ from nlosrender.capture.grids import build_capture
 from nlosrender.capture.time_axis import TimeAxis, latest_arrival, resolve_time_axis
 from nlosrender.errors import ConfigError
 from nlosrender.scene.pose import Pose
-from nlosrender.scene.relay_wall import CylinderWall, RectangleWall, SphereWall
+from nlosrender.scene.relay_wall import RectangleWall
+from nlosrender.scene.round_walls import CylinderWall, SphereWall
 
 WALL = RectangleWall(Pose.identity(), 2.0, 1.5)
 SPHERE = SphereWall(np.zeros(3), 0.8)

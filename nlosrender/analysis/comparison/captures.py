@@ -93,7 +93,7 @@ def bounce_name(header: StoredHeader, bounce: int) -> str:
     """Return what an index of a file's bounce axis holds: a bounce number, "7 and above" or "all"."""
     limit = header.attributes.get("max_bounces")
     highest = limit if isinstance(limit, int) else None
-    return BounceAxis(highest, header.split_bounces is not False).name(bounce)
+    return BounceAxis(highest, header.split_bounces is not False, header.first_bounce).name(bounce)
 
 
 def compare_captures(path: str | Path, reference: str | Path, tolerances: Tolerances) -> Comparison:

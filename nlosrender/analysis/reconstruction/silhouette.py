@@ -97,7 +97,7 @@ def _surfaces(source: Path, attributes: Mapping[str, object]) -> tuple[Surface, 
         raise FileError(f"{source}: does not carry the scene's configuration, so there is nothing to score against")
     try:
         config = parse_config(text, str(source), source.absolute().parent)
-        wall = relay_wall_from_config(config.scene.relay_wall)
+        wall = relay_wall_from_config(config.scene.wall)
         return hidden_surfaces(config.scene.hidden_geometry, wall)
     except (ConfigError, ValueError) as error:
         raise FileError(f"{source}: the configuration it carries cannot be used: {error}") from error

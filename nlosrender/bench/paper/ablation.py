@@ -47,7 +47,7 @@ FORWARD, BOTH = TECHNIQUES[0], TECHNIQUES[-1]
 
 def ablation(study: Study, name: str, figure: str, title: str) -> PaperFigure:
     """Figures 8 and 9: the same number of paths by every technique."""
-    side, spp = study.pick((48, 2048), (256, 20_000))
+    side, spp = study.pick((48, 2048), (128, 20_000))
     common = (f"capture.sensor_grid={{nx: {side}, ny: {side}}}", f"capture.laser_spot_radius={SPOT_RADIUS}")
     reference = study.render(
         name, f"{name}-reference", *common, *BOTH.overrides,

@@ -12,8 +12,11 @@ from pathlib import Path
 from nlosrender.bench.paper.ablation import ablation
 from nlosrender.bench.paper.binning import time_binning
 from nlosrender.bench.paper.convergence import convergence
+from nlosrender.bench.paper.curved_walls import curved_walls
 from nlosrender.bench.paper.figure import PaperFigure
+from nlosrender.bench.paper.light_in_flight import light_in_flight
 from nlosrender.bench.paper.page import write_page
+from nlosrender.bench.paper.polarised_light import polarised_light
 from nlosrender.bench.paper.rooms import closed_rooms
 from nlosrender.bench.paper.scenes_table import scenes_table
 from nlosrender.bench.paper.silhouettes import silhouettes
@@ -25,8 +28,11 @@ from nlosrender.files.provenance import package_versions
 # by the name that --figure takes
 FIGURES: Mapping[str, Callable[[Study], PaperFigure]] = {
     "1": captured_letters,
+    "2": partial(light_in_flight, name="cornell-box"),
     "4": z_letter,
     "6": time_binning,
+    "7": partial(light_in_flight, name="interior-mirror"),
+    "7-xml": partial(light_in_flight, name="../mitsuba-scene"),
     "table1": scenes_table,
     "8": partial(ablation, name="letters-near", figure="Figure 8, Table 2", title="the four techniques, close"),
     "9": partial(
@@ -35,6 +41,8 @@ FIGURES: Mapping[str, Callable[[Study], PaperFigure]] = {
     "10": closed_rooms,
     "11": convergence,
     "12": silhouettes,
+    "13": polarised_light,
+    "walls": curved_walls,
 }
 
 

@@ -1,4 +1,4 @@
-"""Hidden triangles, quartered where a laser or sensor point is near: the units that patches and sites are made of."""
+"""Triangles, quartered where a laser or sensor point is near: the units that patches and sites are made of."""
 
 from __future__ import annotations
 
@@ -7,13 +7,17 @@ from dataclasses import dataclass
 import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from nlosrender.capture.grids import Capture, PointGrid
 from nlosrender.engine.surface_sampler import facing_triangles
-from nlosrender.scene.build import BuiltScene
+from nlosrender.scene.build import WALL_ID, BuiltScene
 from nlosrender.scene.pose import Float64
 
 NEAREST = 1e-3  # engine units: surfaces nearer to a laser or sensor point are not cut any finer
+ROUNDING = 1e-9  # engine units: points that lie so near to those of a regular grid are that grid
+NEIGHBOURS = 8  # points asked for the nearest that is not in the plane of a cell
+IN_PLANE = 1e-5  # cosine below which a cell of the wall is in the plane of a point, and neither lights nor sees it
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,7 +72,7 @@ class RegularPoints:
 
 
 class WallDistance:
-    """Distance from the nearest laser or sensor point of a capture before a planar wall.
+    """Distance from the nearest laser or sensor point of a capture.
 
     Parameters
     ----------
@@ -80,21 +84,52 @@ class WallDistance:
 
     def __init__(self, capture: Capture, unit: float):
         grids = {id(grid): grid for grid in (capture.sensor_grid, capture.laser_grid)}
-        self._grids = [RegularPoints.of(grid, unit) for grid in grids.values()]
+        self._points = np.concatenate([grid.positions.reshape(-1, 3) / unit for grid in grids.values()])
+        self._normals = np.concatenate([grid.normals.reshape(-1, 3) for grid in grids.values()])
+        self._all: cKDTree | None = None
+        self._regular: list[RegularPoints] = []
+        self._trees: list[cKDTree] = []
+        for grid in grids.values():
+            regular = RegularPoints.of(grid, unit)
+            positions = grid.positions.reshape(-1, 3) / unit
+            if regular.squared_distance(positions).max() < ROUNDING**2:
+                self._regular.append(regular)
+            else:
+                self._trees.append(cKDTree(positions))
 
     def __call__(self, points: Float64) -> Float64:
         """Return the distance (n,) of ``points`` (n, 3) [engine units]."""
-        return np.sqrt(np.min([grid.squared_distance(points) for grid in self._grids], axis=0))
+        squares = [grid.squared_distance(points) for grid in self._regular]
+        squares += [np.square(tree.query(points)[0]) for tree in self._trees]
+        return np.sqrt(np.min(squares, axis=0))
+
+    def out_of_plane(self, points: Float64) -> Float64:
+        """Return the distance (n,) of points of the wall (n, 3) from the nearest one whose plane they are not in.
+
+        Where there is none among ``NEIGHBOURS``, the distance of the last of them: no other is nearer.
+        """
+        if self._all is None:
+            self._all = cKDTree(self._points)
+        count = min(NEIGHBOURS, len(self._points))
+        distances, index = self._all.query(points, k=np.arange(1, count + 1))
+        heights = np.einsum("nkx,nkx->nk", points[:, None] - self._points[index], self._normals[index])
+        apart = np.abs(heights) > IN_PLANE * distances
+        apart[:, -1] = True
+        return distances[np.arange(len(points)), apart.argmax(axis=1)]
 
 
 def cells_of_mesh(built: BuiltScene, index: int, mesh: mi.Mesh, distance: WallDistance) -> Cells:
-    """Quarter the triangles of shape ``index`` until none is longer than its distance from the nearest point."""
+    """Quarter the triangles of shape ``index`` until none is longer than its distance from the nearest point.
+
+    The points lie on those of the wall: there only points in the planes of other triangles count.
+    """
+    from_points = distance.out_of_plane if mesh.id() == WALL_ID else distance
     corners, primitives = facing_triangles(built, mesh)
     weights = np.broadcast_to(np.eye(3), corners.shape)
     done: list[Cells] = []
     while len(corners):
         sizes = longest_edges(corners)
-        distances = np.maximum(distance(corners.mean(axis=1)), NEAREST)
+        distances = np.maximum(from_points(corners.mean(axis=1)), NEAREST)
         large = sizes > distances
         small = Cells(corners, weights, np.full(len(corners), index, np.uint32), primitives, sizes, distances)
         done.append(small.at(~large))

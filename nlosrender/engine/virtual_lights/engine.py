@@ -21,7 +21,7 @@ from nlosrender.engine.sampling import DEFAULT_TARGET, Budget, Progress
 from nlosrender.engine.virtual_lights.further_bounces import FurtherBounces, rounds_needed
 from nlosrender.engine.virtual_lights.lights import GatherSettings
 from nlosrender.engine.virtual_lights.occlusion import nothing_occludes
-from nlosrender.engine.virtual_lights.tessellator import Tessellator
+from nlosrender.engine.virtual_lights.tessellator import Tessellator, wall_sees_itself
 from nlosrender.engine.virtual_lights.third_bounce import (
     FIRST_COARSENESS,
     REFINEMENT,
@@ -47,8 +47,8 @@ class VirtualLightEngine:
     Parameters
     ----------
     built, capture, time_axis, options
-        As for the path engine. The wall has to be planar, the hidden geometry meshes, spheres and cylinders, none of
-        them a mirror.
+        As for the path engine. The hidden geometry has to be meshes, spheres and cylinders, none of them a mirror, and
+        no more than the wall may be.
     lanes
         Lanes that keep the backend busy.
     """
@@ -59,16 +59,17 @@ class VirtualLightEngine:
         self.built, self.capture, self.time_axis, self.options, self.lanes = built, capture, time_axis, options, lanes
         self.paths = PathEngine(built, capture, time_axis, options, first_bounce=THIRD_BOUNCE + 1)
         self.tessellator = Tessellator(built, capture, time_axis.bin_width_opl / built.unit)
+        shapes = (*built.hidden_shapes, *([built.wall_shape] if wall_sees_itself(built) else []))
         self.settings = GatherSettings(
             is_confocal=capture.scan_type == "confocal",
-            is_diffuse=all(is_lambertian(shape.bsdf()) for shape in built.hidden_shapes),
+            is_diffuse=all(is_lambertian(shape.bsdf()) for shape in shapes),
             needs_visibility=not nothing_occludes(built),
         )
         self.third = ThirdBounce(self.paths, self.tessellator, self.settings, lanes)
         self.further: FurtherBounces | None = None  # else the path engine
         if self.has_further_bounces and self.settings.is_diffuse:
             self.further = FurtherBounces(self.paths, self.tessellator, self.settings.needs_visibility)
-        self.reason = "Lambertian surfaces before a planar wall"
+        self.reason = f"Lambertian surfaces before a {'planar' if built.wall.is_planar else 'curved'} wall"
         self._settled: dict[Budget, Budget] = {}
 
     @property
@@ -175,6 +176,8 @@ class VirtualLightEngine:
         statistics = histogram.statistics(done, self.paths.scale, range(-first, bounces.n_slots - first))
         mean, variance = (histogram.on_host(values) for values in statistics)
         impulses = done * self.further.impulses_per_round
+        if not self.built.wall.is_planar:
+            mean[:, :1] += self.paths.second_bounce(batch)
         return Histogram(mean[..., :-1], variance[..., :-1], mean[..., -1], impulses)
 
     def _fineness_in_time(self, budget: Budget, target: float) -> float:

@@ -1,14 +1,7 @@
 """The gather: every sensor point looks at every patch; each patch's light is spread over the bins it covers.
 
-One lane per sensor point walks over all patches, so that a lane owns its rows of the histogram. A triangle's delay
-differs over its area. Let t0 <= t1 <= t2 be the delays (in bins) at its corners; with the delay linear in between,
-the part of its area with a delay below t is
-
-    (t - t0)^2 / ((t2 - t0)(t1 - t0))          for t0 <= t <= t1
-    1 - (t2 - t)^2 / ((t2 - t0)(t2 - t1))      for t1 <= t <= t2
-
-and the share of a bin is the difference of this function at the bin's edges: no noise, exact for a linear delay.
-Cf. Iseringhausen & Hullin 2020; Tsai et al. 2019.
+One lane per sensor point walks over all patches, so that a lane owns its rows of the histogram (``spread``). The lanes
+of a packet are neighbouring sensor points that look at one point of the same patch: packets of rays stay together.
 """
 
 from __future__ import annotations
@@ -19,12 +12,10 @@ import drjit as dr
 import mitsuba as mi
 
 from nlosrender.engine.device_arrays import WallPoints
-from nlosrender.engine.histogram import DeviceHistogram
-from nlosrender.engine.low_discrepancy import recurrence_steps
 from nlosrender.engine.transport import Transport
-from nlosrender.engine.virtual_lights.lights import GatherSettings, Lights, four_corners, is_visible, point_inside
-
-NARROWEST = 1e-3  # bins: below it a triangle's delay counts as one number
+from nlosrender.engine.virtual_lights.block_histogram import BlockHistogram
+from nlosrender.engine.virtual_lights.lights import ROWS, GatherSettings, Lights, four_corners, is_visible
+from nlosrender.engine.virtual_lights.spread import spread_triangle
 
 
 @dr.syntax
@@ -32,30 +23,21 @@ def gather_third_bounce(
     settings: GatherSettings,
     transport: Transport,
     lights: Lights,
-    histogram: DeviceHistogram,
+    histogram: BlockHistogram,
     slice_of_lane: mi.UInt32,
-    jitter: mi.UInt32,
 ) -> None:
     """Deposit the third bounce: lane by lane over the patches of its slice.
 
-    Parameters
-    ----------
-    slice_of_lane
-        Several lanes may share the patches of one sensor point, each into rows of its own.
-    jitter
-        Per lane: start of the sequence that places the visibility ray within each patch. A ray to a random point
-        makes a partly hidden patch count by its visible share, on average.
+    Several lanes may share the patches of one sensor point, each into rows of its own.
     """
     built, sensors = transport.built, transport.sensors
     sensor, wall_bsdf = sensors.interaction, built.wall_bsdf
     context = mi.BSDFContext()
     lane = dr.arange(mi.UInt32, dr.width(sensors.delay_bins))
-    steps = recurrence_steps(2)
     n_lasers, count = transport.n_lasers, lights.count
     own_laser = transport.lasers.gather(transport.first_laser)
 
     end = dr.gather(mi.UInt32, lights.first, slice_of_lane + 1)
-    start_u, start_v = mi.UInt32(jitter), mi.UInt32(jitter * 0x9E3779B1)
 
     # ---- State ---------------------------------------------------------------------------------------------------
     patch = dr.gather(mi.UInt32, lights.first, slice_of_lane)
@@ -64,8 +46,6 @@ def gather_third_bounce(
         patch < end,
         exclude=[
             end,
-            start_u,
-            start_v,
             settings,
             transport,
             lights,
@@ -78,8 +58,8 @@ def gather_third_bounce(
         ],
     ):
         # ---- The patch as the sensor point sees it -----------------------------------------------------------------
-        rows = [dr.gather(mi.Vector4f, lights.packed, patch * 4 + k) for k in range(4)]
-        a, b, c, centre = (mi.Point3f(row.x, row.y, row.z) for row in rows)
+        rows = [dr.gather(mi.Vector4f, lights.packed, patch * ROWS + k) for k in range(ROWS)]
+        a, b, c, centre, shown = (mi.Point3f(row.x, row.y, row.z) for row in rows)
         areas = mi.Vector3f(rows[0].w, rows[1].w, rows[2].w)
         to_patch = centre - sensor.p
         distance2 = dr.squared_norm(to_patch)
@@ -94,18 +74,12 @@ def gather_third_bounce(
 
         is_cluster = None
         if dr.hint(lights.has_clusters, mode="scalar"):
-            member = dr.gather(mi.Vector4f, lights.members, patch)
-            is_cluster = member.w > 0
+            is_cluster = rows[3].w > 0
 
         # ---- Visibility --------------------------------------------------------------------------------------------
         if dr.hint(settings.needs_visibility, mode="scalar"):
-            number = dr.gather(mi.UInt32, lights.numbers, patch)
-            seq_u, seq_v = start_u + number * steps[0], start_v + number * steps[1]
-            point = point_inside([a, b, c], mi.Float(seq_u >> 8) * 2.0**-24, mi.Float(seq_v >> 8) * 2.0**-24)
-            point += areas * rows[3].w
-            if dr.hint(lights.has_clusters, mode="scalar"):
-                point = dr.select(is_cluster, mi.Point3f(*member.xyz), point)
-            active = is_visible(built, sensor, point, active)
+            is_open = rows[4].w > 0
+            active &= is_open | is_visible(built, sensor, shown, active & ~is_open)
 
         # ---- Reflect towards the lasers and deposit ----------------------------------------------------------------
         scale = transport.bins_per_unit
@@ -153,7 +127,7 @@ class _SeenPatch:
 def _deposit(
     settings: GatherSettings,
     lights: Lights,
-    histogram: DeviceHistogram,
+    histogram: BlockHistogram,
     sensors: WallPoints,
     laser_points: WallPoints,
     lane: mi.UInt32,
@@ -175,7 +149,7 @@ def _deposit(
 
 
 def _spread(
-    histogram: DeviceHistogram,
+    histogram: BlockHistogram,
     lane: mi.UInt32,
     laser: mi.UInt32,
     delays: mi.Vector4f,
@@ -194,40 +168,6 @@ def _spread(
     spread_triangle(histogram, lane, laser, mi.Vector3f(a, c, d), whole, value, active & is_cluster)
 
 
-@dr.syntax
-def spread_triangle(
-    histogram: DeviceHistogram,
-    lane: mi.UInt32,
-    laser: mi.UInt32,
-    delays: mi.Vector3f,
-    whole: mi.Int32,
-    value: mi.Spectrum,
-    active: mi.Bool,
-) -> None:
-    """Deposit ``value`` over the bins that a triangle with corner ``delays`` [bins] covers."""
-    a, b, c = delays
-    t0 = dr.minimum(a, dr.minimum(b, c))
-    t2 = dr.maximum(a, dr.maximum(b, c))
-    t1 = dr.maximum(dr.minimum(a, b), dr.minimum(dr.maximum(a, b), c))
-    base = dr.floor(t0)
-    t0, t1, t2 = t0 - base, t1 - base, t2 - base
-    span = dr.maximum(t2 - t0, NARROWEST)
-    rising = dr.rcp(span * dr.maximum(t1 - t0, 1e-6))
-    falling = dr.rcp(span * dr.maximum(t2 - t1, 1e-6))
-    edge = mi.Float(0)  # left edge of the bin, counted from ``base``
-    below = mi.Float(0)  # share of the area with a delay below it
-    more = mi.Bool(active)
-    slot = mi.UInt32(0)
-    while dr.hint(more, exclude=[histogram, value, lane, laser, whole, slot]):
-        edge += 1
-        up = dr.square(edge - t0) * rising
-        down = 1 - dr.square(dr.maximum(t2 - edge, 0)) * falling
-        share = dr.select(edge >= t2, 1, dr.select(edge < t1, up, down))
-        histogram.deposit(lane, laser, slot, mi.Int32(base + edge) - 1 + whole, value * (share - below), more)
-        below = share
-        more = edge < t2
-
-
 def _reflected(
     lights: Lights, patch: mi.UInt32, direction: mi.Vector3f, to_laser: mi.Vector3f, active: mi.Bool
 ) -> mi.Spectrum:
@@ -235,9 +175,3 @@ def _reflected(
     si = dr.gather(mi.SurfaceInteraction3f, lights.interaction, patch)
     si.wi = si.to_local(-direction)
     return si.bsdf().eval(mi.BSDFContext(), si, si.to_local(to_laser), active)
-
-
-def own_rows(points: WallPoints, sensors: int, slices: int) -> tuple[WallPoints, mi.UInt32]:
-    """Repeat the sensor points once per slice of the patches; return them and each lane's slice."""
-    lane = dr.arange(mi.UInt32, sensors * slices)
-    return points.gather(lane % sensors), lane // sensors

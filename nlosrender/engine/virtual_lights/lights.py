@@ -9,13 +9,16 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from nlosrender.engine.connections import RAY_OFFSET
+from nlosrender.engine.connections import off_the_wall
 from nlosrender.engine.low_discrepancy import recurrence_steps
+from nlosrender.engine.space_filling import z_order
 from nlosrender.engine.transport import Transport
+from nlosrender.engine.virtual_lights.occlusion import HiddenHull
 from nlosrender.engine.virtual_lights.patches import Patches
 from nlosrender.scene.build import BuiltScene
 from nlosrender.scene.pose import Float64
 
+ROWS = 5  # of four numbers each: what the gather reads of a patch
 LASER_RAYS = 4  # shadow rays from a laser to points spread over a patch
 
 
@@ -39,28 +42,42 @@ class DevicePatches:
     areas: mi.Vector3f  # geometric normal times area
     interaction: mi.SurfaceInteraction3f  # at the centres
     reflectance: mi.Spectrum  # of Lambertian patches
+    shown: mi.Point3f  # where rays from sensor points end
+    is_open: mi.Float  # 1 where nothing can stop them
 
 
 @dataclass(frozen=True, eq=False)
 class Lights:
     """What the gather's loop reads: patches that are lit, packed so that one load brings four numbers."""
 
-    packed: mi.Float  # 16 a patch: three corners and the centre, each with one component of normal times area, lift
+    # 20 a patch: three corners, each with one component of normal times area; the centre, and 1 for a cluster; where
+    # rays from sensor points end, and 1 where nothing can stop them
+    packed: mi.Float
     shading: mi.Normal3f  # shading normals
     interaction: mi.SurfaceInteraction3f  # at the centres; not read for Lambertian patches
     reflectance: mi.Spectrum  # confocal Lambertian patches: reflectance / pi
     arriving: mi.Spectrum  # index = laser * count + patch: light that arrives, per area perpendicular to it;
     # of Lambertian patches the light that leaves; empty for confocal captures
     delays: mi.Float  # four an index: from the laser point to each corner [bins]
-    members: mi.Float  # four a patch: ``DevicePatches.members``
     has_clusters: bool
     count: mi.UInt32  # of lit patches, opaque
-    numbers: mi.UInt32  # of the patches before those in the dark were left out
     first: mi.UInt32  # of slice k: its patches are first[k] to first[k + 1]
 
 
-def upload_patches(built: BuiltScene, patches: Patches) -> DevicePatches:
-    """Bring patches to the device and evaluate their reflectance and shading frames."""
+def upload_patches(built: BuiltScene, patches: Patches, hull: HiddenHull, seed: int) -> DevicePatches:
+    """Bring patches to the device, neighbours together, and evaluate their reflectance and shading frames.
+
+    Parameters
+    ----------
+    built, patches
+        The scene and what it was cut into.
+    hull
+        Tells which patches the whole wall sees.
+    seed
+        Of the points that stand for their patches where visibility is asked for. A point at random makes a partly
+        hidden patch count by its visible share, on average; one for all sensor points keeps their rays together.
+    """
+    patches = patches.at(np.argsort(z_order(patches.centres), kind="stable"))
     interaction = surface_at(
         built, patches.centres, patches.normals, patches.shapes, patches.primitives, patches.barycentric
     )
@@ -72,8 +89,16 @@ def upload_patches(built: BuiltScene, patches: Patches) -> DevicePatches:
     # a cluster's members have normals of their own: it is lit and seen by their mean
     frame, own = interaction.sh_frame, mi.Frame3f(mi.Normal3f(interaction.n))
     interaction.sh_frame = dr.select(members.w > 0, own, frame)
-    dr.eval(interaction, reflectance, corners, areas, lift, members)
-    return DevicePatches(corners, lift, members, bool(patches.is_cluster.any()), areas, interaction, reflectance)
+    number, steps = dr.arange(mi.UInt32, len(patches)), recurrence_steps(2)
+    start_u, start_v = mi.sample_tea_32(mi.UInt32(seed), mi.UInt32(0))
+    u, v = (
+        mi.Float((start + number * step) >> 8) * 2.0**-24 for start, step in zip((start_u, start_v), steps, strict=True)
+    )
+    shown = mi.Point3f(dr.select(members.w > 0, members.xyz, point_inside(corners, u, v) + lift))
+    is_open = mi.Float((hull.is_below(patches) & ~patches.is_cluster).astype(np.float32))
+    dr.eval(interaction, reflectance, corners, areas, lift, members, shown, is_open)
+    has_clusters = bool(patches.is_cluster.any())
+    return DevicePatches(corners, lift, members, has_clusters, areas, interaction, reflectance, shown, is_open)
 
 
 def surface_at(
@@ -132,8 +157,8 @@ def light_patches(
     n_lasers
         Lasers of the batch.
     slices
-        Lanes that share the patches of a sensor point. A patch's number decides its slice and its visibility rays,
-        so what one laser sends does not depend on the batch's other lasers, whose patches may be others.
+        Lanes that share the patches of a sensor point. A patch's number decides its slice, so what one laser sends
+        does not depend on the batch's other lasers, whose patches may be others.
     """
     count = dr.width(patches.areas)
     lit = dr.arange(mi.UInt32, count)
@@ -156,15 +181,15 @@ def light_patches(
         dr.gather(mi.Vector3f, patches.areas, lit),
         dr.gather(mi.SurfaceInteraction3f, patches.interaction, lit),
     )
-    lift = dr.norm(dr.gather(mi.Vector3f, patches.lift, lit)) / dr.maximum(dr.norm(areas), 1e-30)
-    rows = [(a, areas.x), (b, areas.y), (c, areas.z), (interaction.p, lift)]
-    packed = dr.zeros(mi.Float, 16 * dr.width(lit))
+    is_cluster = dr.gather(mi.Vector4f, patches.members, lit).w
+    shown, is_open = dr.gather(mi.Point3f, patches.shown, lit), dr.gather(mi.Float, patches.is_open, lit)
+    rows = [(a, areas.x), (b, areas.y), (c, areas.z), (interaction.p, is_cluster), (shown, is_open)]
+    packed = dr.zeros(mi.Float, 4 * ROWS * dr.width(lit))
     lane = dr.arange(mi.UInt32, dr.width(lit))
     for k, (point, fourth) in enumerate(rows):
-        dr.scatter(packed, mi.Vector4f(*point, fourth), lane * 4 + k)
+        dr.scatter(packed, mi.Vector4f(*point, fourth), lane * ROWS + k)
     reflectance = dr.gather(mi.Spectrum, patches.reflectance, lit) * dr.inv_pi
-    members = dr.ravel(dr.gather(mi.Vector4f, patches.members, lit))
-    dr.eval(packed, arriving, delays, interaction, reflectance, members)
+    dr.eval(packed, arriving, delays, interaction, reflectance)
     return Lights(
         packed,
         interaction.sh_frame.n,
@@ -172,10 +197,8 @@ def light_patches(
         reflectance,
         arriving,
         delays,
-        members,
         patches.has_clusters,
         dr.opaque(mi.UInt32, dr.width(lit)),
-        lit,
         first,
     )
 
@@ -237,7 +260,7 @@ def _illuminate(
 
 def is_visible(built: BuiltScene, wall_point: mi.SurfaceInteraction3f, target: mi.Point3f, active: mi.Bool) -> mi.Bool:
     """Return whether nothing lies between a point of the wall and a point of a patch."""
-    origin = wall_point.p + wall_point.n * RAY_OFFSET
+    origin = off_the_wall(built, wall_point)
     direction = target - origin
     # stops short of the patch by 1e-4 of the way: a thin sheet 4 mm in front still hides it
     ray = mi.Ray3f(origin, direction, mi.Float(1 - 1e-4), mi.Float(0), [])

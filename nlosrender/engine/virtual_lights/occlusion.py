@@ -1,13 +1,18 @@
-"""Scenes in which nothing can lie between the wall and a lit patch: no visibility rays are needed there."""
+"""Scenes and patches between which and the wall nothing can lie: no visibility rays are needed there."""
 
 from __future__ import annotations
 
 import mitsuba as mi
 import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import ConvexHull, QhullError
 
+from nlosrender.engine.virtual_lights.patches import Patches
 from nlosrender.scene.build import BuiltScene, wall_box
+from nlosrender.scene.pose import Float64
 
 MOST_FACES = 4000  # beyond it the test itself, faces times vertices, costs more than the rays it saves
+MOST_HEIGHTS = 2**22  # of corners over planes at a time, for memory
 PLANARITY = 1e-6  # engine units: float32 vertices of a plane of size 1 are good to 1e-7
 
 
@@ -38,3 +43,49 @@ def nothing_occludes(built: BuiltScene) -> bool:
     is_convex = heights.max(initial=0.0) <= PLANARITY
     is_room = min(heights.min(initial=0.0), of_wall.min(initial=0.0)) >= -PLANARITY
     return bool(is_convex or is_room)
+
+
+class HiddenHull:
+    """The convex hull of all hidden geometry: a patch in one of its faces is seen from everywhere in front of it.
+
+    Parameters
+    ----------
+    built
+        The scene. Before a curved wall, or with surfaces that reflect on both sides, no patch is known to be seen.
+    """
+
+    def __init__(self, built: BuiltScene):
+        shapes = built.hidden_shapes
+        two_sided = any(bool(shape.bsdf().flags() & mi.BSDFFlags.BackSide) for shape in shapes)
+        self.corners: Float64 | None = None
+        if built.wall.is_planar and shapes and not two_sided:
+            self.corners = _outermost(np.concatenate([_points(shape) for shape in shapes]))
+
+    def is_below(self, patches: Patches) -> NDArray[np.bool_]:
+        """Return which patches (n,) have all hidden geometry behind, or in, their planes."""
+        if self.corners is None:
+            return np.zeros(len(patches), bool)
+        result = np.zeros(len(patches), bool)
+        step = max(1, MOST_HEIGHTS // len(self.corners))
+        for start in range(0, len(patches), step):
+            part = slice(start, start + step)
+            normals = patches.normals[part]
+            offsets = np.einsum("ij,ij->i", patches.centres[part], normals)
+            result[part] = (normals @ self.corners.T).max(axis=1) - offsets <= PLANARITY
+        return result
+
+
+def _points(shape: mi.Shape) -> Float64:
+    """Return points whose convex hull holds a shape: vertices of a mesh, else the corners of its box."""
+    if shape.is_mesh():
+        return np.asarray(mi.traverse(shape)["vertex_positions"], dtype=np.float64).reshape(-1, 3)
+    box = shape.bbox()
+    return np.array([np.ravel(np.asarray(box.corner(k), dtype=np.float64)) for k in range(8)])
+
+
+def _outermost(points: Float64) -> Float64:
+    """Return the points (m, 3) that are corners of the convex hull."""
+    try:
+        return points[ConvexHull(points).vertices]
+    except QhullError:  # all in a plane
+        return np.unique(points, axis=0)

@@ -32,6 +32,10 @@ class Patches:
     def __len__(self) -> int:
         return len(self.areas)
 
+    def at(self, index: NDArray[np.integer]) -> Patches:
+        """Return the patches at ``index``."""
+        return Patches(*(getattr(self, field.name)[index] for field in fields(Patches)))
+
     @classmethod
     def joined(cls, parts: list[Patches]) -> Patches:
         """Return the patches of all parts."""

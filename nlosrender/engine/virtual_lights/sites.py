@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nlosrender.engine.low_discrepancy import recurrence_steps
+from nlosrender.engine.space_filling import z_order
 from nlosrender.engine.virtual_lights.cells import longest_edges, normals_and_areas
 from nlosrender.engine.virtual_lights.round_shapes import onto_round_shapes
 from nlosrender.engine.virtual_lights.tessellator import Tessellator
@@ -64,7 +65,7 @@ class SiteSampler:
         # a cell is no longer than its distance; its own size stands for the distance where it touches a point
         distances = np.maximum(distances, sizes / 2)
         self._reach = distances * (distances + tessellator.reach)
-        order = _along_a_curve(self._corners.mean(axis=1), self._shapes)
+        order = np.lexsort((z_order(self._corners.mean(axis=1)), self._shapes))  # shape by shape, neighbours together
         importance = (self._areas / self._reach)[order]
         self._order = order
         self.is_empty = not importance.sum() > 0
@@ -105,17 +106,3 @@ class SiteSampler:
             areas,
             areas / self._reach[cell],
         )
-
-
-def _along_a_curve(points: Float64, shapes: NDArray[np.uint32]) -> NDArray[np.int64]:
-    """Return an order in which neighbours are near in space: shape by shape, along a Z-order curve (Morton 1966)."""
-    if not len(points):
-        return np.zeros(0, np.int64)
-    low = points.min(axis=0)
-    scaled = (points - low) / max(float((points.max(axis=0) - low).max()), 1e-300)
-    grid = np.minimum((scaled * 1024).astype(np.int64), 1023)
-    code = np.zeros(len(points), np.int64)
-    for bit in range(10):
-        for axis in range(3):
-            code |= ((grid[:, axis] >> bit) & 1) << (3 * bit + axis)
-    return np.lexsort((code, shapes))

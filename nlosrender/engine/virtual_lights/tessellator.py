@@ -1,4 +1,4 @@
-"""Hidden surfaces -> patches, as fine as asked.
+"""Hidden surfaces, and a wall that sees itself -> patches, as fine as asked.
 
 A patch of size h at distance d from the nearest laser or sensor point has an error of order (h/d)^2 in its geometry
 and of h^2/(4 d w) bins in its delay, with w the bin width: within a triangle the delay is taken as linear. One number,
@@ -27,7 +27,7 @@ MERGED = 0.4  # of the size allowed: smaller cells are merged
 
 
 class Tessellator:
-    """Cuts the hidden geometry of one scene into patches, as fine as asked.
+    """Cuts the hidden geometry of one scene, and a wall that sees itself, into patches, as fine as asked.
 
     Triangles are first quartered until none is longer than its distance from the nearest laser or sensor point
     (the *cells*), then cut into equal parts, or merged where they are far smaller than need be.
@@ -48,9 +48,12 @@ class Tessellator:
         self.reach = max(capture.sensor_grid.size) / (2 * built.unit)  # half the sensor grid's extent [engine units]
         cells: list[Cells] = []
         self.round_shapes: list[RoundShape] = []
+        self.wall_index: int | None = None  # of the wall among the scene's shapes, where it is cut as well
         for index, shape in enumerate(built.scene.shapes()):
             if shape.id() == WALL_ID:
-                continue
+                if not wall_sees_itself(built):
+                    continue
+                self.wall_index = index
             if shape.is_mesh():
                 cells.append(cells_of_mesh(built, index, shape, self.distance))
             else:
@@ -77,18 +80,33 @@ class Tessellator:
 
     def count(self, coarseness: float) -> int:
         """Return about how many patches ``patches`` would make, without making them; exactly where none merge."""
+        return sum(self.counts(coarseness))
+
+    def counts(self, coarseness: float) -> tuple[int, int]:
+        """Return ``count`` of the hidden surfaces, and of a wall that sees itself."""
+        hidden = np.ones(len(self.cells.shapes), bool)
+        if self.wall_index is not None:
+            hidden = self.cells.shapes != self.wall_index
         far_smaller = self._far_smaller(coarseness)
-        flat = int((self._splits(coarseness)[~far_smaller] ** 2).sum())
         # an equilateral triangle of the size allowed has 0.43 of its square as area
-        areas = self._areas[far_smaller] / (0.43 * (coarseness * self._allowed[far_smaller]) ** 2)
-        on_round = sum(shape.count(self._allowed_on(shape, coarseness)) for shape in self.round_shapes)
-        return flat + math.ceil(areas.sum()) + on_round
+        merged = self._areas / (0.43 * (coarseness * self._allowed) ** 2)
+        splits = self._splits(coarseness) ** 2
+        counts = [
+            int(splits[~far_smaller & chosen].sum()) + math.ceil(merged[far_smaller & chosen].sum())
+            for chosen in (hidden, ~hidden)
+        ]
+        for shape in self.round_shapes:
+            counts[shape.index == self.wall_index] += shape.count(self._allowed_on(shape, coarseness))
+        return counts[0], counts[1]
 
     @property
     def nearest(self) -> float:
-        """Distance of the nearest cell's centre, or round shape, from any laser or sensor point [engine units]."""
-        on_round = [shape.nearest(self.distance) for shape in self.round_shapes]
-        return min([float(self.cells.distances.min(initial=np.inf)), *on_round])
+        """Distance from the points to the nearest hidden cell's centre, or round shape [engine units]."""
+        on_round = [shape.nearest(self.distance) for shape in self.round_shapes if shape.index != self.wall_index]
+        hidden = np.ones(len(self.cells.shapes), bool)
+        if self.wall_index is not None:
+            hidden = self.cells.shapes != self.wall_index
+        return min([float(self.cells.distances[hidden].min(initial=np.inf)), *on_round])
 
     def round_cells(self) -> list[tuple[RoundShape, Patches]]:
         """Return every round shape, and its cells, whose corners lie on it."""
@@ -106,12 +124,20 @@ class Tessellator:
         return self.cells.sizes < MERGED * coarseness * self._allowed
 
     def _allowed_on(self, shape: RoundShape, coarseness: float) -> float:
-        nearest = max(shape.nearest(self.distance), abs(shape.radius) / 8)
+        if shape.index == self.wall_index:
+            # cos cos / r^2 varies over the radius only, however near: 1 / (4 radius^2) between points of a sphere
+            nearest = abs(shape.radius)
+        else:
+            nearest = max(shape.nearest(self.distance), abs(shape.radius) / 8)
         return coarseness * min(float(self._allowed_at(np.array([nearest]))[0]), abs(shape.radius))
 
 
 def can_tessellate(built: BuiltScene) -> bool:
-    """Return whether every hidden shape is a mesh, a sphere or a cylinder, in front of a planar wall."""
-    return built.wall.is_planar and all(
-        shape.is_mesh() or shape.class_name() in ROUND_PLUGINS for shape in built.hidden_shapes
-    )
+    """Return whether every hidden shape is a mesh, a sphere or a cylinder."""
+    return all(shape.is_mesh() or shape.class_name() in ROUND_PLUGINS for shape in built.hidden_shapes)
+
+
+def wall_sees_itself(built: BuiltScene) -> bool:
+    """Return whether light may go from the wall to the wall: not on a plane, nor outside a sphere or cylinder."""
+    wall = built.wall_shape
+    return not built.wall.is_planar and (wall.is_mesh() or wall.has_flipped_normals())

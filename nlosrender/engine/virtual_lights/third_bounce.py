@@ -11,12 +11,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nlosrender.capture.plan import Batch
-from nlosrender.engine.histogram import DeviceHistogram, HistogramShape, relative_l2_error
+from nlosrender.engine.histogram import HistogramShape, relative_l2_error
 from nlosrender.engine.path_engine import PathEngine
 from nlosrender.engine.pilot import Pilot
+from nlosrender.engine.space_filling import z_order
 from nlosrender.engine.transport import Transport
-from nlosrender.engine.virtual_lights.gather import gather_third_bounce, own_rows
-from nlosrender.engine.virtual_lights.lights import GatherSettings, light_patches, upload_patches
+from nlosrender.engine.virtual_lights.block_histogram import BlockHistogram
+from nlosrender.engine.virtual_lights.gather import gather_third_bounce
+from nlosrender.engine.virtual_lights.lights import ROWS, GatherSettings, Lights, light_patches, upload_patches
+from nlosrender.engine.virtual_lights.occlusion import HiddenHull
+from nlosrender.engine.virtual_lights.patches import Patches
 from nlosrender.engine.virtual_lights.tessellator import MAX_PATCHES, Tessellator
 
 FIRST_COARSENESS = 1.0
@@ -43,8 +47,9 @@ class Gathered:
 class LitPatches:
     """Patches that some laser point lights [engine units]."""
 
-    positions: NDArray[np.float64]  # (n, 3)
+    positions: NDArray[np.float64]  # (n, 3) where rays from sensor points end
     normals: NDArray[np.float64]  # (n, 3)
+    is_open: NDArray[np.bool_]  # (n,) whether nothing can stop these rays
 
 
 class ThirdBounce:
@@ -64,6 +69,7 @@ class ThirdBounce:
 
     def __init__(self, paths: PathEngine, tessellator: Tessellator, settings: GatherSettings, lanes: int):
         self.paths, self.tessellator, self.settings, self.lanes = paths, tessellator, settings, lanes
+        self.hull = HiddenHull(paths.built)
 
     def gather(self, batch: Batch | Pilot, coarseness: float) -> Gathered:
         """Gather a batch at one resolution."""
@@ -71,20 +77,24 @@ class ThirdBounce:
         patches = self.tessellator.patches(coarseness)
         if not len(patches):  # nothing faces the wall
             return Gathered(np.zeros((shape.channels, shape.slots, shape.lasers, shape.sensors, shape.row)), 1)
-        transport, slice_of_lane, jitter = self._transport(batch, shape)
-        on_device = upload_patches(self.paths.built, patches)
-        lights = light_patches(self.settings, transport, on_device, shape.lasers, shape.replicas)
-        histogram = DeviceHistogram(shape)
-        gather_third_bounce(self.settings, transport, lights, histogram, slice_of_lane, jitter)
-        return Gathered(histogram.on_host(histogram.total()), len(patches))
+        transport, slice_of_lane, order = self._transport(batch, shape)
+        histogram = BlockHistogram(shape, order)
+        lights = self._lights(transport, shape, patches)
+        gather_third_bounce(self.settings, transport, lights, histogram, slice_of_lane)
+        return Gathered(histogram.on_host(), len(patches))
 
     def lit_patches(self, batch: Batch | Pilot, coarseness: float) -> LitPatches:
-        """Return the patches that the gather of a batch goes through."""
+        """Return the patches that the gather of a batch goes through, in its order."""
         shape = self.shape(batch)
         transport, _, _ = self._transport(batch, shape)
-        on_device = upload_patches(self.paths.built, self.tessellator.patches(coarseness))
-        surface = light_patches(self.settings, transport, on_device, shape.lasers, shape.replicas).interaction
-        return LitPatches(np.array(surface.p, np.float64).T, np.array(surface.n, np.float64).T)
+        lights = self._lights(transport, shape, self.tessellator.patches(coarseness))
+        shown = np.array(lights.packed).reshape(-1, ROWS, 4)[:, ROWS - 1]
+        normals = np.array(lights.interaction.n, np.float64).T
+        return LitPatches(shown[:, :3].astype(np.float64), normals, shown[:, 3] > 0)
+
+    def _lights(self, transport: Transport, shape: HistogramShape, patches: Patches) -> Lights:
+        on_device = upload_patches(self.paths.built, patches, self.hull, self.paths.options.seed)
+        return light_patches(self.settings, transport, on_device, shape.lasers, shape.replicas)
 
     def pair(self, batch: Batch | Pilot, fineness: float) -> tuple[Gathered, Gathered]:
         """Gather a batch at ``fineness`` and at the coarser resolution it is compared with."""
@@ -111,16 +121,23 @@ class ThirdBounce:
             coarse, fineness = fine, self.finer(fineness, min(max(MARGIN * error / target, 1.25), REFINEMENT))
 
     def finer(self, coarseness: float, factor: float) -> float:
-        """Return a coarseness with at least ``factor`` times the patches (a mesh may be finer than asked for)."""
-        count, finer = self.tessellator.count(coarseness), coarseness / math.sqrt(factor)
-        while 0 < self.tessellator.count(finer) < 0.9 * factor * count:
+        """Return a coarseness with at least ``factor`` times the patches (a mesh may be finer than asked for).
+
+        Of hidden surfaces and wall each: if only one of them became finer, the error of the other would not show.
+        """
+        counts, finer = self.tessellator.counts(coarseness), coarseness / math.sqrt(factor)
+        while any(
+            0 < more < 0.9 * factor * count for more, count in zip(self.tessellator.counts(finer), counts, strict=True)
+        ):
             finer *= 0.9
         return finer
 
     def coarser(self, fineness: float) -> float:
         """Return the coarseness that ``fineness`` is compared with: a third of the patches, or all there are."""
-        count, coarser = self.tessellator.count(fineness), fineness * math.sqrt(REFINEMENT)
-        while self.tessellator.count(coarser) > count / REFINEMENT and coarser < FIRST_COARSENESS:
+        counts, coarser = self.tessellator.counts(fineness), fineness * math.sqrt(REFINEMENT)
+        while coarser < FIRST_COARSENESS and any(
+            less > count / REFINEMENT for less, count in zip(self.tessellator.counts(coarser), counts, strict=True)
+        ):
             coarser *= 1.1
         return coarser
 
@@ -134,17 +151,17 @@ class ThirdBounce:
         points = self.paths.capture.n_sensors if isinstance(batch, Batch) else batch.sensors.size
         return replace(self.paths.shape(batch, 1), replicas=max(1, min(math.ceil(self.lanes / points), most)))
 
-    def _transport(self, batch: Batch | Pilot, shape: HistogramShape) -> tuple[Transport, mi.UInt32, mi.UInt32]:
-        """Return what the lanes read, each lane's slice, and its start in the sequence of visibility rays."""
+    def _transport(self, batch: Batch | Pilot, shape: HistogramShape) -> tuple[Transport, mi.UInt32, NDArray[np.int64]]:
+        """Return what the lanes read, each lane's slice, and the order of the sensor points: neighbours together."""
         transport = self.paths.transport(batch, replace(shape, replicas=1))
-        sensors, slice_of_lane = own_rows(transport.sensors, shape.sensors, shape.replicas)
+        points = self.paths.capture.sensor_grid.positions.reshape(-1, 3)[self.paths.sensor_indices(batch)]
+        order = np.argsort(z_order(points), kind="stable")
         lane = dr.arange(mi.UInt32, shape.lanes)
-        first_laser = dr.gather(mi.UInt32, transport.first_laser, lane % shape.sensors)
-        point = dr.gather(mi.UInt32, mi.UInt32(self.paths.sensor_indices(batch)), lane % shape.sensors)
-        key = point * shape.replicas + slice_of_lane
-        jitter = mi.sample_tea_32(key, mi.UInt32(self.paths.options.seed))[0]
-        dr.eval(sensors.interaction, sensors.delay_bins, sensors.delay_fraction, first_laser, slice_of_lane, jitter)
-        return replace(transport, sensors=sensors, first_laser=first_laser), slice_of_lane, jitter
+        sensor = dr.gather(mi.UInt32, mi.UInt32(order.astype(np.uint32)), lane % shape.sensors)
+        sensors, first_laser = transport.sensors.gather(sensor), dr.gather(mi.UInt32, transport.first_laser, sensor)
+        slice_of_lane = lane // shape.sensors
+        dr.eval(sensors.interaction, sensors.delay_bins, sensors.delay_fraction, first_laser, slice_of_lane)
+        return replace(transport, sensors=sensors, first_laser=first_laser), slice_of_lane, order
 
 
 def estimated_error(coarse: Gathered, fine: Gathered) -> float:

@@ -100,7 +100,7 @@ def trace_walks(
     # ---- State -------------------------------------------------------------------------------------------------
     throughput = mi.Spectrum(reflectance)
     direction = sites.sh_frame.to_world(mi.warp.square_to_cosine_hemisphere(square))
-    ray = mi.Ray3f(offset_origin(sites, direction), direction)
+    ray = mi.Ray3f(offset_origin(built, sites, direction), direction)
     alive = dr.any(throughput > 0) & (dr.dot(direction, sites.n) > 0)
     origin = mi.Point3f(sites.p)
     opl = mi.Float(0)  # optical path length from the site [engine units]
@@ -116,9 +116,11 @@ def trace_walks(
         opl += dr.norm(si.p - origin)
         bounce += 1
 
-        # ---- What the lasers would bring, were nothing between; the wall is dark to its own laser points ------------
+        # ---- What the lasers would bring, were nothing between; a plane is dark to its own laser points -------------
         bsdf = si.bsdf()
-        hidden = alive & (si.shape != wall) & (mi.Frame3f.cos_theta(si.wi) > 0)
+        hidden = alive & (mi.Frame3f.cos_theta(si.wi) > 0)
+        if dr.hint(built.wall.is_planar, mode="scalar"):
+            hidden &= si.shape != wall
         upright = mi.SurfaceInteraction3f(si)
         upright.wi = mi.Vector3f(0, 0, 1)
         leaving = throughput * bsdf.eval(context, upright, mi.Vector3f(0, 0, 1), hidden)
@@ -149,7 +151,7 @@ def trace_walks(
         throughput *= weight / dr.maximum(survival, 1e-9)
         direction = si.to_world(bs.wo)
         origin = mi.Point3f(si.p)
-        ray = mi.Ray3f(offset_origin(si, direction), direction)
+        ray = mi.Ray3f(offset_origin(built, si, direction), direction)
 
     return WalkEnds(position, normal, shading, carried, chosen_opl, chosen_bounce, expected, total)
 
@@ -299,7 +301,7 @@ def _connect(
     value *= arriving(built, lasers, position, dr.gather(mi.Normal3f, ends.shading, end))
     value *= dr.gather(mi.Float, mi.Float(scale.astype(np.float32)), at)
     active = dr.any(value > 0)
-    segment = connection_segment(si, to_laser / distance, lasers.interaction.p)
+    segment = connection_segment(built, si, to_laser / distance, lasers.interaction)
     active &= ~built.scene.ray_test(segment, coherent=False, active=active)
     value = dr.select(active, value, 0)
     delays = (dr.gather(mi.Float, ends.opl, end) + distance) * transport.bins_per_unit

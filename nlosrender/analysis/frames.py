@@ -1,0 +1,190 @@
+"""A line-of-sight capture as pictures: one per range of bins, and the steady one. Light in flight, in any viewer."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nlosrender.analysis.laser_view import lit_window
+from nlosrender.analysis.pictures import SUFFIXES, save_animation, save_exr, save_png, stokes_panels, tone_mapped
+from nlosrender.capture.bounces import LINE_OF_SIGHT
+from nlosrender.errors import FileError, OptionError
+from nlosrender.files.layout import STOKES
+from nlosrender.files.reader import StoredCapture, open_capture
+from nlosrender.files.replacement import explained_write
+
+Float32 = NDArray[np.float32]
+
+FRAMES_AIM = 120  # without --every: about so many pictures for the part of the time axis that holds light
+BAND_BYTES = 64 * 2**20  # of samples read at a time
+MOST_FRAMES = 20_000
+MOST_BYTES = 4 * 2**30  # of all pictures together
+BRIGHTEST = 99.0  # percentile of the lit pixels of all frames that becomes white ...
+BRIGHTEST_STEADY = 97.0  # ... and of the steady picture, whose emitters outshine all they light
+
+
+@dataclass(frozen=True)
+class FrameOptions:
+    """Which pictures to write.
+
+    Raises
+    ------
+    OptionError
+        A value is out of range; the option is named.
+    """
+
+    kind: str = "exr"  # one of SUFFIXES
+    every: int | None = None  # bins per picture; None: so many that there are about 120 pictures
+    start_opl: float | None = None  # m; None: where light begins
+    end_opl: float | None = None  # m; None: where it ends
+    frames_per_second: float = 12.0  # of an animation
+    exposure: float = 0.0  # stops, of png and gif
+
+    def __post_init__(self) -> None:
+        if self.kind == "mp4":
+            raise OptionError("--format: got 'mp4', which no installed package writes; use gif, or png and ffmpeg.")
+        if self.kind not in SUFFIXES:
+            raise OptionError(f"--format: got {self.kind!r}, need one of {', '.join(SUFFIXES)}")
+        if self.every is not None and self.every < 1:
+            raise OptionError(f"--every: got {self.every}, need at least 1 bin")
+        if not 0.1 <= self.frames_per_second <= 50:  # a GIF's clock ticks every 10 ms
+            raise OptionError(f"--fps: got {self.frames_per_second:g}, need 0.1 to 50")
+        if not -30 <= self.exposure <= 30:
+            raise OptionError(f"--exposure: got {self.exposure:g}, need -30 to 30 stops")
+
+
+def write_frames(path: str | Path, folder: str | Path, options: FrameOptions) -> list[Path]:
+    """Write the pictures of a line-of-sight capture into a folder, which is made where there is none.
+
+    Pictures hold radiance [W m^-2 sr^-1] summed over their bins; .exr as float32 without any scaling, .png and .gif
+    scaled together, so that frames can be compared. Rows run downwards, as in every picture.
+
+    Parameters
+    ----------
+    path
+        Capture file.
+    folder
+        Where pictures go: frame-00000.exr and so on, steady.exr, steady.png; an animation is frames.gif.
+    options
+        Which.
+
+    Returns
+    -------
+    list of Path
+        What was written, the steady pictures last.
+
+    Raises
+    ------
+    FileError
+        The capture is none of a camera, cannot be read or is too large, or a picture cannot be written.
+    OptionError
+        The options do not suit the capture.
+    """
+    folder = Path(folder)
+    with open_capture(path) as capture:
+        if capture.header.scan_type != LINE_OF_SIGHT:
+            raise FileError(
+                f"{path}: is a {capture.header.scan_type} capture of a relay wall, not what a camera sees. "
+                "See `nlosrender plot`."
+            )
+        stokes = capture.header.attributes.get("channels") == STOKES
+        ranges = _frame_ranges(capture, options)
+        frames, steady = _pictures(capture, ranges)
+    with explained_write(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+        written = _write_all(frames, folder, options, stokes)
+        written += [folder / "steady.exr", folder / "steady.png"]
+        save_exr(steady, written[-2], stokes)
+        save_png(_shown(steady[None], stokes, options.exposure, BRIGHTEST_STEADY)[0], written[-1])
+    return written
+
+
+def _frame_ranges(capture: StoredCapture, options: FrameOptions) -> list[slice]:
+    header = capture.header
+    first, last = 0, header.n_bins - 1
+    if options.start_opl is None or options.end_opl is None:
+        first, last = lit_window(_light_over_time(capture))
+    if options.start_opl is not None:
+        first = int(np.floor((options.start_opl - header.start_opl) / header.bin_width_opl))
+    if options.end_opl is not None:
+        last = int(np.ceil((options.end_opl - header.start_opl) / header.bin_width_opl)) - 1
+    first, last = max(first, 0), min(last, header.n_bins - 1)
+    if first > last:
+        window = f"{header.start_opl:g} to {header.end_opl:g} m"
+        raise OptionError(f"--from, --to: no bin of the file lies between them; its time axis is {window}")
+    every = options.every or max(1, round((last + 1 - first) / FRAMES_AIM))
+    count = -(-(last + 1 - first) // every)
+    n_bytes = count * 4 * header.sizes["channel"] * header.sizes["sensor_y"] * header.sizes["sensor_x"]
+    if count > MOST_FRAMES or n_bytes > MOST_BYTES:
+        raise OptionError(
+            f"--every: {count} pictures of {n_bytes / 1e9:.3g} GB together are too many; use more bins each"
+        )
+    return [slice(start, min(start + every, last + 1)) for start in range(first, last + 1, every)]
+
+
+def _light_over_time(capture: StoredCapture) -> NDArray[np.float64]:
+    total = np.zeros(capture.header.n_bins)
+    for _, band in _bands(capture):
+        total += band[0].sum(axis=(0, 1), dtype=np.float64)
+    return total
+
+
+def _pictures(capture: StoredCapture, ranges: list[slice]) -> tuple[Float32, Float32]:
+    """Return (frame, row, column, channel) and the steady (row, column, channel), rows downwards."""
+    sizes = capture.header.sizes
+    shape = (sizes["sensor_y"], sizes["sensor_x"], sizes["channel"])
+    frames, steady = np.zeros((len(ranges), *shape), np.float32), np.zeros(shape, np.float32)
+    for rows, band in _bands(capture):
+        steady[rows] = np.moveaxis(band.sum(axis=-1, dtype=np.float64), 0, -1)
+        for frame, bins in zip(frames, ranges, strict=True):
+            frame[rows] = np.moveaxis(band[..., bins].sum(axis=-1, dtype=np.float64), 0, -1)
+    return frames[:, ::-1], steady[::-1]
+
+
+def _bands(capture: StoredCapture) -> Iterator[tuple[slice, Float32]]:
+    """Yield (channel, row, column, bin) for a few rows at a time, summed over bounces.
+
+    Raises
+    ------
+    FileError
+        A sample is not finite.
+    """
+    header = capture.header
+    sizes = header.sizes
+    row_bytes = 8 * sizes["channel"] * len(header.bounce_indices) * sizes["sensor_x"] * sizes["bin"]
+    step = max(1, BAND_BYTES // row_bytes)
+    for start in range(0, sizes["sensor_y"], step):
+        rows = slice(start, min(start + step, sizes["sensor_y"]))
+        band = capture.read_block(sensors=(rows, None)).sum(axis=1)[:, 0, 0]
+        if not np.isfinite(band).all():
+            raise FileError(f"{capture.path}: data holds numbers that are not finite; see `nlosrender info --check`")
+        yield rows, band
+
+
+def _shown(frames: Float32, stokes: bool, exposure: float, brightest: float = BRIGHTEST) -> NDArray[np.uint8]:
+    """Return frames (frame, row, column, 3) as they are shown, all on one scale."""
+    light = frames[..., :1] if stokes else frames
+    lit = light[light > 0]
+    white = float(np.percentile(lit, brightest)) if lit.size else 1.0
+    scale = 2.0**exposure / white
+    return stokes_panels(frames, scale) if stokes else tone_mapped(frames * scale)
+
+
+def _write_all(frames: Float32, folder: Path, options: FrameOptions, stokes: bool) -> list[Path]:
+    names = [folder / f"frame-{index:05d}{SUFFIXES[options.kind]}" for index in range(len(frames))]
+    if options.kind == "exr":
+        for frame, name in zip(frames, names, strict=True):
+            save_exr(frame, name, stokes)
+        return names
+    shown = _shown(frames, stokes, options.exposure)
+    if options.kind == "png":
+        for picture, name in zip(shown, names, strict=True):
+            save_png(picture, name)
+        return names
+    animation = folder / "frames.gif"
+    save_animation(shown, animation, options.frames_per_second)
+    return [animation]

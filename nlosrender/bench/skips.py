@@ -1,0 +1,146 @@
+"""What each kind of skipped work saves: CPU seconds with and without it, the results compared."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from nlosrender.bench.runs import Float64, LoadedScene, Timer, load
+from nlosrender.bench.scenes import BenchScene, closed_room
+
+if TYPE_CHECKING:
+    from nlosrender.engine.path_engine import PathEngine
+    from nlosrender.engine.virtual_lights.engine import VirtualLightEngine
+
+ROUNDS = 3
+GATHER_TARGET = 0.01
+PATHS = 1024  # per sensor point
+MIXTURE = 0.5  # of BSDF and hidden geometry sampling at the wall, where one of them suffices
+
+
+@dataclass(frozen=True)
+class Saving:
+    """One skip on one scene. Both ways run in turns; the fastest of several rounds counts."""
+
+    what: str
+    scene: str
+    seconds: float  # CPU seconds of all threads, with the skip
+    seconds_without: float
+    difference: float  # relative L2 between the two results; of noisy ones it is the noise of both
+
+    def report(self) -> dict[str, Any]:
+        """Return all as plain values."""
+        return {**vars(self), "saved": 1 - self.seconds / self.seconds_without}
+
+
+def measure_skips(scenes: Sequence[BenchScene]) -> list[Saving]:
+    """Measure every skip on the scenes where it applies: third-bounce scenes, and a closed room.
+
+    Raises
+    ------
+    ConfigError
+        A scene's mesh cannot be read.
+    RenderError
+        A render failed.
+    """
+    savings: list[Saving] = []
+    for scene in scenes:
+        savings += _of_gather(load(scene))
+        savings += _of_paths(load(scene))
+    savings += _of_paths(load(closed_room(16)))
+    return savings
+
+
+def _of_gather(loaded: LoadedScene) -> Iterator[Saving]:
+    """Yield what the gather leaves out: rays nothing can stop, the dark patches, colour."""
+    from nlosrender import pipeline
+    from nlosrender.engine.path_engine import Budget
+    from nlosrender.engine.virtual_lights.engine import VirtualLightEngine
+
+    config = loaded.scene.config(engine="virtual_lights", split_bounces=False)
+    plan, engine = pipeline.prepare(config, loaded.backend, loaded.built, loaded.capture, loaded.time_axis)
+    if not isinstance(engine, VirtualLightEngine):
+        return
+    fineness = engine.settle(Budget(target_error=GATHER_TARGET)).fineness or 1.0
+
+    def gather() -> Float64:
+        return np.concatenate([engine.third.gather(batch, fineness).values for batch in plan.batches], axis=3)
+
+    if not engine.settings.needs_visibility:
+        yield _saving("rays where nothing can lie between", loaded, gather, _tracing_all(engine, gather))
+    elif engine.third.lit_patches(plan.batches[0], fineness).is_open.any():
+        yield _saving("rays to patches all the wall sees", loaded, gather, _without_hull(engine, gather))
+
+
+def _tracing_all(engine: VirtualLightEngine, gather: Callable[[], Float64]) -> Callable[[], Float64]:
+    """Return ``gather`` with visibility rays that the scene does not need."""
+
+    def traced() -> Float64:
+        third = engine.third
+        known, third.settings = third.settings, replace(third.settings, needs_visibility=True)
+        hull, corners = third.hull, third.hull.corners
+        hull.corners = None
+        try:
+            return gather()
+        finally:
+            third.settings, hull.corners = known, corners
+
+    return traced
+
+
+def _without_hull(engine: VirtualLightEngine, gather: Callable[[], Float64]) -> Callable[[], Float64]:
+    """Return ``gather`` with rays to patches that lie in the hull of the hidden geometry."""
+
+    def traced() -> Float64:
+        hull, corners = engine.third.hull, engine.third.hull.corners
+        hull.corners = None
+        try:
+            return gather()
+        finally:
+            hull.corners = corners
+
+    return traced
+
+
+def _of_paths(loaded: LoadedScene) -> Iterator[Saving]:
+    """Yield what the path engine leaves out: rays nothing can stop, the technique that is not needed."""
+    from nlosrender import pipeline
+    from nlosrender.engine.path_engine import PathEngine
+    from nlosrender.engine.path_integrator import load_path_integrator
+
+    config = loaded.scene.config(engine="path", split_bounces=False, spp=PATHS)
+    plan, engine = pipeline.prepare(config, loaded.backend, loaded.built, loaded.capture, loaded.time_axis)
+    if not isinstance(engine, PathEngine):
+        return
+
+    def render(other: PathEngine) -> Callable[[], Float64]:
+        from nlosrender.engine.path_engine import Budget
+
+        return lambda: np.concatenate([other.render(b, Budget(spp=PATHS)).mean for b in plan.batches], axis=3)
+
+    def engine_with(**options: Any) -> PathEngine:
+        return PathEngine(loaded.built, loaded.capture, loaded.time_axis, replace(engine.options, **options))
+
+    if not engine.settings.needs_visibility:
+        tracing = engine_with()
+        tracing.integrator = load_path_integrator(replace(engine.settings, needs_visibility=True))
+        yield _saving("rays of paths where nothing can lie between", loaded, render(engine), render(tracing))
+    if engine.hidden_fraction in (0.0, 1.0):
+        kept = "hidden geometry" if engine.hidden_fraction else "BSDF"
+        mixed = engine_with(hidden_fraction=MIXTURE)
+        yield _saving(f"MIS where {kept} sampling suffices", loaded, render(engine), render(mixed))
+
+
+def _saving(what: str, loaded: LoadedScene, skipping: Callable[[], Float64], doing: Callable[[], Float64]) -> Saving:
+    results = [skipping(), doing()]  # compiles
+    spent: list[list[float]] = [[], []]
+    for _ in range(ROUNDS):
+        for times, work in zip(spent, (skipping, doing), strict=True):
+            timer = Timer()
+            work()
+            times.append(timer.read()[1])
+    difference = float(np.linalg.norm(results[0] - results[1]) / np.linalg.norm(results[1]))
+    return Saving(what, loaded.scene.name, min(spent[0]), min(spent[1]), difference)

@@ -1,0 +1,211 @@
+"""Scene of a line-of-sight capture -> Mitsuba: surfaces, lamps and a whole Mitsuba scene, in engine units."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+from xml.etree import ElementTree
+
+import mitsuba as mi
+import numpy as np
+from numpy.typing import ArrayLike
+
+from nlosrender.config.emitters import PointLamp, SpotLamp
+from nlosrender.config.mitsuba_xml import image_files, mesh_files, read_mitsuba_xml
+from nlosrender.scene.build import load_surface, read_mesh_of, shape_bounds
+from nlosrender.scene.camera import ImagePlane, image_plane
+from nlosrender.scene.hidden_geometry import (
+    Bounds,
+    ShapeDescription,
+    Surface,
+    box_corners,
+    hidden_surfaces,
+    joined_bounds,
+)
+from nlosrender.scene.images import check_image
+from nlosrender.scene.materials import first_line, mitsuba_spectrum, rejected
+from nlosrender.scene.mesh_file import read_mesh
+from nlosrender.scene.pose import Float64, Pose
+from nlosrender.scene.relay_wall import relay_wall_from_config
+from nlosrender.scene.triangle_mesh import TriangleMesh
+
+if TYPE_CHECKING:
+    from nlosrender.config.capture import CaptureConfig
+    from nlosrender.config.scene import SceneConfig
+
+WHERE = "scene.mitsuba"
+
+
+@dataclass(frozen=True, eq=False)
+class BuiltView:
+    """A scene ready to be seen by a camera. The local frame is that of the image plane."""
+
+    scene: mi.Scene
+    wall: ImagePlane
+    surfaces: tuple[Surface, ...]  # configured ones; a Mitsuba scene has more
+    hidden_shapes: tuple[mi.Shape, ...]  # everything that can be seen
+    hidden_bounds: Bounds | None  # box around all surfaces and lamps [m, local frame]; None when there is none
+    frame: Pose  # of the engine, in the scene
+    unit: float  # metres per engine unit of length, a power of two
+    n_triangles: int
+
+    def to_engine(self, positions: ArrayLike) -> Float64:
+        """Take positions (..., 3) [m] of the local frame to the engine's [engine units]."""
+        return self.frame.to_local(self.wall.pose.to_scene(positions)) / self.unit
+
+    def direction_to_engine(self, directions: ArrayLike) -> Float64:
+        """Take directions (..., 3) of the local frame to the engine's; their lengths stay."""
+        return self.frame.direction_to_local(self.wall.pose.direction_to_scene(directions))
+
+
+def build_view(scene_config: SceneConfig, capture_config: CaptureConfig) -> BuiltView:
+    """Build the Mitsuba scene of a line-of-sight capture; the backend has to be started before.
+
+    Parameters
+    ----------
+    scene_config, capture_config
+        ``scene`` and ``capture``.
+
+    Raises
+    ------
+    ConfigError
+        Mitsuba rejects a shape, a BSDF or the scene's file, or a mesh cannot be read; the item is named.
+    ValueError
+        A pose is degenerate; the message begins with the item's key.
+    """
+    whole = None if scene_config.mitsuba is None else _load_xml(scene_config.mitsuba)
+    plane = _image_plane(capture_config, whole)
+    frame = _engine_frame(scene_config, plane)
+    surfaces = tuple(_surfaces(scene_config, frame))
+    loaded = [read_mesh_of(surface) for surface in surfaces]
+    lamps = [item for item in scene_config.emitters if isinstance(item, (PointLamp, SpotLamp))]
+    points = [frame.to_local(lamp.position) for lamp in lamps]
+    camera = frame.to_local(plane.pose.to_scene(plane.default_device_position))
+    unit = 1.0 if whole is not None else _unit_length([shape.bounds() for shape in loaded], [*points, camera])
+    shapes = [load_surface(surface, shape, unit) for surface, shape in zip(surfaces, loaded, strict=True)]
+    contents: dict[str, object] = {f"lamp_{index}": _lamp(lamp, frame, unit) for index, lamp in enumerate(lamps)}
+    if whole is not None:
+        shapes += whole.shapes()
+        far = [emitter for emitter in whole.emitters() if not emitter.flags() & mi.EmitterFlags.Surface]
+        contents |= {f"emitter_{index}": emitter for index, emitter in enumerate(far)}
+    contents |= {f"shape_{index}": shape for index, shape in enumerate(shapes)}
+    boxes = [shape_bounds(shape, unit) for shape in shapes] + [(point, point) for point in points]
+    return BuiltView(
+        scene=mi.load_dict({"type": "scene", **contents}),
+        wall=plane,
+        surfaces=surfaces,
+        hidden_shapes=tuple(shapes),
+        hidden_bounds=_in_frame_of(plane, frame, joined_bounds(boxes)),
+        frame=frame,
+        unit=unit,
+        n_triangles=sum(int(shape.face_count()) for shape in shapes if shape.is_mesh()),
+    )
+
+
+def _surfaces(scene_config: SceneConfig, frame: Pose) -> Iterator[Surface]:
+    """Yield relay wall, hidden geometry and shining surfaces in the engine's frame [m]."""
+    at = _Frame(frame)
+    if scene_config.relay_wall is not None:
+        wall = relay_wall_from_config(scene_config.relay_wall)
+        description = wall.shape_description()
+        to_frame = frame.inverse_matrix() @ wall.pose.matrix()
+        shape: TriangleMesh | ShapeDescription
+        if isinstance(description, TriangleMesh):
+            shape = description.transformed(to_frame)
+        else:
+            to_world = to_frame @ np.asarray(description.get("to_world", np.eye(4)))
+            shape = ShapeDescription({**description, "to_world": to_world})
+        yield Surface("relay_wall", "scene.relay_wall", shape, scene_config.relay_wall.bsdf, False)
+    yield from hidden_surfaces(scene_config.hidden_geometry, at)
+    for index, item in enumerate(scene_config.emitters):
+        if not isinstance(item, (PointLamp, SpotLamp)):
+            yield from hidden_surfaces([item], at, [f"scene.emitters.{index}"])
+
+
+@dataclass(frozen=True)
+class _Frame:
+    pose: Pose
+
+
+def _engine_frame(scene_config: SceneConfig, plane: ImagePlane) -> Pose:
+    """Return where the engine's origin lies: a Mitsuba scene stays where it is, all else comes near the origin."""
+    if scene_config.mitsuba is not None:
+        return Pose.identity()
+    if scene_config.relay_wall is not None:
+        return relay_wall_from_config(scene_config.relay_wall).pose  # a room is built around it
+    return Pose(np.eye(3), plane.pose.origin)
+
+
+def _image_plane(capture_config: CaptureConfig, whole: mi.Scene | None) -> ImagePlane:
+    camera, pixels = capture_config.camera, (capture_config.sensor_grid.nx, capture_config.sensor_grid.ny)
+    if camera is not None:
+        return image_plane(camera.position, camera.look_at, camera.up, camera.fov_deg, pixels)
+    if whole is None or not whole.sensors():
+        raise rejected("capture.camera", "missing, and there is no Mitsuba scene with a perspective sensor.")
+    parameters = mi.traverse(whole.sensors()[0])
+    to_world = np.array(parameters["to_world"].matrix, dtype=np.float64).reshape(4, 4)
+    offset = [float(np.ravel(parameters[f"principal_point_offset_{axis}"])[0]) for axis in "xy"]
+    if not np.isfinite(to_world).all() or np.linalg.det(to_world[:3, :3]) <= 0 or any(offset):
+        raise rejected(WHERE, "its sensor is mirrored or shifted, which is not supported; give capture.camera.")
+    position, forward, up = to_world[:3, 3], to_world[:3, 2], to_world[:3, 1]
+    fov = float(np.ravel(parameters["x_fov"])[0])
+    return image_plane(position, position + forward / np.linalg.norm(forward), up, fov, pixels)
+
+
+def _load_xml(path: Path) -> mi.Scene:
+    try:
+        root, _ = read_mitsuba_xml(path)
+        for filename, kind in mesh_files(root):
+            _check_mesh(filename, kind)
+        for image in image_files(root):
+            check_image(image)
+        return mi.load_string(ElementTree.tostring(root, encoding="unicode"))
+    except (RuntimeError, TypeError, ValueError) as error:
+        raise rejected(WHERE, f"{path}: {first_line(error)}") from error
+
+
+def _check_mesh(filename: str, kind: str) -> None:
+    """Read a mesh before Mitsuba does, whose readers end the process on a wrong index."""
+    try:
+        read_mesh(filename, kind, face_normals=False)
+    except ValueError as error:
+        raise ValueError(f"{filename} cannot be used as a mesh: {error}") from error
+
+
+def _lamp(lamp: PointLamp | SpotLamp, frame: Pose, unit: float) -> mi.Emitter:
+    position = (frame.to_local(lamp.position) / unit).tolist()
+    # intensity is per steradian seen from a distance in m: radiance falls with the square of engine units
+    scale = 1.0 / unit**2
+    value = lamp.intensity
+    scaled = tuple(channel * scale for channel in value) if isinstance(value, tuple) else value * scale
+    intensity = mitsuba_spectrum(scaled)  # type: ignore[arg-type]
+    if isinstance(lamp, PointLamp):
+        return mi.load_dict({"type": "point", "position": position, "intensity": intensity})
+    target = frame.to_local(lamp.look_at) / unit
+    axis = target - position
+    up = np.eye(3)[int(np.argmin(np.abs(axis)))]
+    return mi.load_dict(
+        {
+            "type": "spot",
+            "to_world": mi.ScalarTransform4f().look_at(position, target.tolist(), up.tolist()),
+            "intensity": intensity,
+            "cutoff_angle": lamp.cutoff_deg,
+            "beam_width": 0.75 * lamp.cutoff_deg if lamp.beam_deg is None else lamp.beam_deg,
+        }
+    )
+
+
+def _unit_length(boxes: Sequence[Bounds | None], points: Sequence[Float64]) -> float:
+    """Return the power of two [m] nearest to the scene's reach from the engine's origin."""
+    reach = [float(np.abs(box).max()) for box in boxes if box is not None] + [float(np.abs(p).max()) for p in points]
+    return 2.0 ** round(math.log2(max(max(reach), 1e-9)))
+
+
+def _in_frame_of(plane: ImagePlane, frame: Pose, box: Bounds | None) -> Bounds | None:
+    if box is None:
+        return None
+    corners = plane.pose.to_local(frame.to_scene(box_corners(box)))
+    return corners.min(axis=0), corners.max(axis=0)

@@ -1,0 +1,183 @@
+"""Configurations of line-of-sight captures: what they may hold, and how mistakes are told."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+from rendering import configured, flat_wall
+from views import view_config
+
+from nlosrender.config.load import config_to_dict, load_config
+from nlosrender.config.mitsuba_xml import is_colored_xml, read_mitsuba_xml
+from nlosrender.config.warnings import config_warnings
+from nlosrender.errors import ConfigError
+
+ROOT = Path(__file__).parents[2]
+LAMP = {"type": "point", "position": [0, 1, 0], "intensity": 1.0}
+
+
+def problem_of(config: dict[str, Any], folder: Path | None = None) -> tuple[str, str]:
+    """Return key and message of the one mistake in a configuration."""
+    with pytest.raises(ConfigError) as caught:
+        configured(config, folder=folder)
+    (problem,) = caught.value.problems
+    return problem.key, problem.message
+
+
+@pytest.mark.parametrize(
+    "name", ["paper/cornell-box", "paper/interior-mirror", "paper/polarised-cornell-box", "mitsuba-scene"]
+)
+def test_configurations_that_come_along(name: str) -> None:
+    """They are valid, say nothing, and survive being written out and read again."""
+    config = load_config(ROOT / "configs" / f"{name}.yaml")
+    assert config.capture.is_line_of_sight
+    assert config_warnings(config) == ()
+    assert config_to_dict(configured(yaml.safe_dump(config_to_dict(config)))) == config_to_dict(config)
+
+
+def test_pixels_are_the_sensor_grid() -> None:
+    """The camera's pixels take the place of the sensor points."""
+    config = configured(view_config(emitters=[LAMP], camera={"width": 7, "height": 3}))
+    assert (config.capture.sensor_grid.nx, config.capture.sensor_grid.ny) == (7, 3)
+
+
+@pytest.mark.parametrize(
+    ("changes", "key", "message"),
+    [
+        ({"capture": {"camera": None}}, "capture.camera", r"missing, a line_of_sight capture needs it"),
+        ({"capture": {"laser_point": [0, 0]}}, "capture.laser_point", r"has no laser; remove it"),
+        ({"capture": {"laser_energy": 2.0}}, "capture.laser_energy", r"has no laser; remove it"),
+        ({"capture": {"sensor_position": [0, 0, 1]}}, "capture.sensor_position", r"use capture.camera.position"),
+        ({"capture": {"sensor_grid": {"nx": 2, "ny": 7}}}, "capture.sensor_grid", r"are the camera's pixels"),
+        ({"camera": {"look_at": [0, 0, 4]}}, "capture.camera.look_at", r"the camera's position, need another"),
+        ({"camera": {"up": [0, 0, 1]}}, "capture.camera.up", r"the direction the camera looks in"),
+        ({"camera": {"fov_deg": 180}}, "capture.camera.fov_deg", r"an angle between 0 and 180"),
+        ({"camera": {"width": 0}}, "capture.camera.width", r"got 0, need an integer >= 1"),
+        ({"render": {"engine": "virtual_lights"}}, "render.engine", r"need a relay wall"),
+        ({"render": {"hidden_geometry_sampling": False}}, "render.hidden_geometry_sampling", r"no such technique"),
+        ({"render": {"max_bounces": -1}}, "render.max_bounces", r"got -1"),
+        ({"render": {"polarized": True, "color": "rgb"}}, "render.polarized", r"rendered in grey"),
+        ({"render": {"temporal_kernel_opl": 0.1}}, "render.temporal_kernel_opl", r"has plain bins"),
+    ],
+)
+def test_mistakes_of_a_capture(changes: dict[str, Any], key: str, message: str) -> None:
+    """Each is told once, at its key, with what to do."""
+    arguments = {"emitters": [LAMP], **{k: v for k, v in changes.items() if k != "render"}, **changes.get("render", {})}
+    found, text = problem_of(view_config(**arguments))
+    assert found == key
+    assert re.search(message, text), text
+
+
+@pytest.mark.parametrize(
+    ("emitter", "key", "message"),
+    [
+        ({"type": "lamp"}, "type", "need one of"),
+        ({"type": "sphere", "center": [0, 0, 0], "radius": 1}, "radiance", "missing"),
+        ({**LAMP, "intensity": -1}, "intensity", "got -1, need a number from 0"),
+        ({**LAMP, "intensity": [1, 2]}, "intensity", r"or \[r, g, b\]"),
+        ({**LAMP, "type": "spot", "look_at": [0, 1, 0]}, "look_at", "the spot's position"),
+        ({**LAMP, "type": "spot", "look_at": [0, 0, 0], "beam_deg": 30}, "beam_deg", "less than cutoff_deg, 20"),
+    ],
+)
+def test_mistakes_of_an_emitter(emitter: dict[str, Any], key: str, message: str) -> None:
+    """Emitters are told apart by their type, and checked like any item."""
+    with pytest.raises(ConfigError, match=message) as caught:
+        configured(view_config(emitters=[emitter]))
+    assert caught.value.problems[0].key == f"scene.emitters.0.{key}"
+
+
+@pytest.mark.parametrize(
+    ("section", "addition", "key", "message"),
+    [
+        ("scene", {"emitters": [LAMP]}, "scene.emitters", "lit by the laser alone"),
+        ("scene", {"mitsuba": "box.xml"}, "scene.mitsuba", "its shapes go into hidden_geometry"),
+        (
+            "capture",
+            {"camera": {"position": [0, 0, 1], "look_at": [0, 0, 0], "width": 2, "height": 3}},
+            "capture.camera",
+            "a camera is for scan_type: line_of_sight, got single",
+        ),
+    ],
+)
+def test_a_relay_wall_has_no_camera(
+    section: str, addition: dict[str, Any], key: str, message: str, tmp_path: Path
+) -> None:
+    """What belongs to a camera is refused where a relay wall is seen, with what to do."""
+    (tmp_path / "box.xml").write_text("<scene version='3.0.0'/>", encoding="utf-8")
+    config = flat_wall()
+    config[section] |= addition
+    found, text = problem_of(config, tmp_path)
+    assert found == key
+    assert message in text
+
+
+def test_a_relay_wall_is_missing() -> None:
+    """Only cameras do without."""
+    config = flat_wall()
+    del config["scene"]["relay_wall"]
+    key, text = problem_of(config)
+    assert key == "scene.relay_wall"
+    assert text.startswith("missing, it is required")
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ("<scene", "not well-formed XML"),
+        ("<!DOCTYPE scene [<!ENTITY a 'b'>]><scene/>", "document type or entities"),
+        ("<shape/>", "its root is <shape>"),
+        ("<scene><include filename='other.xml'/></scene>", "<include> is not supported"),
+        ("<scene><shape type='../../evil'/></scene>", "need one of"),
+        ("<scene><medium type='homogeneous'/></scene>", "<medium> is not supported"),
+        ("<scene><shape type='$kind'/></scene>", r"\$kind has no <default>"),
+        ("<scene><shape type='ply'/></scene>", "has no filename"),
+        (
+            "<scene><shape type='ply'><string name='filename' value='gone.ply'/></shape></scene>",
+            "there is no file at",
+        ),
+        ("<scene><bsdf type='diffuse'><texture type='bitmap'/></bsdf></scene>", "has no filename"),
+        (
+            "<scene><sensor type='perspective'><film type='hdrfilm'><integer name='width' value='x'/></film></sensor>"
+            "</scene>",
+            "need two integers",
+        ),
+    ],
+)
+def test_mistakes_of_a_mitsuba_scene(content: str, message: str, tmp_path: Path) -> None:
+    """They are found before Mitsuba sees the file."""
+    (tmp_path / "scene.xml").write_text(content, encoding="utf-8")
+    with pytest.raises(ConfigError, match=message) as caught:
+        configured(view_config(emitters=[LAMP], scene={"mitsuba": "scene.xml"}), folder=tmp_path)
+    assert caught.value.problems[0].key == "scene.mitsuba"
+
+
+def test_a_mitsuba_scene_without_camera_needs_one(tmp_path: Path) -> None:
+    """A file without sensor goes with a configured camera, and not without."""
+    (tmp_path / "scene.xml").write_text("<scene version='3.0.0'><shape type='sphere'/></scene>", encoding="utf-8")
+    config = view_config(emitters=[LAMP], scene={"mitsuba": "scene.xml"})
+    assert configured(config, folder=tmp_path).capture.sensor_grid.n_points == 15
+    del config["capture"]["camera"]
+    key, text = problem_of(config, tmp_path)
+    assert key == "capture.camera"
+    assert "scene.xml has no perspective sensor" in text
+
+
+def test_what_is_left_of_a_mitsuba_scene(tmp_path: Path) -> None:
+    """Defaults are filled in, films and integrators gone, files absolute; colour is seen."""
+    root, size = read_mitsuba_xml(ROOT / "scenes" / "glass-and-mirror.xml")
+    assert size == (48, 32)
+    assert not list(root.iter("film")) + list(root.iter("integrator")) + list(root.iter("default"))
+    assert not is_colored_xml(root)
+    (tmp_path / "red.xml").write_text(
+        "<scene><bsdf type='diffuse'><rgb name='reflectance' value='0.5 0.1 0.1'/></bsdf></scene>", encoding="utf-8"
+    )
+    assert is_colored_xml(read_mitsuba_xml(tmp_path / "red.xml")[0])
+
+
+def test_warnings() -> None:
+    """A scene in which nothing shines is legal and pointless."""
+    assert any("nothing shines" in text for text in config_warnings(configured(view_config(emitters=[]))))
