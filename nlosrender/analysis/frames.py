@@ -51,6 +51,9 @@ class FrameOptions:
             raise OptionError(f"--format: got {self.kind!r}, need one of {', '.join(SUFFIXES)}")
         if self.every is not None and self.every < 1:
             raise OptionError(f"--every: got {self.every}, need at least 1 bin")
+        for option, opl in (("--from", self.start_opl), ("--to", self.end_opl)):
+            if opl is not None and not np.isfinite(opl):
+                raise OptionError(f"{option}: got {opl}, need a finite optical path length in m")
         if not 0.1 <= self.frames_per_second <= 50:  # a GIF's clock ticks every 10 ms
             raise OptionError(f"--fps: got {self.frames_per_second:g}, need 0.1 to 50")
         if not -30 <= self.exposure <= 30:

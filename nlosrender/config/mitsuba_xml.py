@@ -1,7 +1,7 @@
 """``scene.mitsuba``: a whole scene as Mitsuba XML, read and checked here before Mitsuba sees any of it.
 
 What reaches Mitsuba is a tree of known plugins with absolute file names: nothing that loads code, includes other
-files, or is known to end the process. Integrators, samplers and films are left out; the film's size is kept.
+files, or is known to end the process. Integrators and samplers are left out, and of the film all but its size.
 """
 
 from __future__ import annotations
@@ -19,9 +19,11 @@ from nlosrender.config.bsdf_table import BSDF_TYPES, COLORED_TYPES, SHAPE_TYPES,
 from nlosrender.config.fields import Checked
 from nlosrender.config.plugin_check import config_folder, existing_file
 from nlosrender.config.refusal import Fault, listed, refuse
+from nlosrender.config.xml_numbers import check_numbers
 
 MAX_XML_BYTES = 16 * 2**20
 MAX_ELEMENTS = 100_000
+MAX_DEPTH = 64  # of elements in each other; scenes have five or six
 DEFAULT_FILM = (768, 576)  # Mitsuba's
 _PLUGINS = {  # element: the types it may have
     "scene": (),
@@ -67,29 +69,26 @@ def read_mitsuba_xml(path: Path) -> tuple[Element, tuple[int, int] | None]:
         raise ValueError(f"cannot be read: {error.strerror}") from error
     if len(text) > MAX_XML_BYTES:
         raise ValueError(f"it is larger than {MAX_XML_BYTES // 2**20} MiB; keep meshes in files of their own")
-    if b"<!DOCTYPE" in text or b"<!ENTITY" in text:
-        raise ValueError("it declares a document type or entities, which no Mitsuba scene needs")
-    try:
-        root = ElementTree.fromstring(text)
-    except (ElementTree.ParseError, ValueError) as error:
-        raise ValueError(f"it is not well-formed XML: {error}") from error
+    root = _parsed(text)
     if root.tag != "scene":
         raise ValueError(f"its root is <{root.tag}>, need <scene>")
-    if sum(1 for _ in root.iter()) > MAX_ELEMENTS:
-        raise ValueError(f"it has more than {MAX_ELEMENTS} elements")
     _substitute(root)
     size = _keep_one_sensor(root)
     _clean(root, path.parent)
+    if size is not None:
+        _add_film(root, size)
     return root, size
 
 
 def is_colored_xml(root: Element) -> bool:
-    """Return whether a colour occurs in a scene, or may: textures from files count as coloured."""
+    """Return whether a colour occurs in a scene, or may: textures from files and spectra count as coloured."""
     for element in root.iter():
         if element.get("type") in COLORED_TYPES:
             return True
         value = element.get("value", "").strip()
         if element.tag == "rgb" and len(set(_channels(value))) > 1:
+            return True
+        if element.tag == "spectrum" and (":" in value or element.get("filename") is not None):
             return True
     return False
 
@@ -108,6 +107,48 @@ def image_files(root: Element) -> Iterator[Path]:
             yield Path(_string(element, "filename") or "")
 
 
+def named_files(root: Element) -> Iterator[Path]:
+    """Yield every file a scene names: meshes, images, measured materials and spectra."""
+    for element in root.iter():
+        for key in _file_keys(element):
+            if element.get(key) is not None:
+                yield Path(str(element.get(key)))
+
+
+class _LimitedTree(ElementTree.TreeBuilder):
+    """Builds a scene's tree, or says what no scene needs while it is read, before it grows."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._count = self._depth = 0
+
+    def doctype(self, name: str, pubid: str | None, system: str | None) -> None:
+        raise ValueError("it declares a document type or entities, which no Mitsuba scene needs")
+
+    def start(self, tag: str, attrs: dict[str, str]) -> Element:
+        self._count += 1
+        self._depth += 1
+        if self._count > MAX_ELEMENTS:
+            raise ValueError(f"it has more than {MAX_ELEMENTS} elements")
+        if self._depth > MAX_DEPTH:
+            raise ValueError(f"its elements lie in each other more than {MAX_DEPTH} deep")
+        return super().start(tag, attrs)
+
+    def end(self, tag: str) -> Element:
+        self._depth -= 1
+        return super().end(tag)
+
+
+def _parsed(text: bytes) -> Element:
+    parser = ElementTree.XMLParser(target=_LimitedTree())
+    try:
+        parser.feed(text)
+        root: Element = parser.close()
+    except (ElementTree.ParseError, LookupError) as error:  # LookupError: an encoding nobody knows
+        raise ValueError(f"it is not well-formed XML: {error}") from error
+    return root
+
+
 def _channels(value: str) -> list[str]:
     if value.startswith("#"):
         return [value[1 + 2 * i : 3 + 2 * i].lower() for i in range(3)]
@@ -124,8 +165,15 @@ def _substitute(root: Element) -> None:
             raise ValueError(f"${match[1]} has no <default>")
         return defaults[match[1]]
 
+    longest = max((len(value) for value in defaults.values()), default=0)
+    room = MAX_XML_BYTES  # for all that is put in: a short file could ask for more than there is memory
     for element in root.iter():
         for key, text in element.attrib.items():
+            if "$" not in text:
+                continue
+            room -= text.count("$") * longest
+            if room < 0:
+                raise ValueError("what its <default>s stand for is too large")
             element.set(key, _VARIABLE.sub(value_of, text))
 
 
@@ -148,6 +196,14 @@ def _keep_one_sensor(root: Element) -> tuple[int, int] | None:
     return int(numbers[0]), int(numbers[1])
 
 
+def _add_film(root: Element, size: tuple[int, int]) -> None:
+    """Give the sensor a plain film of its old film's size: Mitsuba's fov_axis and focal_length depend on its aspect."""
+    for sensor in root.findall("sensor"):
+        film = ElementTree.SubElement(sensor, "film", type="hdrfilm")
+        for name, pixels in zip(("width", "height"), size, strict=True):
+            ElementTree.SubElement(film, "integer", name=name, value=str(pixels))
+
+
 def _clean(element: Element, folder: Path) -> None:
     """Check an element and everything in it; drop what is left out, make file names absolute."""
     for child in list(element):
@@ -166,18 +222,23 @@ def _clean(element: Element, folder: Path) -> None:
                 raise ValueError(f"<texture type={kind!r}> has no {name}")
         if kind in ("ply", "obj", "envmap") and _string(child, "filename") is None:
             raise ValueError(f"<{child.tag} type={kind!r}> has no filename")
+        check_numbers(child)
         _absolute_files(child, folder)
         _clean(child, folder)
 
 
 def _absolute_files(element: Element, folder: Path) -> None:
-    named = element.tag == "string" and element.get("name") == "filename"
-    for key in ("value",) if named else ("filename",):
+    for key in _file_keys(element):
         if element.get(key) is not None:
             file, problem = existing_file(str(element.get(key)), folder)
             if problem:
                 raise ValueError(problem.removesuffix("."))
             element.set(key, str(file))
+
+
+def _file_keys(element: Element) -> tuple[str, ...]:
+    """Return the attributes in which an element may name a file."""
+    return ("value",) if element.tag == "string" and element.get("name") == "filename" else ("filename",)
 
 
 def _string(element: Element, name: str) -> str | None:

@@ -6,6 +6,7 @@ Positions and grids are data, never constants of a kernel: one compiled kernel s
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -18,9 +19,33 @@ from nlosrender.errors import RenderError
 from nlosrender.scene.build import WALL_ID, BuiltScene
 from nlosrender.scene.pose import Float64
 
+KINDS = {"Float": np.float32, "UInt": np.uint32, "Int": np.int32}  # by Dr.Jit's names
+ALIGNMENT = 64  # bytes, the widest vectors there are
 MESH_LIFT = 1e-4  # engine units: less than any fold of a mesh wall, far more than the rounding of its points
 MESH_NUDGE = 1e-6  # engine units: off the edges of its triangles, where rays may slip through
 SAME_FACE = 1 - 1e-5  # least cosine between the normals of a face in float32 and float64
+
+
+def on_device(kind: Any, values: NDArray[np.generic]) -> Any:
+    """Bring numbers (n,) of 32 bits to the device as an array of type ``kind``.
+
+    Dr.Jit takes numpy's memory as it is, and a kernel knows how its arrays are aligned: numpy aligns by chance, and
+    each pattern of chance would be a kernel to compile.
+    """
+    source = np.ascontiguousarray(values, dtype=KINDS[kind.__name__])
+    room = np.empty(source.nbytes + ALIGNMENT, np.uint8)
+    start = -room.ctypes.data % ALIGNMENT
+    aligned = room[start : start + source.nbytes].view(source.dtype)
+    aligned[:] = source
+    return kind(aligned)
+
+
+def columns(values: NDArray[np.floating]) -> list[mi.Float]:
+    """Bring the columns of ``values`` (n, k) to the device, each as an array of its own.
+
+    A vector made of the whole would be taken apart by a kernel that has n in it, compiled anew for every n.
+    """
+    return [on_device(mi.Float, column) for column in np.asarray(values).T]
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,8 +88,8 @@ def laser_points(built: BuiltScene, capture: Capture, time_axis: TimeAxis, index
 def _wall_points(
     built: BuiltScene, positions: Float64, normals: Float64, device: Float64, delay: Float64
 ) -> WallPoints:
-    point = mi.Point3f((positions / built.unit).T.astype(np.float32))
-    normal = mi.Vector3f(normals.T.astype(np.float32))
+    point = mi.Point3f(*columns(positions / built.unit))
+    normal = mi.Vector3f(*columns(normals))
     # The wall's own intersection gives shading frame and texture coordinates for every wall type and BSDF.
     if built.wall_shape.class_name() == "Mesh":
         interaction = _on_mesh(built, point, normal)
@@ -73,12 +98,12 @@ def _wall_points(
     interaction.p = point  # the exact grid point, not where a float32 ray met the wall
     to_device = device - positions
     to_device /= np.maximum(np.linalg.norm(to_device, axis=-1, keepdims=True), 1e-300)
-    interaction.wi = interaction.to_local(mi.Vector3f(to_device.T.astype(np.float32)))
+    interaction.wi = interaction.to_local(mi.Vector3f(*columns(to_device)))
     whole = np.floor(delay)
     points = WallPoints(
         interaction,
-        mi.Int32(np.clip(whole, -(2**30), 2**30).astype(np.int32)),
-        mi.Float((delay - whole).astype(np.float32)),
+        on_device(mi.Int32, np.clip(whole, -(2**30), 2**30)),
+        on_device(mi.Float, delay - whole),
     )
     dr.eval(points.interaction, points.delay_bins, points.delay_fraction)
     return points

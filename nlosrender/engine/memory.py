@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
-from dataclasses import replace
 
 from nlosrender.capture.grids import Capture
 from nlosrender.capture.plan import BYTES_PER_SUM, MOST_SUMS, Batch, Plan
 from nlosrender.engine.backend import batch_memory, physical_memory
 from nlosrender.engine.engines import Engine
 from nlosrender.engine.skipped import traces_paths
+from nlosrender.engine.virtual_lights.block_histogram import BlockHistogram
 from nlosrender.engine.virtual_lights.engine import VirtualLightEngine
 from nlosrender.engine.virtual_lights.third_bounce import FIRST_COARSENESS, REFINEMENT
 from nlosrender.errors import RenderError
@@ -31,8 +30,7 @@ def batch_bytes(engine: Engine, plan: Plan) -> int:
     entries = paths.shape(largest, paths.n_slots).size
     gathered = 0
     if isinstance(engine, VirtualLightEngine):
-        fewest = min(plan.batches, key=lambda batch: batch.sensors.size)
-        gathered = max(_gather_entries(engine, batch) for batch in (largest, fewest))
+        gathered = BlockHistogram.entries(engine.third.shape(largest))
     if max(entries, gathered) > MOST_SUMS:
         raise RenderError(
             f"a batch of {max(entries, gathered):.2e} sums is more than 32-bit indices reach; lower render.memory_limit"
@@ -93,12 +91,6 @@ def _refuse_patches(engine: VirtualLightEngine, memory_limit: int) -> None:
 def n_pairs(capture: Capture, batch: Batch) -> int:
     """Return the pairs of laser and sensor points in a batch."""
     return batch.sensors.size * (batch.lasers.size if capture.scan_type == "exhaustive" else 1)
-
-
-def _gather_entries(engine: VirtualLightEngine, batch: Batch) -> int:
-    """Return the sums of the gather: lanes that share a sensor point's patches have rows of their own."""
-    slices = max(1, math.ceil(engine.lanes / batch.sensors.size))
-    return replace(engine.paths.shape(batch, 1), replicas=slices).size
 
 
 def _size(n_bytes: float) -> str:

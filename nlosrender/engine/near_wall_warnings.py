@@ -13,13 +13,13 @@ from nlosrender.capture.grids import Capture, PointGrid
 from nlosrender.engine.connections import RAY_OFFSET, WALL_OFFSET
 from nlosrender.engine.engines import Engine
 from nlosrender.engine.path_engine import PathEngine
+from nlosrender.engine.virtual_lights.engine import RARE, VirtualLightEngine
 from nlosrender.scene.build import BuiltScene
 from nlosrender.scene.mesh_wall import MeshWall
 from nlosrender.scene.pose import Float64
 
 NEAREST_KNOWN = 1e-6  # engine units; nearer surfaces that are tilted or round lie some per cent nearer or farther
 NEAREST_TOLD = 2.0  # ray offsets from a curved wall within which light is lost
-RARE = 1e-4  # share of the paths: rarer light is not found by renders of common lengths, or by too few paths
 LEAST_FRACTION = 1e-3  # of hidden geometry sampling where there is none: BSDF sampling finds even less
 
 
@@ -33,6 +33,7 @@ def near_wall_warnings(engine: Engine, built: BuiltScene, capture: Capture) -> I
     """
     yield from _near_warnings(built, capture)
     yield from _rare_light_warnings(engine, built, capture)
+    yield from _virtual_light_warnings(engine)
     yield from _edge_warnings(built, capture)
 
 
@@ -76,6 +77,17 @@ def _rare_light_warnings(engine: Engine, built: BuiltScene, capture: Capture) ->
             f"a hidden surface lies {height * built.unit:.2g} m before the laser point ({x:.4g}, {y:.4g}, {z:.4g}) m: "
             f"only one path in {1 / share:.0e} finds the light between the two, up to half of H, and the stated error "
             "misses it as well. Use render.engine: virtual_lights, or scan_type: confocal."
+        )
+
+
+def _virtual_light_warnings(engine: Engine) -> Iterator[str]:
+    """Yield what the virtual lights do not get right close to the wall."""
+    if isinstance(engine, VirtualLightEngine) and engine.misses_light:
+        distance = engine.tessellator.nearest_to_laser * engine.built.unit
+        yield (
+            f"a hidden surface lies {distance:.1g} m from a laser point: the third bounce is right, "
+            "but most of the light that goes to and fro between the two is not found, and the stated "
+            "error takes all further bounces for unknown. Use render.max_bounces: 3 where they do not matter."
         )
 
 

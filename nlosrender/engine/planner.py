@@ -12,12 +12,13 @@ from nlosrender.engine.engines import Engine
 from nlosrender.engine.line_of_sight.engine import LineOfSightEngine
 from nlosrender.engine.path_engine import PathEngine, PathOptions
 from nlosrender.engine.virtual_lights.engine import VirtualLightEngine, is_lambertian
-from nlosrender.engine.virtual_lights.tessellator import can_tessellate, wall_sees_itself
+from nlosrender.engine.virtual_lights.tessellator import MAX_PATCHES, can_tessellate, wall_sees_itself
+from nlosrender.engine.virtual_lights.third_bounce import FIRST_COARSENESS
 from nlosrender.scene.build import BuiltScene
 from nlosrender.scene.view import BuiltView
 
-# Engine units: a surface this near to a laser or sensor point is seen under a large angle however finely it is cut.
-TOUCHING = 2e-3
+TOUCHING = 2e-3  # engine units: a surface this near to laser or sensor points takes patches of its own for each of them
+MOST_NEAR = 100_000  # patches of such surfaces at the coarsest, where paths find the same light
 MAX_TRIANGLES = 5_000_000  # of all meshes: merging them takes about 1 kB each on the way
 
 
@@ -51,11 +52,30 @@ def choose_engine(
     if reason is not None:
         return PathEngine(built, capture, time_axis, options, reason=reason)
     engine = VirtualLightEngine(built, capture, time_axis, options, lanes)
+    if engine.tessellator.nearest_round < TOUCHING:
+        reason = "a round surface, which is cut into patches of one size, touches a laser or sensor point"
+        return PathEngine(built, capture, time_axis, options, reason=reason)
     if render.engine == "virtual_lights":
         engine.reason = "asked for"
-    elif engine.tessellator.nearest < TOUCHING:
-        return PathEngine(built, capture, time_axis, options, reason="hidden geometry touches a laser or sensor point")
+    elif (reason := _obstacle_close_by(engine, capture)) is not None:
+        return PathEngine(built, capture, time_axis, options, reason=reason)
     return engine
+
+
+def _obstacle_close_by(engine: VirtualLightEngine, capture: Capture) -> str | None:
+    """Return why paths are better before surfaces almost on the wall; None where they are not.
+
+    Paths from the sensor points find what is close to these, but not what is close to a laser point elsewhere.
+    """
+    tessellator = engine.tessellator
+    if tessellator.nearest >= TOUCHING:
+        return None
+    if capture.scan_type == "confocal":
+        return "hidden geometry touches a laser or sensor point"
+    most = MAX_PATCHES if tessellator.nearest_to_laser < TOUCHING else MOST_NEAR
+    if tessellator.count(FIRST_COARSENESS) > most:
+        return "hidden geometry touches so many points that paths cost less"
+    return None
 
 
 def _obstacle(render: RenderConfig, capture: Capture, built: BuiltScene) -> str | None:

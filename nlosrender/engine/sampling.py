@@ -15,6 +15,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from nlosrender.engine.device_arrays import on_device
 from nlosrender.engine.histogram import DeviceHistogram, HistogramShape
 from nlosrender.engine.temporal_kernel import TemporalKernel
 from nlosrender.engine.transport import LaneRandomness
@@ -93,7 +94,7 @@ def accumulate(
     """
     histogram = DeviceHistogram(shape, kernel)
     lane = dr.arange(mi.UInt32, shape.lanes)
-    point = dr.gather(mi.UInt32, mi.UInt32(points), lane % shape.sensors)
+    point = dr.gather(mi.UInt32, on_device(mi.UInt32, points), lane % shape.sensors)
     randomness = LaneRandomness.seeded(seed, point * shape.replicas + lane // shape.sensors)
     begun, done, compile_seconds = time.perf_counter(), 0, 0.0
     while (more := schedule.next_samples(done, time.perf_counter() - begun)) > 0:

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from nlosrender.config.canonical import tree_hash
+from nlosrender.config.mitsuba_xml import named_files, read_mitsuba_xml
 from nlosrender.files.layout import FORMAT_VERSION
 from nlosrender.files.provenance import package_versions
 
@@ -16,7 +17,8 @@ from nlosrender.files.provenance import package_versions
 # told by the Mitsuba variant.
 NOT_THE_CAPTURE = (("output", "path"), ("render", "memory_limit"), ("render", "backend"))
 PACKAGES = ("nlosrender", "mitsuba", "drjit")  # whose versions the samples depend on
-FILE_KEYS = ("filename", "mitsuba")  # of meshes, textures, spectra; of a whole scene
+FILE_KEY = "filename"  # of meshes, textures, spectra
+SCENE_KEY = "mitsuba"  # of a whole scene, which names files of its own
 
 
 def capture_identity(resolved_config: Mapping[str, Any], part: str, variant: str, replicas: int) -> dict[str, Any]:
@@ -104,11 +106,25 @@ def _shown(value: Any) -> str:
 
 def _with_content(tree: Any) -> Any:
     if isinstance(tree, Mapping):
-        return {
-            key: _content(value) if key in FILE_KEYS and isinstance(value, str) else _with_content(value)
-            for key, value in tree.items()
-        }
+        return {key: _value_with_content(key, value) for key, value in tree.items()}
     return [_with_content(item) for item in tree] if isinstance(tree, (list, tuple)) else tree
+
+
+def _value_with_content(key: str, value: Any) -> Any:
+    if isinstance(value, str) and key == FILE_KEY:
+        return _content(value)
+    if isinstance(value, str) and key == SCENE_KEY:
+        return _content_of_scene(value)
+    return _with_content(value)
+
+
+def _content_of_scene(name: str) -> str | list[str]:
+    """Return the digest of a Mitsuba scene, and those of the files it names, which may change while it does not."""
+    try:
+        root, _ = read_mitsuba_xml(Path(name))
+    except ValueError:  # the renderer says so, with its place in the YAML
+        return _content(name)
+    return [_content(name), *(_content(str(file)) for file in named_files(root))]
 
 
 def _content(name: str) -> str:

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from nlosrender.config.emitters import PointLamp, SpotLamp
+from nlosrender.config.fields import LONGEST
 from nlosrender.config.mitsuba_xml import image_files, mesh_files, read_mitsuba_xml
 from nlosrender.scene.build import load_surface, read_mesh_of, shape_bounds
 from nlosrender.scene.camera import ImagePlane, image_plane
@@ -88,6 +89,7 @@ def build_view(scene_config: SceneConfig, capture_config: CaptureConfig) -> Buil
     shapes = [load_surface(surface, shape, unit) for surface, shape in zip(surfaces, loaded, strict=True)]
     contents: dict[str, object] = {f"lamp_{index}": _lamp(lamp, frame, unit) for index, lamp in enumerate(lamps)}
     if whole is not None:
+        _check_extents(whole.shapes())
         shapes += whole.shapes()
         far = [emitter for emitter in whole.emitters() if not emitter.flags() & mi.EmitterFlags.Surface]
         contents |= {f"emitter_{index}": emitter for index, emitter in enumerate(far)}
@@ -173,6 +175,15 @@ def _check_mesh(filename: str, kind: str) -> None:
         read_mesh(filename, kind, face_normals=False)
     except ValueError as error:
         raise ValueError(f"{filename} cannot be used as a mesh: {error}") from error
+
+
+def _check_extents(shapes: Sequence[mi.Shape]) -> None:
+    """Refuse what transformations have made of a scene's numbers: nothing, or more than float32 can square."""
+    for shape in shapes:
+        box = shape_bounds(shape, 1.0)
+        if box is None or not float(np.abs(box).max()) <= LONGEST:
+            extent = "has no extent" if box is None else f"reaches {float(np.abs(box).max()):.4g} m from the origin"
+            raise rejected(WHERE, f"its {shape.class_name()} {shape.id()!r} {extent}. Check its transformation.")
 
 
 def _lamp(lamp: PointLamp | SpotLamp, frame: Pose, unit: float) -> mi.Emitter:

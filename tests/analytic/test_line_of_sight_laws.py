@@ -123,6 +123,10 @@ def test_target_error_is_met() -> None:
         ("<shape type='sphere'><float name='nonsense' value='1'/></shape>", "nonsense"),
         ("<shape type='ply'><string name='filename' value='damaged.ply'/></shape>", "damaged.ply"),
         ("<shape type='sphere'><ref id='nobody'/></shape>", "nobody"),
+        (
+            "<shape type='cube'><transform name='to_world'><scale value='1e8'/><scale x='1e8'/></transform></shape>",
+            "reaches 1e\\+16 m from the origin",
+        ),
     ],
 )
 def test_what_mitsuba_finds_wrong_with_a_scene(content: str, message: str, tmp_path: Path) -> None:
@@ -132,3 +136,32 @@ def test_what_mitsuba_finds_wrong_with_a_scene(content: str, message: str, tmp_p
     with pytest.raises(ConfigError, match=message) as caught:
         see(view_config(emitters=[PANEL], scene={"mitsuba": "scene.xml"}), folder=tmp_path)
     assert caught.value.problems[0].key == "scene.mitsuba"
+
+
+@pytest.mark.parametrize("axis", ["x", "y", "smaller", "larger", "diagonal"])
+def test_field_of_view_of_a_mitsuba_camera(axis: str, tmp_path: Path) -> None:
+    """A picture of 6 x 3 pixels that is 40 degrees across ``fov_axis`` sees what Mitsuba's camera would see."""
+    (tmp_path / "scene.xml").write_text(
+        f"<scene version='3.0.0'><sensor type='perspective'><string name='fov_axis' value='{axis}'/>"
+        "<float name='fov' value='40'/><film type='hdrfilm'><integer name='width' value='6'/>"
+        "<integer name='height' value='3'/></film></sensor><shape type='sphere'/></scene>",
+        encoding="utf-8",
+    )
+    config = view_config(emitters=[PANEL], scene={"mitsuba": "scene.xml"}, spp=16)
+    del config["capture"]["camera"]
+    plane = see(config, folder=tmp_path).engine.built.wall
+    extent = {"x": 1.0, "larger": 1.0, "y": 0.5, "smaller": 0.5, "diagonal": np.hypot(1, 0.5)}[axis]  # of the width
+    half_width = np.tan(np.radians(20)) / extent
+    assert plane.width / 2 / plane.distance == pytest.approx(half_width, rel=1e-5)
+    assert plane.height == pytest.approx(plane.width / 2)
+
+
+@pytest.mark.parametrize("index", [{"specular": 0.5}, {}, {"eta": 1.5}])
+def test_index_of_a_principled_surface(index: dict[str, float]) -> None:
+    """It may be told as ``eta`` or as ``specular``, of which 0.5, the default, is 1.5."""
+    ball = {"type": "sphere", "center": [0, 0, 0], "radius": 0.5}
+    bsdf = {"type": "principled", "spec_trans": 0.5, **index}
+    view = see(view_config({**ball, "bsdf": bsdf}, emitters=[PANEL], spp=16))
+    from nlosrender.engine.line_of_sight.transport import refractive_indices
+
+    assert max(np.array(refractive_indices(view.engine.built.scene))) == pytest.approx(1.5, rel=1e-5)

@@ -106,6 +106,8 @@ def test_a_plot(capture: Path, tmp_path: Path) -> None:
         ({"kind": "bmp"}, "need one of exr, png, gif"),
         ({"every": 0}, "--every: got 0"),
         ({"frames_per_second": 0}, "--fps"),
+        ({"start_opl": float("nan")}, "--from: got nan"),
+        ({"end_opl": float("-inf")}, "--to: got -inf"),
     ],
 )
 def test_options_that_make_no_pictures(options: dict, message: str) -> None:

@@ -287,6 +287,21 @@ def test_a_memory_limit_is_checked_against_machine_and_lanes():
     assert "batches of 2 sensor points, too few" in warning
 
 
+def test_the_gather_takes_what_is_said():
+    """Its sums, in whole blocks of bins; and a batch of few points does not take rows for every processor."""
+    from nlosrender.engine.memory import batch_bytes
+    from nlosrender.engine.virtual_lights.block_histogram import BlockHistogram
+
+    config = configured(flat_wall(PLATE, sensors=(50, 30), bins=(0.0, 9.0, 1), engine="auto", spp=None))
+    _, plan, engine = prepared(config)
+    shape = engine.third.shape(plan.batches[0])
+    histogram = BlockHistogram(shape, np.arange(shape.sensors))
+    n_sums = len(histogram.sums) + len(histogram.outside)
+    assert batch_bytes(engine, plan) == max(plan.bytes_per_batch, 8 * n_sums)
+    small = plan_of((Batch(Tile(0, 1, 0, 2), Tile(0, 1, 0, 1)),) * 750, plan.replicas, 1)
+    assert batch_bytes(engine, small) == pytest.approx(8 * n_sums / 750)
+
+
 # --- how long ---
 
 

@@ -15,6 +15,7 @@ from nlosrender.config.load import config_to_dict, load_config
 from nlosrender.config.mitsuba_xml import is_colored_xml, read_mitsuba_xml
 from nlosrender.config.warnings import config_warnings
 from nlosrender.errors import ConfigError
+from nlosrender.files.identity import capture_hash
 
 ROOT = Path(__file__).parents[2]
 LAMP = {"type": "point", "position": [0, 1, 0], "intensity": 1.0}
@@ -128,6 +129,20 @@ def test_a_relay_wall_is_missing() -> None:
     ("content", "message"),
     [
         ("<scene", "not well-formed XML"),
+        ("<?xml version='1.0' encoding='bogus'?><scene/>", "unknown encoding"),
+        ("<scene>" * 2000 + "</scene>" * 2000, "more than 64 deep"),
+        ("<scene>" + "<bsdf type='diffuse'/>" * 100_000 + "</scene>", "more than 100000 elements"),
+        (
+            f"<scene><default name='a' value='{'x' * 100_000}'/><string name='b' value='{'$a' * 10_000}'/></scene>",
+            "<default>s stand for is too large",
+        ),
+        ("<scene><shape type='sphere'><float name='radius' value='1e400'/></shape></scene>", "need finite numbers"),
+        ("<scene><shape type='sphere'><point name='center' x='nan'/></shape></scene>", "holds nan"),
+        (
+            "<scene><bsdf type='diffuse'><rgb name='reflectance' value='0.5 1.5 0'/></bsdf></scene>",
+            "holds 1.5, need numbers from 0 to 1 for reflectance",
+        ),
+        ("<scene><emitter type='point'><rgb name='intensity' value='-1'/></emitter></scene>", "need numbers >= 0"),
         ("<!DOCTYPE scene [<!ENTITY a 'b'>]><scene/>", "document type or entities"),
         ("<shape/>", "its root is <shape>"),
         ("<scene><include filename='other.xml'/></scene>", "<include> is not supported"),
@@ -155,6 +170,27 @@ def test_mistakes_of_a_mitsuba_scene(content: str, message: str, tmp_path: Path)
     assert caught.value.problems[0].key == "scene.mitsuba"
 
 
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-16"])
+def test_entities_are_refused_in_any_encoding(encoding: str, tmp_path: Path) -> None:
+    """A short file cannot unpack to a large one, nor name other files, however its characters are stored."""
+    content = f"<?xml version='1.0' encoding='{encoding}'?><!DOCTYPE scene [<!ENTITY a 'b'>]><scene/>"
+    (tmp_path / "scene.xml").write_bytes(content.encode(encoding))
+    with pytest.raises(ValueError, match="document type or entities"):
+        read_mitsuba_xml(tmp_path / "scene.xml")
+
+
+def test_a_scene_is_another_one_when_a_file_it_names_changes(tmp_path: Path) -> None:
+    """A render does not go on with another mesh or image than it began with, though the .xml stays the same."""
+    (tmp_path / "scene.xml").write_text(
+        "<scene><shape type='ply'><string name='filename' value='mesh.ply'/></shape></scene>", encoding="utf-8"
+    )
+    hashes = []
+    for content in ("one", "one", "other"):
+        (tmp_path / "mesh.ply").write_text(content, encoding="utf-8")
+        hashes.append(capture_hash({"scene": {"mitsuba": str(tmp_path / "scene.xml")}}))
+    assert hashes[0] == hashes[1] != hashes[2]
+
+
 def test_a_mitsuba_scene_without_camera_needs_one(tmp_path: Path) -> None:
     """A file without sensor goes with a configured camera, and not without."""
     (tmp_path / "scene.xml").write_text("<scene version='3.0.0'><shape type='sphere'/></scene>", encoding="utf-8")
@@ -167,15 +203,17 @@ def test_a_mitsuba_scene_without_camera_needs_one(tmp_path: Path) -> None:
 
 
 def test_what_is_left_of_a_mitsuba_scene(tmp_path: Path) -> None:
-    """Defaults are filled in, films and integrators gone, files absolute; colour is seen."""
+    """Defaults are filled in, integrators gone, of films only their size left, files absolute; colour is seen."""
     root, size = read_mitsuba_xml(ROOT / "scenes" / "glass-and-mirror.xml")
     assert size == (48, 32)
-    assert not list(root.iter("film")) + list(root.iter("integrator")) + list(root.iter("default"))
+    assert not list(root.iter("integrator")) + list(root.iter("default"))
+    (film,) = root.iter("film")
+    assert [(item.get("name"), item.get("value")) for item in film] == [("width", "48"), ("height", "32")]
     assert not is_colored_xml(root)
-    (tmp_path / "red.xml").write_text(
-        "<scene><bsdf type='diffuse'><rgb name='reflectance' value='0.5 0.1 0.1'/></bsdf></scene>", encoding="utf-8"
-    )
-    assert is_colored_xml(read_mitsuba_xml(tmp_path / "red.xml")[0])
+    for value in ("<rgb name='reflectance' value='0.5 0.1 0.1'/>", "<spectrum name='r' value='400:0.1, 700:0.5'/>"):
+        content = f"<scene><bsdf type='diffuse'>{value}</bsdf></scene>"
+        (tmp_path / "colored.xml").write_text(content, encoding="utf-8")
+        assert is_colored_xml(read_mitsuba_xml(tmp_path / "colored.xml")[0]), value
 
 
 def test_warnings() -> None:

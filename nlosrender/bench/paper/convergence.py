@@ -31,7 +31,9 @@ def convergence(study: Study) -> PaperFigure:
     for technique, (mses, seconds) in curves.items():
         slope = power_law(counts, mses)
         slopes[technique.name] = math.nan if slope is None else slope
-        axes[0, 0].plot(counts, mses, marker="o", ms=4, label=f"{technique.name}, slope {slopes[technique.name]:.2f}")
+        axes[0, 0].plot(
+            counts, mses, marker="o", ms=4, label=f"{technique.name}, slope {_shown(slopes[technique.name])}"
+        )
         axes[0, 1].plot(seconds, mses, marker="o", ms=4, label=technique.name)
     targets = study.pick((0.2, 0.1, 0.05, 0.02), (0.2, 0.1, 0.05, 0.02, 0.01, 0.005))
     lights_mses, lights_seconds, table, agreement = _virtual_lights(study, grid, targets, REFERENCE_TIMES * counts[-1])
@@ -43,7 +45,7 @@ def convergence(study: Study) -> PaperFigure:
         title="convergence",
         reported="The mean squared error of all techniques falls as 1/N; they differ by a factor, and both together "
         "are lowest.",
-        measured="Fitted slopes: " + ", ".join(f"{name} {slope:.2f}" for name, slope in slopes.items()) + ". The "
+        measured="Fitted slopes: " + ", ".join(f"{name} {_shown(slope)}" for name, slope in slopes.items()) + ". The "
         f"virtual lights differ from the path engine by {agreement:.2%} of H, whose own error is part of that.",
         pictures=(Picture(save(figure, study.picture("figure-11-convergence")), "Mean squared error of H."),),
         tables=(table,),
@@ -55,6 +57,11 @@ def convergence(study: Study) -> PaperFigure:
         f"a spot of {1000 * SPOT_RADIUS:g} mm, and are measured against their own finest run.",
         configurations=(SCENE,),
     )
+
+
+def _shown(slope: float) -> str:
+    """Return a slope in words; what hardly any path finds has none yet: its first hits raise the error."""
+    return f"{slope:.2f}" if slope < 0 else "none yet (hardly any path finds the spot)"
 
 
 def _path_reference(study: Study, grid: str, spp: int, *overrides: str) -> Rendered:

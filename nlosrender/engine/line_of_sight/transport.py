@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import drjit as dr
@@ -104,4 +105,8 @@ def crosses_rough_surfaces(scene: mi.Scene) -> bool:
 def _index_behind(bsdf: mi.BSDF) -> float:
     if bsdf.class_name() not in BENDING:
         return 1.0
-    return float(np.ravel(mi.traverse(bsdf)["eta"])[0])
+    parameters = dict(mi.traverse(bsdf))
+    if "eta" in parameters:
+        return float(np.ravel(parameters["eta"])[0])
+    # a principled BSDF told by its reflectance along the normal, 0.08 specular = ((eta - 1) / (eta + 1))^2
+    return float(2 / (1 - math.sqrt(0.08 * np.ravel(parameters["specular"])[0])) - 1)

@@ -36,6 +36,12 @@ class BlockHistogram:
         self.outside = dr.zeros(mi.Float64, rows)
         dr.make_opaque(self.sums, self.outside)
 
+    @staticmethod
+    def entries(shape: HistogramShape) -> int:
+        """Return how many sums a histogram of this shape holds, padding and what lies outside included."""
+        rows = shape.lanes * shape.lasers * shape.channels
+        return rows * (-(-shape.n_bins // BLOCK) * BLOCK + 1)
+
     def deposit(
         self,
         lane: mi.UInt32,

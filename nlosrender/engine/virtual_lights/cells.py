@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import mitsuba as mi
 import numpy as np
@@ -14,7 +15,9 @@ from nlosrender.engine.surface_sampler import facing_triangles
 from nlosrender.scene.build import WALL_ID, BuiltScene
 from nlosrender.scene.pose import Float64
 
-NEAREST = 1e-3  # engine units: surfaces nearer to a laser or sensor point are not cut any finer
+NEAREST = 1e-3  # engine units: nothing is cut finer where the nearest laser or sensor point is in its plane
+LEAST = 1e-8  # engine units: nothing is cut any finer elsewhere
+ROUNDED = 1e-7  # engine units: float32 knows the height of a point over a tilted plane no better
 ROUNDING = 1e-9  # engine units: points that lie so near to those of a regular grid are that grid
 NEIGHBOURS = 8  # points asked for the nearest that is not in the plane of a cell
 IN_PLANE = 1e-5  # cosine below which a cell of the wall is in the plane of a point, and neither lights nor sees it
@@ -29,7 +32,7 @@ class Cells:
     shapes: NDArray[np.uint32]  # (n,) index into the scene's shapes
     primitives: NDArray[np.uint32]  # (n,) triangle of the mesh
     sizes: Float64  # (n,) longest edge
-    distances: Float64  # (n,) of the centre from the nearest laser or sensor point, at least NEAREST
+    distances: Float64  # (n,) of the centre from the nearest laser or sensor point, at least LEAST
 
     def at(self, chosen: NDArray[np.bool_]) -> Cells:
         """Return the cells that are ``chosen``."""
@@ -84,9 +87,9 @@ class WallDistance:
 
     def __init__(self, capture: Capture, unit: float):
         grids = {id(grid): grid for grid in (capture.sensor_grid, capture.laser_grid)}
-        self._points = np.concatenate([grid.positions.reshape(-1, 3) / unit for grid in grids.values()])
+        points = np.concatenate([grid.positions.reshape(-1, 3) / unit for grid in grids.values()])
+        self._points = points.astype(np.float32).astype(np.float64)  # as the device knows them: it matters close by
         self._normals = np.concatenate([grid.normals.reshape(-1, 3) for grid in grids.values()])
-        self._all: cKDTree | None = None
         self._regular: list[RegularPoints] = []
         self._trees: list[cKDTree] = []
         for grid in grids.values():
@@ -97,21 +100,34 @@ class WallDistance:
             else:
                 self._trees.append(cKDTree(positions))
 
+    @cached_property
+    def _tree(self) -> cKDTree:
+        return cKDTree(self._points)
+
     def __call__(self, points: Float64) -> Float64:
         """Return the distance (n,) of ``points`` (n, 3) [engine units]."""
         squares = [grid.squared_distance(points) for grid in self._regular]
         squares += [np.square(tree.query(points)[0]) for tree in self._trees]
         return np.sqrt(np.min(squares, axis=0))
 
+    def of_planes(self, points: Float64, normals: Float64) -> Float64:
+        """Return the distance (n,) of planes, given by points and normals (n, 3), close to the wall.
+
+        At least ``NEAREST`` where the nearest laser or sensor point is in the plane as far as float32 knows: heights
+        over a plane that is parallel to a planar wall it knows exactly.
+        """
+        distances, nearest = self._tree.query(points)
+        heights = np.abs(np.einsum("nx,nx->n", points - self._points[nearest], normals))
+        tilts = np.linalg.norm(np.cross(normals, self._normals[nearest]), axis=1)
+        return np.maximum(distances, np.where(heights > LEAST + ROUNDED * tilts, LEAST, NEAREST))
+
     def out_of_plane(self, points: Float64) -> Float64:
         """Return the distance (n,) of points of the wall (n, 3) from the nearest one whose plane they are not in.
 
         Where there is none among ``NEIGHBOURS``, the distance of the last of them: no other is nearer.
         """
-        if self._all is None:
-            self._all = cKDTree(self._points)
         count = min(NEIGHBOURS, len(self._points))
-        distances, index = self._all.query(points, k=np.arange(1, count + 1))
+        distances, index = self._tree.query(points, k=np.arange(1, count + 1))
         heights = np.einsum("nkx,nkx->nk", points[:, None] - self._points[index], self._normals[index])
         apart = np.abs(heights) > IN_PLANE * distances
         apart[:, -1] = True
@@ -123,13 +139,18 @@ def cells_of_mesh(built: BuiltScene, index: int, mesh: mi.Mesh, distance: WallDi
 
     The points lie on those of the wall: there only points in the planes of other triangles count.
     """
-    from_points = distance.out_of_plane if mesh.id() == WALL_ID else distance
+    is_wall = mesh.id() == WALL_ID
     corners, primitives = facing_triangles(built, mesh)
     weights = np.broadcast_to(np.eye(3), corners.shape)
     done: list[Cells] = []
     while len(corners):
-        sizes = longest_edges(corners)
-        distances = np.maximum(from_points(corners.mean(axis=1)), NEAREST)
+        sizes, centres = longest_edges(corners), corners.mean(axis=1)
+        if is_wall:
+            distances = np.maximum(distance.out_of_plane(centres), NEAREST)
+        else:
+            distances = distance(centres)
+            close = distances < NEAREST
+            distances[close] = distance.of_planes(centres[close], normals_and_areas(corners[close])[0])
         large = sizes > distances
         small = Cells(corners, weights, np.full(len(corners), index, np.uint32), primitives, sizes, distances)
         done.append(small.at(~large))

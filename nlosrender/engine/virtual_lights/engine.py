@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import time
 from dataclasses import replace
+from functools import cached_property
 
 import drjit as dr
 import mitsuba as mi
@@ -39,6 +40,8 @@ THIRD_OF_MANY, REST_OF_MANY = 0.35, 0.88  # patches are cheaper than walks
 PILOT_ERROR = 4.0  # times the target: when a pilot has seen enough to say how many rounds are needed
 MOST_PILOT_ROUNDS = 16
 PILOT_LANES = 2048
+MISSED = 3.0  # times the light that is found of bounce 5: one of the four legs that may lead past the laser point is
+RARE = 1e-4  # share of walks or paths: rarer light is not found by renders of common lengths, or by too few
 
 
 class VirtualLightEngine:
@@ -77,6 +80,18 @@ class VirtualLightEngine:
         """Whether bounces above the third are asked for."""
         highest = self.options.bounces.max_bounces
         return highest is None or highest > THIRD_BOUNCE
+
+    @cached_property
+    def misses_light(self) -> bool:
+        """Whether light of the further bounces is not found, nor known to the estimated error.
+
+        Between a laser point and a surface almost on it, light goes to and fro in an area of about the distance
+        squared. Walks begin anywhere and end there by chance.
+        """
+        sampler = self.paths.sampler
+        if not self.has_further_bounces or self.capture.scan_type == "confocal" or sampler.is_empty:
+            return False
+        return math.pi * self.tessellator.nearest_to_laser**2 < RARE * sampler.area
 
     @property
     def compile_seconds(self) -> float:
@@ -137,6 +152,8 @@ class VirtualLightEngine:
         result = self._further_bounces(
             batch, replace(budget, time_limit_s=left), fine, lambda share: progress((1 + share) / 2)
         )
+        if self.misses_light:
+            np.add(result.variance, np.square(MISSED * result.mean), out=result.variance)
         slot, scale = self.options.bounces.slot(THIRD_BOUNCE), self.paths.scale
         third, deviation = fine.values, coarse.values  # large: worked on in place
         np.subtract(third, deviation, out=deviation)

@@ -11,7 +11,7 @@ import numpy as np
 
 from nlosrender.capture.bounces import THIRD_BOUNCE
 from nlosrender.capture.plan import Batch
-from nlosrender.engine.device_arrays import laser_points
+from nlosrender.engine.device_arrays import laser_points, on_device
 from nlosrender.engine.histogram import DeviceHistogram, HistogramShape
 from nlosrender.engine.path_engine import PathEngine
 from nlosrender.engine.pilot import Pilot, spread
@@ -116,7 +116,7 @@ class FurtherBounces:
         rows[:, 0:3], rows[:, 3] = sites.positions[used], as_float[0]
         rows[:, 4:7], rows[:, 7] = sites.normals[used] * sites.areas[used, None], as_float[1]
         shading = mi.Normal3f(to_points(sites.normals[used]))
-        return SiteTable(mi.Float(rows.ravel()), shading, mi.UInt32(first.astype(np.uint32)))
+        return SiteTable(on_device(mi.Float, rows.ravel()), shading, on_device(mi.UInt32, first))
 
 
 @dr.syntax
@@ -157,7 +157,7 @@ def _gather_impulses(
         weight *= dr.maximum(-dr.dot(areas, direction), 0) / distance2
         active = dr.any(weight > 0)
         if dr.hint(needs_visibility, mode="scalar"):
-            active = is_visible(built, sensor, position, active)
+            active = is_visible(built, sensor, to_site, active)
 
         # ---- Deposit its impulses ------------------------------------------------------------------------------------
         delay = distance * scale + sensors.delay_fraction
@@ -175,7 +175,7 @@ def _gather_impulses(
                 value *= arriving(built, own_laser, end_point, facing)
                 lit = dr.any(value > 0)
                 if dr.hint(needs_visibility, mode="scalar"):
-                    lit = is_visible(built, own_laser.interaction, end_point, lit)
+                    lit = is_visible(built, own_laser.interaction, end_point - own_laser.interaction.p, lit)
                 arrival = delay + dr.gather(mi.Float, impulses.delays, impulse) + own_laser.delay_fraction
                 arrival += dr.norm(end_point - own_laser.interaction.p) * scale
                 bins = mi.Int32(dr.floor(dr.minimum(arrival, 1e9))) + own_laser.delay_bins + sensors.delay_bins

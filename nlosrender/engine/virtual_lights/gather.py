@@ -60,8 +60,11 @@ def gather_third_bounce(
         # ---- The patch as the sensor point sees it -----------------------------------------------------------------
         rows = [dr.gather(mi.Vector4f, lights.packed, patch * ROWS + k) for k in range(ROWS)]
         a, b, c, centre, shown = (mi.Point3f(row.x, row.y, row.z) for row in rows)
+        from_sensor = centre - sensor.p
         areas = mi.Vector3f(rows[0].w, rows[1].w, rows[2].w)
-        to_patch = centre - sensor.p
+        to_patch = from_sensor
+        if dr.hint(lights.remainder is not None, mode="scalar"):
+            to_patch = from_sensor + _remainder(lights, patch)
         distance2 = dr.squared_norm(to_patch)
         direction = to_patch * dr.rsqrt(distance2)
         received = wall_bsdf.eval(context, sensor, sensor.to_local(direction))
@@ -79,7 +82,7 @@ def gather_third_bounce(
         # ---- Visibility --------------------------------------------------------------------------------------------
         if dr.hint(settings.needs_visibility, mode="scalar"):
             is_open = rows[4].w > 0
-            active &= is_open | is_visible(built, sensor, shown, active & ~is_open)
+            active &= is_open | is_visible(built, sensor, from_sensor + shown, active & ~is_open)
 
         # ---- Reflect towards the lasers and deposit ----------------------------------------------------------------
         scale = transport.bins_per_unit
@@ -140,7 +143,10 @@ def _deposit(
     lit = seen.active & dr.any(value > 0)
     if not settings.is_diffuse:
         centre = dr.gather(mi.Point3f, lights.interaction.p, seen.patch)
-        to_laser = dr.normalize(laser_points.interaction.p - centre)
+        to_laser = laser_points.interaction.p - centre
+        if lights.remainder is not None:
+            to_laser -= _remainder(lights, seen.patch)
+        to_laser = dr.normalize(to_laser)
         value *= _reflected(lights, seen.patch, seen.direction, to_laser, lit)
         lit &= dr.any(value > 0)
     legs = dr.gather(mi.Vector4f, lights.delays, entry)
@@ -166,6 +172,12 @@ def _spread(
     value = value * dr.select(is_cluster, mi.Float(0.5), 1)
     spread_triangle(histogram, lane, laser, mi.Vector3f(a, b, c), whole, value, active)
     spread_triangle(histogram, lane, laser, mi.Vector3f(a, c, d), whole, value, active & is_cluster)
+
+
+def _remainder(lights: Lights, patch: mi.UInt32) -> mi.Vector3f:
+    """Return what float32 rounds off a patch's centre."""
+    row = dr.gather(mi.Vector4f, lights.remainder, patch)
+    return mi.Vector3f(row.x, row.y, row.z)
 
 
 def _reflected(

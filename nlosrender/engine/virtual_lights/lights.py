@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nlosrender.engine.connections import off_the_wall
+from nlosrender.engine.device_arrays import columns, on_device
 from nlosrender.engine.low_discrepancy import recurrence_steps
 from nlosrender.engine.space_filling import z_order
 from nlosrender.engine.transport import Transport
@@ -20,6 +21,8 @@ from nlosrender.scene.pose import Float64
 
 ROWS = 5  # of four numbers each: what the gather reads of a patch
 LASER_RAYS = 4  # shadow rays from a laser to points spread over a patch
+SHORT = 1e-4  # of the way: rays stop so short of a patch; a thin sheet 4 mm in front still hides it
+LEAST_SHORT = 2e-7  # engine units: float32 knows a surface's place no better, and a ray must not meet its own end
 
 
 @dataclass(frozen=True)
@@ -35,14 +38,16 @@ class GatherSettings:
 class DevicePatches:
     """Patches on the device, engine units; one lane per patch."""
 
-    corners: list[mi.Point3f]  # three
+    remainder: mi.Vector3f  # of the centre, what float32 rounds off: close to the wall it is more than the distance
+    is_near: bool  # some patch is so near to a laser or sensor point that the remainder counts
+    corners: list[mi.Vector3f]  # three, from the centre
     lift: mi.Vector3f  # from the plane of the corners to the surface
-    members: mi.Vector4f  # where shadow rays of clusters end, and 1 for a cluster, else 0
+    members: mi.Vector4f  # from the centre to where shadow rays of clusters end, and 1 for a cluster, else 0
     has_clusters: bool
     areas: mi.Vector3f  # geometric normal times area
     interaction: mi.SurfaceInteraction3f  # at the centres
     reflectance: mi.Spectrum  # of Lambertian patches
-    shown: mi.Point3f  # where rays from sensor points end
+    shown: mi.Vector3f  # from the centre's float32 position to where rays from sensor points end
     is_open: mi.Float  # 1 where nothing can stop them
 
 
@@ -50,9 +55,10 @@ class DevicePatches:
 class Lights:
     """What the gather's loop reads: patches that are lit, packed so that one load brings four numbers."""
 
-    # 20 a patch: three corners, each with one component of normal times area; the centre, and 1 for a cluster; where
-    # rays from sensor points end, and 1 where nothing can stop them
+    # 20 a patch: three corners, each with one component of normal times area; the centre, and 1 for a cluster; from it
+    # to where rays from sensor points end, and 1 where nothing can stop them
     packed: mi.Float
+    remainder: mi.Float | None  # four a patch: what float32 rounds off the centre; None where that does not count
     shading: mi.Normal3f  # shading normals
     interaction: mi.SurfaceInteraction3f  # at the centres; not read for Lambertian patches
     reflectance: mi.Spectrum  # confocal Lambertian patches: reflectance / pi
@@ -64,7 +70,7 @@ class Lights:
     first: mi.UInt32  # of slice k: its patches are first[k] to first[k + 1]
 
 
-def upload_patches(built: BuiltScene, patches: Patches, hull: HiddenHull, seed: int) -> DevicePatches:
+def upload_patches(built: BuiltScene, patches: Patches, hull: HiddenHull, seed: int, is_near: bool) -> DevicePatches:
     """Bring patches to the device, neighbours together, and evaluate their reflectance and shading frames.
 
     Parameters
@@ -76,16 +82,22 @@ def upload_patches(built: BuiltScene, patches: Patches, hull: HiddenHull, seed: 
     seed
         Of the points that stand for their patches where visibility is asked for. A point at random makes a partly
         hidden patch count by its visible share, on average; one for all sensor points keeps their rays together.
+    is_near
+        Whether some patch is so near to a laser or sensor point that float32 positions do not do.
     """
     patches = patches.at(np.argsort(z_order(patches.centres), kind="stable"))
     interaction = surface_at(
         built, patches.centres, patches.normals, patches.shapes, patches.primitives, patches.barycentric
     )
     reflectance = normal_reflectance(interaction)
-    corners = [to_points(patches.corners[:, k]) for k in range(3)]
+    centre = np.array(interaction.p, np.float64).T
+    from_rounded = patches.centres - centre
+    remainder = mi.Vector3f(to_points(from_rounded))
+    corners = [mi.Vector3f(to_points(patches.corners[:, k] - patches.centres)) for k in range(3)]
     areas = mi.Vector3f(to_points(patches.normals * patches.areas[:, None]))
     lift = mi.Vector3f(to_points(patches.normals * patches.lifts[:, None]))
-    members = mi.Vector4f(*to_points(patches.members), mi.Float(patches.is_cluster.astype(np.float32)))
+    is_cluster = on_device(mi.Float, patches.is_cluster)
+    members = mi.Vector4f(*to_points(patches.members - patches.centres), is_cluster)
     # a cluster's members have normals of their own: it is lit and seen by their mean
     frame, own = interaction.sh_frame, mi.Frame3f(mi.Normal3f(interaction.n))
     interaction.sh_frame = dr.select(members.w > 0, own, frame)
@@ -94,11 +106,13 @@ def upload_patches(built: BuiltScene, patches: Patches, hull: HiddenHull, seed: 
     u, v = (
         mi.Float((start + number * step) >> 8) * 2.0**-24 for start, step in zip((start_u, start_v), steps, strict=True)
     )
-    shown = mi.Point3f(dr.select(members.w > 0, members.xyz, point_inside(corners, u, v) + lift))
-    is_open = mi.Float((hull.is_below(patches) & ~patches.is_cluster).astype(np.float32))
-    dr.eval(interaction, reflectance, corners, areas, lift, members, shown, is_open)
+    shown = remainder + dr.select(members.w > 0, members.xyz, point_inside(corners, u, v) + lift)
+    is_open = on_device(mi.Float, hull.is_below(patches) & ~patches.is_cluster)
+    dr.eval(interaction, reflectance, remainder, corners, areas, lift, members, shown, is_open)
     has_clusters = bool(patches.is_cluster.any())
-    return DevicePatches(corners, lift, members, has_clusters, areas, interaction, reflectance, shown, is_open)
+    return DevicePatches(
+        remainder, is_near, corners, lift, members, has_clusters, areas, interaction, reflectance, shown, is_open
+    )
 
 
 def surface_at(
@@ -125,9 +139,9 @@ def surface_at(
     point, normal = to_points(positions), mi.Vector3f(to_points(normals))
     hit = dr.zeros(mi.PreliminaryIntersection3f, len(positions))
     hit.t = dr.full(mi.Float, 1.0, len(positions))
-    hit.prim_uv = mi.Point2f(np.ascontiguousarray(barycentric.T, dtype=np.float32))
-    hit.prim_index = mi.UInt32(primitives)
-    shape = dr.gather(mi.ShapePtr, built.scene.shapes_dr(), mi.UInt32(shapes))
+    hit.prim_uv = mi.Point2f(*columns(barycentric))
+    hit.prim_index = on_device(mi.UInt32, primitives)
+    shape = dr.gather(mi.ShapePtr, built.scene.shapes_dr(), on_device(mi.UInt32, shapes))
     interaction = shape.compute_surface_interaction(mi.Ray3f(point + normal, -normal), hit, mi.RayFlags.All)
     interaction.initialize_sh_frame()
     interaction.shape = shape
@@ -171,27 +185,33 @@ def light_patches(
     lit, first = _by_slice(lit, slices)
     if not settings.is_confocal:
         index = dr.arange(mi.UInt32, dr.width(lit) * n_lasers)
-        laser, patch = index // dr.width(lit), dr.gather(mi.UInt32, lit, index % dr.width(lit))
-        arriving = dr.gather(mi.Spectrum, arriving, laser * count + patch)
+        n_lit = dr.opaque(mi.UInt32, dr.width(lit))  # as a constant it would be part of the kernel
+        laser, patch = index // n_lit, dr.gather(mi.UInt32, lit, index % n_lit)
+        arriving = dr.gather(mi.Spectrum, arriving, laser * dr.opaque(mi.UInt32, count) + patch)
         points = dr.gather(mi.Point3f, transport.lasers.interaction.p, laser)
-        ends = four_corners(*(dr.gather(mi.Point3f, corner, patch) for corner in patches.corners))
+        ends = four_corners(*_corners(patches, patch))
         delays = dr.ravel(mi.Vector4f(*(dr.norm(end - points) * transport.bins_per_unit for end in ends)))
-    a, b, c = (dr.gather(mi.Point3f, corner, lit) for corner in patches.corners)
+    a, b, c = _corners(patches, lit)
     areas, interaction = (
         dr.gather(mi.Vector3f, patches.areas, lit),
         dr.gather(mi.SurfaceInteraction3f, patches.interaction, lit),
     )
     is_cluster = dr.gather(mi.Vector4f, patches.members, lit).w
-    shown, is_open = dr.gather(mi.Point3f, patches.shown, lit), dr.gather(mi.Float, patches.is_open, lit)
+    shown, is_open = dr.gather(mi.Vector3f, patches.shown, lit), dr.gather(mi.Float, patches.is_open, lit)
     rows = [(a, areas.x), (b, areas.y), (c, areas.z), (interaction.p, is_cluster), (shown, is_open)]
     packed = dr.zeros(mi.Float, 4 * ROWS * dr.width(lit))
     lane = dr.arange(mi.UInt32, dr.width(lit))
     for k, (point, fourth) in enumerate(rows):
         dr.scatter(packed, mi.Vector4f(*point, fourth), lane * ROWS + k)
+    remainder = None
+    if patches.is_near:
+        rest = dr.gather(mi.Vector3f, patches.remainder, lit)
+        remainder = dr.ravel(mi.Vector4f(rest.x, rest.y, rest.z, 0))
     reflectance = dr.gather(mi.Spectrum, patches.reflectance, lit) * dr.inv_pi
-    dr.eval(packed, arriving, delays, interaction, reflectance)
+    dr.eval(packed, remainder, arriving, delays, interaction, reflectance)
     return Lights(
         packed,
+        remainder,
         interaction.sh_frame.n,
         interaction,
         reflectance,
@@ -208,7 +228,7 @@ def _by_slice(numbers: mi.UInt32, slices: int) -> tuple[mi.UInt32, mi.UInt32]:
     patch = np.array(numbers.numpy())
     order = np.lexsort((patch, patch % slices))
     first = np.searchsorted((patch % slices)[order], np.arange(slices + 1))
-    return mi.UInt32(patch[order]), mi.UInt32(first.astype(np.uint32))
+    return on_device(mi.UInt32, patch[order]), on_device(mi.UInt32, first)
 
 
 def _illuminate(
@@ -224,12 +244,13 @@ def _illuminate(
     built = transport.built
     n_patches = dr.width(patches.areas)
     index = dr.arange(mi.UInt32, n_patches * n_lasers)
-    patch, laser = index % n_patches, index // n_patches
+    divisor = dr.opaque(mi.UInt32, n_patches)
+    patch, laser = index % divisor, index // divisor
     points = transport.lasers.gather(laser)
     lit = points.interaction
-    corners = [dr.gather(mi.Point3f, corner, patch) for corner in patches.corners]
+    corners = [dr.gather(mi.Vector3f, corner, patch) for corner in patches.corners]
     centre = dr.gather(mi.Point3f, patches.interaction.p, patch)
-    to_patch = centre - lit.p
+    to_patch = (centre - lit.p) + dr.gather(mi.Vector3f, patches.remainder, patch)
     distance2 = dr.squared_norm(to_patch)
     direction = to_patch * dr.rsqrt(distance2)
     arriving = built.wall_bsdf.eval(mi.BSDFContext(), lit, lit.to_local(direction)) / distance2
@@ -249,8 +270,8 @@ def _illuminate(
         steps = recurrence_steps(2)
         for k in range(LASER_RAYS):
             u, v = _fraction(patch * LASER_RAYS + k, steps[0]), _fraction(patch * LASER_RAYS + k, steps[1])
-            point = dr.select(member.w > 0, mi.Point3f(*member.xyz), point_inside(corners, u, v) + lift)
-            seen += dr.select(is_visible(built, lit, point, active), 1.0 / LASER_RAYS, 0)
+            in_patch = dr.select(member.w > 0, member.xyz, point_inside(corners, u, v) + lift)
+            seen += dr.select(is_visible(built, lit, to_patch + in_patch, active), 1.0 / LASER_RAYS, 0)
     arriving = dr.select(active, arriving * seen, 0)
     brightest = dr.zeros(mi.Float, n_patches)
     dr.scatter_reduce(dr.ReduceOp.Max, brightest, dr.max(arriving), patch)
@@ -258,12 +279,12 @@ def _illuminate(
     return arriving, brightest
 
 
-def is_visible(built: BuiltScene, wall_point: mi.SurfaceInteraction3f, target: mi.Point3f, active: mi.Bool) -> mi.Bool:
-    """Return whether nothing lies between a point of the wall and a point of a patch."""
+def is_visible(built: BuiltScene, wall_point: mi.SurfaceInteraction3f, way: mi.Vector3f, active: mi.Bool) -> mi.Bool:
+    """Return whether nothing lies on the way from a point of the wall to a point of a patch."""
     origin = off_the_wall(built, wall_point)
-    direction = target - origin
-    # stops short of the patch by 1e-4 of the way: a thin sheet 4 mm in front still hides it
-    ray = mi.Ray3f(origin, direction, mi.Float(1 - 1e-4), mi.Float(0), [])
+    direction = way - (origin - wall_point.p)
+    end = dr.maximum(1 - SHORT - LEAST_SHORT * dr.rsqrt(dr.squared_norm(direction)), 0)
+    ray = mi.Ray3f(origin, direction, end, mi.Float(0), [])
     return active & ~built.scene.ray_test(ray, coherent=False, active=active)
 
 
@@ -272,7 +293,12 @@ def four_corners(a: mi.Point3f, b: mi.Point3f, c: mi.Point3f) -> tuple[mi.Point3
     return a, b, c, a + (c - b)
 
 
-def point_inside(corners: list[mi.Point3f], u: mi.Float, v: mi.Float) -> mi.Point3f:
+def _corners(patches: DevicePatches, index: mi.UInt32) -> list[mi.Point3f]:
+    centre = dr.gather(mi.Point3f, patches.interaction.p, index)
+    return [centre + dr.gather(mi.Vector3f, corner, index) for corner in patches.corners]
+
+
+def point_inside(corners: list[mi.Vector3f], u: mi.Float, v: mi.Float) -> mi.Vector3f:
     """Return the point of a triangle that two uniform numbers choose, uniform by area."""
     root = dr.sqrt(u)
     a, b, c = corners
@@ -285,4 +311,4 @@ def _fraction(index: mi.UInt32, step: int) -> mi.Float:
 
 def to_points(values: Float64) -> mi.Point3f:
     """Bring vectors (n, 3) to the device."""
-    return mi.Point3f(np.ascontiguousarray(values.T, dtype=np.float32))
+    return mi.Point3f(*columns(values))

@@ -14,6 +14,7 @@ from nlosrender.scene.pose import Float64
 MOST_FACES = 4000  # beyond it the test itself, faces times vertices, costs more than the rays it saves
 MOST_HEIGHTS = 2**22  # of corners over planes at a time, for memory
 PLANARITY = 1e-6  # engine units: float32 vertices of a plane of size 1 are good to 1e-7
+PARALLEL = 1e-9  # sine of the angle to the wall
 
 
 def nothing_occludes(built: BuiltScene) -> bool:
@@ -71,7 +72,10 @@ class HiddenHull:
             part = slice(start, start + step)
             normals = patches.normals[part]
             offsets = np.einsum("ij,ij->i", patches.centres[part], normals)
-            result[part] = (normals @ self.corners.T).max(axis=1) - offsets <= PLANARITY
+            # the heights of planes parallel to the wall are exact, and those close to it are told apart
+            is_parallel = np.hypot(normals[:, 0], normals[:, 1]) < PARALLEL
+            allowed = PLANARITY * np.where(is_parallel, np.abs(offsets), 1.0)
+            result[part] = (normals @ self.corners.T).max(axis=1) - offsets <= allowed
         return result
 
 

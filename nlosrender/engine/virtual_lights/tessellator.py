@@ -8,7 +8,8 @@ and of h^2/(4 d w) bins in its delay, with w the bin width: within a triangle th
 from __future__ import annotations
 
 import math
-from functools import lru_cache
+from dataclasses import replace
+from functools import cached_property, lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +24,9 @@ from nlosrender.scene.pose import Float64
 
 MAX_PATCHES = 2_000_000  # of one gather; beyond it the path engine is the better choice
 MOST_KEPT = 200_000  # patches of one resolution that are kept for the next call
+# Engine units: of surfaces so near to a point, a dozen cells around its foot make up H. Their numbers of parts have to
+# follow the coarseness in small steps, or two resolutions would differ less than either errs.
+CLOSE = 1e-2
 MERGED = 0.4  # of the size allowed: smaller cells are merged
 
 
@@ -43,7 +47,7 @@ class Tessellator:
     """
 
     def __init__(self, built: BuiltScene, capture: Capture, bin_width: float):
-        self.built, self.bin_width = built, bin_width
+        self.built, self.capture, self.bin_width = built, capture, bin_width
         self.distance = WallDistance(capture, built.unit)
         self.reach = max(capture.sensor_grid.size) / (2 * built.unit)  # half the sensor grid's extent [engine units]
         cells: list[Cells] = []
@@ -84,9 +88,7 @@ class Tessellator:
 
     def counts(self, coarseness: float) -> tuple[int, int]:
         """Return ``count`` of the hidden surfaces, and of a wall that sees itself."""
-        hidden = np.ones(len(self.cells.shapes), bool)
-        if self.wall_index is not None:
-            hidden = self.cells.shapes != self.wall_index
+        hidden = self._hidden()
         far_smaller = self._far_smaller(coarseness)
         # an equilateral triangle of the size allowed has 0.43 of its square as area
         merged = self._areas / (0.43 * (coarseness * self._allowed) ** 2)
@@ -102,11 +104,27 @@ class Tessellator:
     @property
     def nearest(self) -> float:
         """Distance from the points to the nearest hidden cell's centre, or round shape [engine units]."""
-        on_round = [shape.nearest(self.distance) for shape in self.round_shapes if shape.index != self.wall_index]
-        hidden = np.ones(len(self.cells.shapes), bool)
-        if self.wall_index is not None:
-            hidden = self.cells.shapes != self.wall_index
-        return min([float(self.cells.distances[hidden].min(initial=np.inf)), *on_round])
+        return min([float(self.cells.distances[self._hidden()].min(initial=np.inf)), self.nearest_round])
+
+    @property
+    def nearest_round(self) -> float:
+        """Distance from the points to the nearest hidden round shape [engine units]; inf where there is none."""
+        on_round = (shape.nearest(self.distance) for shape in self.round_shapes if shape.index != self.wall_index)
+        return min(on_round, default=math.inf)
+
+    @cached_property
+    def nearest_to_laser(self) -> float:
+        """Distance from the laser points to the nearest hidden cell's centre, or round shape [engine units]."""
+        lasers = WallDistance(replace(self.capture, sensor_grid=self.capture.laser_grid), self.built.unit)
+        on_round = [shape.nearest(lasers) for shape in self.round_shapes if shape.index != self.wall_index]
+        centres = self.cells.corners[self._hidden()].mean(axis=1)
+        return min([float(lasers(centres).min(initial=np.inf)) if len(centres) else math.inf, *on_round])
+
+    def _hidden(self) -> NDArray[np.bool_]:
+        """Return which cells are not the wall's."""
+        if self.wall_index is None:
+            return np.ones(len(self.cells.shapes), bool)
+        return self.cells.shapes != self.wall_index
 
     def round_cells(self) -> list[tuple[RoundShape, Patches]]:
         """Return every round shape, and its cells, whose corners lie on it."""
@@ -114,7 +132,8 @@ class Tessellator:
 
     def _allowed_at(self, distance: Float64) -> Float64:
         """Return the size a patch may have at ``distance`` from the points, at coarseness 1 [engine units]."""
-        return np.minimum(distance, 2 * np.sqrt(distance * self.bin_width))
+        graded = np.where(distance < CLOSE, distance / 2, distance)
+        return np.minimum(graded, 2 * np.sqrt(distance * self.bin_width))
 
     def _splits(self, coarseness: float) -> NDArray[np.int64]:
         return np.maximum(np.ceil(self.cells.sizes / (coarseness * self._allowed)), 1).astype(np.int64)

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nlosrender.capture.plan import Batch
+from nlosrender.engine.device_arrays import on_device
 from nlosrender.engine.histogram import HistogramShape, relative_l2_error
 from nlosrender.engine.path_engine import PathEngine
 from nlosrender.engine.pilot import Pilot
@@ -24,6 +25,7 @@ from nlosrender.engine.virtual_lights.patches import Patches
 from nlosrender.engine.virtual_lights.tessellator import MAX_PATCHES, Tessellator
 
 FIRST_COARSENESS = 1.0
+NEAR = 1e-3  # engine units: the centres of nearer patches are rounded by more than 1e-4 of their distance
 REFINEMENT = 3.0  # at least so many times more patches between the two resolutions that are compared
 STUCK = 0.9  # of the error before, with twice the patches: refining further is in vain
 ROUGH = 0.2  # an error beyond which the law of its decrease does not hold yet
@@ -88,12 +90,14 @@ class ThirdBounce:
         shape = self.shape(batch)
         transport, _, _ = self._transport(batch, shape)
         lights = self._lights(transport, shape, self.tessellator.patches(coarseness))
-        shown = np.array(lights.packed).reshape(-1, ROWS, 4)[:, ROWS - 1]
+        rows = np.array(lights.packed, np.float64).reshape(-1, ROWS, 4)
+        centre, shown = rows[:, ROWS - 2], rows[:, ROWS - 1]
         normals = np.array(lights.interaction.n, np.float64).T
-        return LitPatches(shown[:, :3].astype(np.float64), normals, shown[:, 3] > 0)
+        return LitPatches(centre[:, :3] + shown[:, :3], normals, shown[:, 3] > 0)
 
     def _lights(self, transport: Transport, shape: HistogramShape, patches: Patches) -> Lights:
-        on_device = upload_patches(self.paths.built, patches, self.hull, self.paths.options.seed)
+        is_near = self.tessellator.nearest < NEAR
+        on_device = upload_patches(self.paths.built, patches, self.hull, self.paths.options.seed, is_near)
         return light_patches(self.settings, transport, on_device, shape.lasers, shape.replicas)
 
     def pair(self, batch: Batch | Pilot, fineness: float) -> tuple[Gathered, Gathered]:
@@ -157,7 +161,7 @@ class ThirdBounce:
         points = self.paths.capture.sensor_grid.positions.reshape(-1, 3)[self.paths.sensor_indices(batch)]
         order = np.argsort(z_order(points), kind="stable")
         lane = dr.arange(mi.UInt32, shape.lanes)
-        sensor = dr.gather(mi.UInt32, mi.UInt32(order.astype(np.uint32)), lane % shape.sensors)
+        sensor = dr.gather(mi.UInt32, on_device(mi.UInt32, order), lane % shape.sensors)
         sensors, first_laser = transport.sensors.gather(sensor), dr.gather(mi.UInt32, transport.first_laser, sensor)
         slice_of_lane = lane // shape.sensors
         dr.eval(sensors.interaction, sensors.delay_bins, sensors.delay_fraction, first_laser, slice_of_lane)
