@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 from nlosrender.analysis.forecast import Forecast, forecast_file, forecast_render
 from nlosrender.capture.bounces import BounceAxis, first_bounce_of
 from nlosrender.capture.grids import Capture, build_capture
-from nlosrender.capture.limits import refuse_impossible_grids, refuse_impossible_samples
+from nlosrender.capture.limits import refuse_impossible_grids, refuse_impossible_samples, refuse_wide_kernel
 from nlosrender.capture.part import WHOLE, Selection
 from nlosrender.capture.plan import Plan, plan_capture, remaining_units, replicas_for
 from nlosrender.capture.time_axis import TimeAxis, resolve_time_axis
@@ -253,6 +253,7 @@ def describe_capture(config: Config, wall: RelayWall, built: BuiltScene | BuiltV
     refuse_impossible_grids(config.capture, config.render.memory_limit_bytes or physical_memory())
     capture = build_capture(config.capture, wall)
     time_axis = resolve_time_axis(config.time_axis, capture, wall, built.hidden_bounds, config.render.max_bounces)
+    refuse_wide_kernel(config.render.temporal_kernel_opl, time_axis)
     return capture, time_axis
 
 

@@ -59,13 +59,12 @@ def save_animation(pictures: Bytes, path: Path, frames_per_second: float) -> Non
     from PIL import Image
 
     # one palette for all, or colours would flicker
-    images = [Image.fromarray(_enlarged(picture)) for picture in pictures]
     brightest = Image.fromarray(_enlarged(pictures.max(axis=0)))
     palette = brightest.quantize(256, method=Image.Quantize.MEDIANCUT)
-    indexed = [image.quantize(palette=palette) for image in images]
-    indexed[0].save(
-        path, format="GIF", save_all=True, append_images=indexed[1:], duration=1000 / frames_per_second, loop=0
-    )
+    # one by one: all of them enlarged take gigabytes
+    indexed = (Image.fromarray(_enlarged(picture)).quantize(palette=palette) for picture in pictures)
+    first = next(indexed)
+    first.save(path, format="GIF", save_all=True, append_images=indexed, duration=1000 / frames_per_second, loop=0)
 
 
 def tone_mapped(light: Float32) -> Bytes:

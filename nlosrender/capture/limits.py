@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from nlosrender.capture.plan import BYTES_OF_STATISTICS, BYTES_PER_SUM
+from nlosrender.capture.time_axis import TimeAxis
 from nlosrender.config.capture import CaptureConfig
-from nlosrender.errors import RenderError
+from nlosrender.errors import ConfigError, Problem, RenderError
 
 POINT_BYTES = 640  # per grid point: positions, normals, coordinates, distances to the corners of a box, copies
 MAX_SAMPLES = 2**40  # 4 TiB of float32 per bounce
@@ -34,6 +35,29 @@ def refuse_impossible_grids(capture_config: CaptureConfig, memory_limit: int) ->
                 f"capture.{key}: {grid.nx} x {grid.ny} points take {grid.n_points * POINT_BYTES / 1e9:.3g} GB for "
                 f"their positions alone, but there are {memory_limit / 1e9:.3g} GB. Use fewer points."
             )
+
+
+def refuse_wide_kernel(kernel_opl: float, time_axis: TimeAxis) -> None:
+    """Refuse a temporal kernel wider than the time window, which would carry most light out of it.
+
+    Parameters
+    ----------
+    kernel_opl
+        Full width of the kernel [m]; 0: none.
+    time_axis
+        The bins.
+
+    Raises
+    ------
+    ConfigError
+        It is wider; its work grows with its width in bins, and would never end.
+    """
+    window = time_axis.end_opl - time_axis.start_opl
+    if kernel_opl > window:
+        message = (
+            f"got {kernel_opl:g} m, wider than the time axis, {window:g} m; need a few bins, or 0 for a histogram."
+        )
+        raise ConfigError(Problem("", "render.temporal_kernel_opl", message))
 
 
 def refuse_impossible_samples(

@@ -10,6 +10,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 
@@ -243,11 +244,15 @@ def _scaled(description: Mapping[str, object], unit: float) -> dict[str, object]
 def shape_bounds(shape: mi.Shape, unit: float) -> Bounds | None:
     """Return the box around a loaded shape [m, engine's frame]; None for one without extent."""
     box = shape.bbox()
-    if not box.valid():
+    if box.valid():
+        low, high = (np.ravel(np.asarray(corner, dtype=np.float64)) * unit for corner in (box.min, box.max))
+        return low, high
+    if not (shape.is_mesh() and shape.vertex_count()):
         return None
-    return np.ravel(np.asarray(box.min, dtype=np.float64)) * unit, np.ravel(
-        np.asarray(box.max, dtype=np.float64)
-    ) * unit
+    # Mitsuba joins meshes of a scene file into one, and leaves the box of that one empty
+    index = dr.arange(mi.UInt32, shape.vertex_count())
+    vertices = np.asarray(shape.vertex_position(index), dtype=np.float64) * unit
+    return vertices.min(axis=1), vertices.max(axis=1)
 
 
 def _check_reach(surface: Surface, box: Bounds | None, wall: RelayWall) -> None:

@@ -8,7 +8,10 @@ import numpy as np
 import pytest
 from views import see, view_config
 
+from nlosrender.config.load import load_config
 from nlosrender.errors import ConfigError
+
+ROOT = Path(__file__).parents[2]
 
 WALL = {"type": "rectangle", "width": 2, "height": 2, "center": [0, 0, 0], "normal": [0, 0, 1]}
 WALL |= {"bsdf": {"type": "diffuse", "reflectance": 0.5}}
@@ -165,3 +168,11 @@ def test_index_of_a_principled_surface(index: dict[str, float]) -> None:
     from nlosrender.engine.line_of_sight.transport import refractive_indices
 
     assert max(np.array(refractive_indices(view.engine.built.scene))) == pytest.approx(1.5, rel=1e-5)
+
+
+def test_the_box_of_a_scene_file_holds_the_meshes_that_mitsuba_joins() -> None:
+    """The floor and the back wall of the example become one mesh, whose own box Mitsuba leaves empty."""
+    view = see(load_config(ROOT / "configs" / "mitsuba-scene.yaml", ["render.spp=1", "time_axis.n_bins=3"]))
+    low, high = view.engine.built.hidden_bounds
+    # the floor reaches further than lamp, mirror and block, all of which lie within 1.4 m of the middle
+    assert float((high - low).max()) > 3

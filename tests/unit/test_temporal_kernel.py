@@ -5,7 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from nlosrender.capture.limits import refuse_wide_kernel
+from nlosrender.capture.time_axis import TimeAxis
 from nlosrender.engine.backend import start_backend
+from nlosrender.errors import ConfigError
 
 WIDTHS = (0.3, 1.0, 2.0, 4.7, 12.0)
 
@@ -50,3 +53,11 @@ def test_smoothing_is_a_convolution_that_loses_no_light(width: float) -> None:
     whole = np.array([np.convolve(row[:-1], kernel.shares) for row in values])
     np.testing.assert_allclose(found[:, :-1], whole[:, kernel.reach : kernel.reach + n_bins], rtol=1e-13)
     np.testing.assert_allclose(found.sum(axis=1), values.sum(axis=1), rtol=1e-13)
+
+
+def test_a_kernel_wider_than_the_time_axis_is_refused() -> None:
+    """Its work grows with its width in bins: a slip of the pen would take all memory, or all time."""
+    axis = TimeAxis(1.0, 0.5, 7)
+    refuse_wide_kernel(3.5, axis)
+    with pytest.raises(ConfigError, match=r"render.temporal_kernel_opl: got 1e\+09 m, wider than the time axis, 3.5 m"):
+        refuse_wide_kernel(1e9, axis)
