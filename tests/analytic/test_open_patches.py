@@ -67,3 +67,19 @@ def test_a_sphere_counts_by_its_box() -> None:
         plate &= lit.normals[:, 2] < -0.999
         assert plate.any()
         assert (lit.is_open[plate] == expected).all()
+
+
+@pytest.mark.parametrize("shape", ["plane", "line", "solid"])
+def test_the_hull_of_many_points_is_few_points_that_reach_as_far(shape: str) -> None:
+    """20,000 points of a tilted rectangle have four outermost ones: patches times points would take minutes."""
+    from nlosrender.engine.virtual_lights.occlusion import _outermost
+
+    generator = np.random.default_rng(2)
+    flat = generator.random((20_000, 3)) * {"plane": [1, 1, 0], "line": [1, 0, 0], "solid": [1, 1, 1]}[shape]
+    corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)]) * flat.max(axis=0)
+    turn = np.linalg.qr(generator.normal(size=(3, 3)))[0]
+    points = np.concatenate([flat, np.unique(corners, axis=0)]) @ turn.T + [0.3, 0.1, 2.0]
+    found = _outermost(points)
+    assert len(found) <= 16
+    directions = generator.normal(size=(100, 3))
+    np.testing.assert_allclose((directions @ found.T).max(axis=1), (directions @ points.T).max(axis=1), atol=1e-9)

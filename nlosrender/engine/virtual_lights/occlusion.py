@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
+
 import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +14,7 @@ from nlosrender.scene.build import BuiltScene, wall_box
 from nlosrender.scene.pose import Float64
 
 MOST_FACES = 4000  # beyond it the test itself, faces times vertices, costs more than the rays it saves
+MOST_CORNERS = 512  # of the hull
 MOST_HEIGHTS = 2**22  # of corners over planes at a time, for memory
 PLANARITY = 1e-6  # engine units: float32 vertices of a plane of size 1 are good to 1e-7
 PARALLEL = 1e-9  # sine of the angle to the wall
@@ -60,7 +63,9 @@ class HiddenHull:
         two_sided = any(bool(shape.bsdf().flags() & mi.BSDFFlags.BackSide) for shape in shapes)
         self.corners: Float64 | None = None
         if built.wall.is_planar and shapes and not two_sided:
-            self.corners = _outermost(np.concatenate([_points(shape) for shape in shapes]))
+            corners = _outermost(np.concatenate([_points(shape) for shape in shapes]))
+            # a round mesh has all its vertices on its hull: looking at each for every patch costs more than the rays
+            self.corners = corners if len(corners) <= MOST_CORNERS else None
 
     def is_below(self, patches: Patches) -> NDArray[np.bool_]:
         """Return which patches (n,) have all hidden geometry behind, or in, their planes."""
@@ -91,5 +96,16 @@ def _outermost(points: Float64) -> Float64:
     """Return the points (m, 3) that are corners of the convex hull."""
     try:
         return points[ConvexHull(points).vertices]
-    except QhullError:  # all in a plane
-        return np.unique(points, axis=0)
+    except QhullError:  # all in a plane, perhaps on a line
+        return _outermost_in_plane(points)
+
+
+def _outermost_in_plane(points: Float64) -> Float64:
+    """The same for points that lie in one plane, or nearly: what lies off it by more than rounding stays."""
+    middle = points.mean(axis=0)
+    axes = np.linalg.svd(points - middle, full_matrices=False)[2]
+    x, y, z = ((points - middle) @ axes.T).T
+    ends = [int(end(values)) for values in (x, y, z) for end in (np.argmin, np.argmax)]
+    with suppress(QhullError):  # a line: its ends are known
+        ends += ConvexHull(np.column_stack([x, y])).vertices.tolist()
+    return points[np.unique(ends)]
