@@ -95,47 +95,8 @@ def steady_reference(view: View, spp: int) -> tuple[Array, Array]:
 
     Channels are red, green, blue, or the Stokes components of a polarised view.
     """
-    import mitsuba as mi
+    from nlosrender.bench.paper.steady import mitsuba_picture
 
     engine = view.engine
-    built, grid = engine.built, engine.capture.sensor_grid
-    target, up = built.to_engine([0, 0, 0]), built.direction_to_engine([0, 1, 0])
-    plane = built.wall
-    sensor = mi.load_dict(
-        {
-            "type": "perspective",
-            "to_world": mi.ScalarTransform4f().look_at(
-                built.to_engine(engine.capture.sensor_position).tolist(), target.tolist(), up.tolist()
-            ),
-            "fov": float(np.degrees(2 * np.arctan(plane.width / 2 / plane.distance))),
-            "near_clip": 0.01,
-            "film": {
-                "type": "hdrfilm",
-                "width": grid.nx,
-                "height": grid.ny,
-                "rfilter": {"type": "box"},
-                "pixel_format": "rgb",
-                "component_format": "float32",
-            },
-        }
-    )
-    highest = engine.options.bounces.max_bounces
-    depth = -1 if highest is None else highest + 1  # Mitsuba counts the emitter, too
-    tracer: dict[str, Any] = {"type": "path", "max_depth": depth}
-    polarized = view.config.render.polarized
-    if polarized:
-        tracer = {"type": "stokes", "nested": tracer}
-    # the stokes integrator asks the scene's first sensor what is up
-    contents = {f"part_{index}": part for index, part in enumerate(built.scene.shapes())}
-    contents |= {
-        f"lamp_{i}": e for i, e in enumerate(built.scene.emitters()) if not e.flags() & mi.EmitterFlags.Surface
-    }
-    scene = mi.load_dict({"type": "scene", "sensor": sensor, **contents})
-    pictures = []
-    for seed in range(REPLICAS):
-        picture = np.array(mi.render(scene, sensor=sensor, integrator=mi.load_dict(tracer), spp=spp, seed=seed))
-        if polarized:
-            picture = picture[..., 3::3]  # after the colours, S0.R, S0.G, S0.B, S1.R, ...
-        pictures.append(np.moveaxis(picture.astype(np.float64), -1, 0)[:, ::-1])
-    stack = np.array(pictures)
-    return stack.mean(axis=0), stack.var(axis=0, ddof=1) / REPLICAS
+    highest, polarized = engine.options.bounces.max_bounces, view.config.render.polarized
+    return mitsuba_picture(engine.built, engine.capture, highest, polarized, spp, REPLICAS)

@@ -6,6 +6,7 @@ Longitude and azimuth are 0 in the direction of local +z and grow towards local 
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,8 +19,33 @@ from nlosrender.scene.wall_coordinates import on_wall, require_positive
 _POLAR_AXIS_TO_Y = np.array([[0.0, 1, 0, 0], [0, 0, 1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
 
 
+class _RoundWall(ABC):
+    """What spheres and tubes about the local y axis share."""
+
+    radius: float
+    inside: bool
+
+    @abstractmethod
+    def _outward(self, xy: ArrayLike) -> Float64:
+        """Return unit vectors (..., 3) that point away from the centre or axis; ValueError off the wall."""
+
+    @property
+    def is_planar(self) -> bool:
+        """False: light may go from the wall to the wall."""
+        return False
+
+    @property
+    def default_device_position(self) -> Float64:
+        """The middle of a wall lit from within, else 1 m in front of wall coordinates (0, 0): (3,) [m]."""
+        return np.array([0.0, 0.0, 0.0 if self.inside else self.radius + 1.0])
+
+    def normals(self, xy: ArrayLike) -> Float64:
+        """Return unit normals (..., 3) of the lit side at wall coordinates (..., 2) [m]; ValueError off the wall."""
+        return -self._outward(xy) if self.inside else self._outward(xy)
+
+
 @dataclass(frozen=True, eq=False)
-class SphereWall:
+class SphereWall(_RoundWall):
     """A whole sphere as relay wall; wall coordinates are the equal-area cylindrical projection.
 
     Parameters
@@ -60,27 +86,13 @@ class SphereWall:
         return 2 * self.radius
 
     @property
-    def is_planar(self) -> bool:
-        """False: light may go from the wall to the wall."""
-        return False
-
-    @property
     def area(self) -> float:
         """Area of the lit side [m^2]."""
         return 4 * np.pi * self.radius**2
 
-    @property
-    def default_device_position(self) -> Float64:
-        """The centre of a sphere lit from within, else 1 m in front of wall coordinates (0, 0): (3,) [m]."""
-        return np.array([0.0, 0.0, 0.0 if self.inside else self.radius + 1.0])
-
     def positions(self, xy: ArrayLike) -> Float64:
         """Return the points (..., 3) [m, local frame] at wall coordinates (..., 2) [m]; ValueError off the wall."""
         return self.radius * self._outward(xy)
-
-    def normals(self, xy: ArrayLike) -> Float64:
-        """Return unit normals (..., 3) of the lit side at wall coordinates (..., 2) [m]; ValueError off the wall."""
-        return -self._outward(xy) if self.inside else self._outward(xy)
 
     def uv(self, xy: ArrayLike) -> Float64:
         """Return texture coordinates (..., 2): u = longitude / 2 pi in [0, 1), v = 0 at the +y pole, 1 at the -y pole.
@@ -118,7 +130,7 @@ class SphereWall:
 
 
 @dataclass(frozen=True, eq=False)
-class CylinderWall:
+class CylinderWall(_RoundWall):
     """An open tube as relay wall; wall coordinates are arc length and position along the axis.
 
     Parameters
@@ -150,29 +162,15 @@ class CylinderWall:
         return 2 * np.pi * self.radius
 
     @property
-    def is_planar(self) -> bool:
-        """False: light may go from the wall to the wall."""
-        return False
-
-    @property
     def area(self) -> float:
         """Area of the lit side [m^2]."""
         return self.width * self.height
-
-    @property
-    def default_device_position(self) -> Float64:
-        """The middle of the axis of a tube lit from within, else 1 m in front of wall coordinates (0, 0): (3,) [m]."""
-        return np.array([0.0, 0.0, 0.0 if self.inside else self.radius + 1.0])
 
     def positions(self, xy: ArrayLike) -> Float64:
         """Return the points (..., 3) [m, local frame] at wall coordinates (..., 2) [m]; ValueError off the wall."""
         points = self.radius * self._outward(xy)
         points[..., 1] = np.asarray(xy, dtype=np.float64)[..., 1]
         return points
-
-    def normals(self, xy: ArrayLike) -> Float64:
-        """Return unit normals (..., 3) of the lit side at wall coordinates (..., 2) [m]; ValueError off the wall."""
-        return -self._outward(xy) if self.inside else self._outward(xy)
 
     def uv(self, xy: ArrayLike) -> Float64:
         """Return texture coordinates (..., 2): u = azimuth / 2 pi in [0, 1), v from 0 at -y to 1 at +y.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from nlosrender.analysis.theme import GROUND, INK, MARK
 from nlosrender.bench.curve import power_law
 from nlosrender.bench.paper.drawing import log_log, new_figure, save
 from nlosrender.bench.paper.figure import Check, PaperFigure, Picture, Table
@@ -31,7 +32,7 @@ def time_binning(study: Study) -> PaperFigure:
             errors[line, column] = relative_error(light, truths[width])
             part = axes[line, column]
             part.stairs(light / width, edges, color="#f7b267", lw=0.7)
-            part.set_title(f"{1000 * width:g} mm, {count} paths: {errors[line, column]:.0%}", color="#e8e8ee", size=8)
+            part.set_title(f"{1000 * width:g} mm, {count} paths: {errors[line, column]:.0%}", color=INK, size=8)
             part.set_yticks([])
     by_count = [power_law(counts, row) or 0.0 for row in errors.tolist()]
     by_width = power_law(widths, np.exp(np.log(errors).mean(axis=1)).tolist()) or 0.0
@@ -86,9 +87,9 @@ def _kernels(study: Study, bin_width: float, count: int) -> tuple[Table, Picture
         if kernel in (0.0, 0.016):
             name = "histogram" if kernel == 0 else f"kernel of {1000 * kernel:g} mm"
             axes[0, 0].stairs(runs[0] / bin_width, edges, lw=0.8, label=name)
-    axes[0, 0].stairs(truth / bin_width, edges, lw=1.2, color="#7fd6ff", label="virtual lights")
-    axes[0, 0].legend(facecolor="#0e0f14", labelcolor="#e8e8ee", fontsize=8)
-    axes[0, 0].set_title(f"one point, {count} paths", color="#e8e8ee", size=10)
+    axes[0, 0].stairs(truth / bin_width, edges, lw=1.2, color=MARK, label="virtual lights")
+    axes[0, 0].legend(facecolor=GROUND, labelcolor=INK, fontsize=8)
+    axes[0, 0].set_title(f"one point, {count} paths", color=INK, size=10)
     kernels = [kernel for kernel in totals if kernel > 0]
     for column, name in ((1, "noise"), (2, "bias"), (3, "both")):
         values = [float(row[column].rstrip("%")) / 100 for row in rows[1:]]

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from nlosrender.analysis.theme import MARK
 from nlosrender.bench.curve import power_law
 from nlosrender.bench.paper.ablation import BOTH, SPOT_RADIUS, TECHNIQUES, Technique
 from nlosrender.bench.paper.drawing import log_log, new_figure, save
@@ -37,7 +38,7 @@ def convergence(study: Study) -> PaperFigure:
         axes[0, 1].plot(seconds, mses, marker="o", ms=4, label=technique.name)
     targets = study.pick((0.2, 0.1, 0.05, 0.02), (0.2, 0.1, 0.05, 0.02, 0.01, 0.005))
     lights_mses, lights_seconds, table, agreement = _virtual_lights(study, grid, targets, REFERENCE_TIMES * counts[-1])
-    axes[0, 1].plot(lights_seconds, lights_mses, marker="s", ms=5, color="#7fd6ff", label="virtual lights")
+    axes[0, 1].plot(lights_seconds, lights_mses, marker="s", ms=5, color=MARK, label="virtual lights")
     log_log(axes[0, 0], "mean squared error against paths", "paths per sensor point", "MSE of H")
     log_log(axes[0, 1], "mean squared error against seconds of rendering", "s", "MSE of H")
     return PaperFigure(

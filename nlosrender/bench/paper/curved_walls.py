@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from nlosrender.analysis.comparison.captures import Tolerances, compare_captures
+from nlosrender.analysis.theme import FAINT
 from nlosrender.bench.paper.drawing import new_figure, save, show_row
 from nlosrender.bench.paper.figure import Check, PaperFigure, Picture, Table
 from nlosrender.bench.paper.study import Rendered, Study
@@ -38,7 +39,7 @@ def curved_walls(study: Study) -> PaperFigure:
         for part, run in zip(line, (lights, paths), strict=True):
             light = run.light()[0, 0]
             show_row(part, light[light.shape[0] // 2], run.bin_edges(), 0.5, f"{title}: {run.report.engine}")
-            part.set_ylabel("middle row, share of its width", color="#8b8d98")
+            part.set_ylabel("middle row, share of its width", color=FAINT)
     pictures.append(Picture(save(figure, study.picture("curved-walls")), "The middle row of each wall over time."))
     columns = ("wall", "engine", "virtual lights", "path engine", "difference of energy", "largest |z|")
     return PaperFigure(

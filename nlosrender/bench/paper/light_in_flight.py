@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from nlosrender.analysis.frames import FrameOptions, write_frames
+from nlosrender.analysis.theme import INK
 from nlosrender.bench.paper.drawing import new_figure, save
 from nlosrender.bench.paper.figure import Check, PaperFigure, Picture, Table
 from nlosrender.bench.paper.steady import steady_picture, worst_deviation
@@ -90,7 +91,7 @@ def _montage(study: Study, run: Rendered, label: str) -> Path:
         top = np.percentile(frame[frame > 0], 98) if (frame > 0).any() else 1.0
         shown = np.clip(frame / top, 0, 1) ** (1 / 2.2)
         part.imshow(np.repeat(shown, 3, axis=-1) if shown.shape[-1] == 1 else shown, origin="lower")
-        part.set_title(f"{edges[moment]:.2f} m", color="#e8e8ee", size=10)
+        part.set_title(f"{edges[moment]:.2f} m", color=INK, size=10)
         part.set_xticks([])
         part.set_yticks([])
     return save(figure, study.picture(f"light-in-flight-{label}"))

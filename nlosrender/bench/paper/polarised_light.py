@@ -8,6 +8,7 @@ import numpy as np
 
 from nlosrender.analysis.frames import FrameOptions, write_frames
 from nlosrender.analysis.pictures import degree_of_polarization, signed_colors
+from nlosrender.analysis.theme import INK
 from nlosrender.bench.paper.drawing import new_figure, save
 from nlosrender.bench.paper.figure import Check, PaperFigure, Picture, Table
 from nlosrender.bench.paper.light_in_flight import steady_sum
@@ -72,7 +73,7 @@ def _montage(study: Study, run: Rendered) -> Path:
     for line, (title, stokes) in zip(axes, shown, strict=True):
         for part, name, picture in zip(line, (*COMPONENTS, "degree"), _colored(stokes), strict=True):
             part.imshow(picture, origin="lower", cmap="gray", vmin=0, vmax=1)
-            part.set_title(f"{name}, {title}", color="#e8e8ee", size=9)
+            part.set_title(f"{name}, {title}", color=INK, size=9)
             part.set_xticks([])
             part.set_yticks([])
     return save(figure, study.picture("figure-13-stokes"))

@@ -83,8 +83,8 @@ def reproduce(
     page = study.folder
     for name in names:
         timer = Timer()
-        figure = replace(FIGURES[name](study), seed=study.seed, seconds=timer.read()[0])
-        figures.append(replace(figure, seconds=timer.read()[0]))
+        figure = FIGURES[name](study)
+        figures.append(replace(figure, seed=study.seed, seconds=timer.read()[0]))
         told(figures[-1])
         page = write_page(figures, study.folder, facts | {"seconds": round(begun.read()[0], 1)})
     return figures, page

@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
 from nlosrender import pipeline
+from nlosrender.capture.grids import Capture
 from nlosrender.config.document import Config
 from nlosrender.engine.backend import start_backend
+
+if TYPE_CHECKING:
+    from nlosrender.scene.view import BuiltView
 
 Float64 = NDArray[np.float64]
 SEEDS = 8  # independent pictures, whose spread is the noise of their mean
@@ -30,10 +36,17 @@ def steady_picture(config: Config, spp: int) -> tuple[Float64, Float64]:
     """
     polarized = config.render.polarized
     start_backend(config.render.backend, colored=config.is_colored, polarized=polarized)
-    import mitsuba as mi
-
     built = pipeline.load_view(config)
     capture, _ = pipeline.describe_capture(config, built.wall, built)
+    return mitsuba_picture(built, capture, config.render.max_bounces, polarized, max(1, spp // SEEDS), SEEDS)
+
+
+def mitsuba_picture(
+    built: BuiltView, capture: Capture, max_bounces: int | None, polarized: bool, spp: int, seeds: int
+) -> tuple[Float64, Float64]:
+    """The same of a scene that is loaded: mean of ``seeds`` pictures of ``spp`` paths per pixel, and its variance."""
+    import mitsuba as mi
+
     grid, plane = capture.sensor_grid, built.wall
     target, up = built.to_engine([0, 0, 0]), built.direction_to_engine([0, 1, 0])
     origin = built.to_engine(capture.sensor_position)
@@ -47,20 +60,20 @@ def steady_picture(config: Config, spp: int) -> tuple[Float64, Float64]:
             "film": film | {"pixel_format": "rgb", "component_format": "float32"},
         }
     )
-    highest = config.render.max_bounces
-    integrator = {"type": "path", "max_depth": -1 if highest is None else highest + 1}  # the emitter counts, too
+    # the emitter counts, too
+    integrator = {"type": "path", "max_depth": -1 if max_bounces is None else max_bounces + 1}
     tracer = mi.load_dict({"type": "stokes", "nested": integrator} if polarized else integrator)
     # the stokes integrator asks the scene's own sensor which way is up
     lamps = [lamp for lamp in built.scene.emitters() if not lamp.flags() & mi.EmitterFlags.Surface]
     parts = {f"part_{number}": part for number, part in enumerate([*built.scene.shapes(), *lamps])}
     scene = mi.load_dict({"type": "scene", "sensor": sensor, **parts})
     pictures = []
-    for seed in range(SEEDS):
-        picture = np.array(mi.render(scene, sensor=sensor, integrator=tracer, spp=max(1, spp // SEEDS), seed=seed))
+    for seed in range(seeds):
+        picture = np.array(mi.render(scene, sensor=sensor, integrator=tracer, spp=spp, seed=seed))
         shown = picture[..., 3::3] if polarized else picture  # after the colours S0.R, S0.G, S0.B, S1.R, ...
         pictures.append(np.moveaxis(shown.astype(np.float64), -1, 0)[:, ::-1])
     stack = np.array(pictures)
-    return stack.mean(axis=0), stack.var(axis=0, ddof=1) / SEEDS
+    return stack.mean(axis=0), stack.var(axis=0, ddof=1) / seeds
 
 
 def worst_deviation(ours: Float64, variance: Float64, theirs: Float64, noise: Float64) -> tuple[float, float, int]:

@@ -11,6 +11,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from nlosrender.engine.device_arrays import on_device
 from nlosrender.engine.histogram import HistogramShape
 
 BLOCK = 8  # bins: 64 bytes of float64, a line of the cache
@@ -73,7 +74,7 @@ class BlockHistogram:
         sensor, rest = rest % shape.sensors, rest // shape.sensors
         laser, channel = rest % shape.lasers, rest // shape.lasers
         inside = entry < shape.n_bins
-        lane = dr.gather(mi.UInt32, mi.UInt32(places), sensor)
+        lane = dr.gather(mi.UInt32, on_device(mi.UInt32, places), sensor)
         total = mi.Float64(0)
         for _ in range(shape.replicas):
             row = (lane * shape.lasers + laser) * shape.channels + channel
