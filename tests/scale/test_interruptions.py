@@ -81,11 +81,13 @@ def finished(process: subprocess.Popen[str]) -> str:
 
 def wait_for_units(folder: Path, process: subprocess.Popen[str], count: int) -> int:
     """Wait until so many units are noted as finished, or the process ends; return how many are."""
-    journal, units = folder / ".a.hdf5.partial" / "journal", 0
+    partial, units = folder / ".a.hdf5.partial", 0
     while process.poll() is None and units < count:
         time.sleep(0.002)
+        if not any(partial.glob("samples.*")):  # a journal alone is what a finished render was killed over
+            continue
         with suppress(FileNotFoundError):  # not yet, or no longer
-            units = len(UnfinishedRender.from_records(read_records(journal)).tally.units)
+            units = len(UnfinishedRender.from_records(read_records(partial / "journal")).tally.units)
     return units
 
 
@@ -123,6 +125,22 @@ def test_killed_at_random_moments(fresh: Path, kills: int) -> None:
     assert report["resumed_units"] >= saved
     assert_whole(fresh)
     assert not (fresh / ".a.hdf5.partial").exists()
+
+
+def test_a_journal_without_its_samples_means_nothing(fresh: Path) -> None:
+    """Killed after the output was put in place, before the journal was gone: the next render begins anew."""
+    partial = fresh / ".a.hdf5.partial"
+    process = start(fresh)
+    assert wait_for_units(fresh, process, 1) >= 1
+    journal = (partial / "journal").read_bytes()
+    process.communicate(timeout=120)
+    (fresh / "a.hdf5").unlink()
+    partial.mkdir()
+    (partial / "journal").write_bytes(journal)
+    report = json.loads(finished(start(fresh, "--json")))
+    assert report["resumed_units"] == 0
+    assert_whole(fresh)
+    assert not partial.exists()
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.slow)])
