@@ -20,6 +20,7 @@ class ScanTypeOption(StrEnum):
     single = "single"
     confocal = "confocal"
     exhaustive = "exhaustive"
+    line_of_sight = "line_of_sight"
 
 
 def register(app: typer.Typer) -> None:

@@ -25,12 +25,16 @@ def paper(
         typer.Option(metavar="NAME", help="Figure or table such as 4 or table1; may be repeated.", show_default="all"),
     ] = None,
     quick: Annotated[bool, typer.Option("--quick", help="Fewer points and paths: minutes instead of an hour.")] = False,
+    meshes_only: Annotated[
+        bool, typer.Option("--meshes-only", help="Write the generated meshes of the room configurations and stop.")
+    ] = False,
     seed: Annotated[int, typer.Option(min=0, help="Of every render.")] = 0,
     configs: Annotated[Path, typer.Option(help="Folder of the paper's configurations.")] = Path("configs/paper"),
     output: Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="Folder to write.")] = Path("out/paper"),
 ) -> None:
     """Reproduce the figures and tables of Royo et al. 2022 into one HTML page."""
     from nlosrender.bench.paper.reproduce import FIGURES, reproduce
+    from nlosrender.bench.paper.rooms import write_meshes
     from nlosrender.bench.paper.study import Study
     from nlosrender.errors import EXIT_FAILURE, nearest
 
@@ -42,6 +46,10 @@ def paper(
     if not configs.is_dir():
         raise typer.BadParameter(f"{configs}: there is no such folder", param_hint="--configs")
     study = Study(configs, output, quick, seed, lambda what: typer.echo(what, err=True))
+    if meshes_only:
+        for path in write_meshes(study):
+            typer.echo(f"mesh: {path}")
+        return
     figures, page = reproduce(study, figure or FIGURES, _print_figure)
     typer.echo(f"page: {page}")
     if not all(found.holds for found in figures):

@@ -5,7 +5,6 @@ A reflectance is a number (grey), ``[r, g, b]``, or a texture/spectrum dictionar
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping
 from typing import Annotated, Any
 
@@ -16,7 +15,10 @@ from nlosrender.config.bsdf_table import (
     BSDF_REQUIRED,
     BSDF_TYPES,
     COLORED_TYPES,
+    MEDIA,
+    METALS,
     NESTED_BSDFS,
+    NO_METAL,
     TEXTURE_REQUIRED,
     TEXTURE_TYPES,
     TRANSMITTING,
@@ -28,7 +30,10 @@ from nlosrender.config.plugin_check import TRANSFORM_KEYS, PluginCheck, checked_
 from nlosrender.config.refusal import KeyPath, listed
 from nlosrender.errors import nearest
 
-_MEDIUM = re.compile(r"[\w -]+")  # no slashes: Mitsuba makes a file name of a metal's
+_NAMES = {  # known ones only: Mitsuba makes a file name of a metal's
+    Kind.MATERIAL: (NO_METAL, *METALS),
+    Kind.IOR: MEDIA,
+}
 _WITH_RGB = (Kind.REFLECTANCE, Kind.SPECTRUM)
 _WITH_TEXTURE = (Kind.REFLECTANCE, Kind.UNIT, Kind.SPECTRUM)
 _NUMBER_RANGES = {  # lowest and highest number allowed
@@ -63,11 +68,18 @@ BsdfMapping = Annotated[
 WHITE_DIFFUSE = FrozenDict(type="diffuse", reflectance=1.0)
 
 
+def check_parameter(check: PluginCheck, kind: str, key: str, value: Any) -> None:
+    """Note what is wrong with the value of one parameter of a BSDF; of parameters not in the table nothing is said."""
+    known = BSDF_PARAMETERS.get(kind, {})
+    if key in known:
+        _parameter(check, value, (key,), known[key])
+
+
 def is_colored(value: object) -> bool:
     """Return whether a checked BSDF, or a part of one, differs between colour channels (or may: textures)."""
     if isinstance(value, Mapping):
         kind = value.get("type")
-        metal = value.get("material", "none") != "none"
+        metal = value.get("material", NO_METAL) != NO_METAL
         spectrum = kind == "spectrum" and as_finite(value.get("value")) is None
         parts = (item for key, item in value.items() if key not in TRANSFORM_KEYS)
         return kind in COLORED_TYPES or metal or spectrum or any(is_colored(part) for part in parts)
@@ -135,7 +147,7 @@ def _check_combination(
         check.fault((*path, given), f"{given} needs {absent} beside it; use alpha for both.", at_key=True)
     if "alpha" in value and "alpha_u" in value:
         check.fault((*path, "alpha"), "alpha and alpha_u, alpha_v exclude each other; keep one.", at_key=True)
-    if value.get("material", "none") != "none" and ("eta" in value or "k" in value):
+    if value.get("material", NO_METAL) != NO_METAL and ("eta" in value or "k" in value):
         check.fault((*path, "material"), "material and eta, k exclude each other; keep one.", at_key=True)
     if kind == "principled" and "eta" in value and "specular" in value:
         check.fault((*path, "specular"), "eta and specular exclude each other; keep one.", at_key=True)
@@ -148,7 +160,11 @@ def _parameter(check: PluginCheck, value: Any, path: KeyPath, kind: Kind) -> Any
         return value
     if kind is Kind.DISTRIBUTION and value in ("beckmann", "ggx"):
         return value
-    if kind in (Kind.MATERIAL, Kind.IOR) and isinstance(value, str) and _MEDIUM.fullmatch(value):
+    if kind in _NAMES and isinstance(value, str):
+        known = _NAMES[kind]
+        if value not in known and not (kind is Kind.IOR and value.lower() in known):
+            close = nearest(value, known)
+            check.refuse(path, value, kind.value, f"Did you mean {close}?" if close else "")
         return value
     low, high = _NUMBER_RANGES.get(kind, (1.0, 0.0))  # an empty range: no number is allowed
     if isinstance(value, (list, tuple)) and len(value) == 3 and kind in _WITH_RGB:

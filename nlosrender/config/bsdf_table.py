@@ -16,7 +16,7 @@ class Kind(Enum):
     UNIT = "a number from 0 to 1, or a texture"
     UNIT_NUMBER = "a number from 0 to 1"
     SPECTRUM = "a number >= 0, [r, g, b] with each >= 0, or a spectrum"
-    IOR = "a number > 0 or the name of a medium"
+    IOR = "a number > 0 or the name of a medium, such as bk7 or water"
     IOR_NUMBER = "a number > 0"
     MATERIAL = "the name of a metal, such as Au, Ag, Cu or none"
     DISTRIBUTION = "beckmann or ggx"
@@ -43,6 +43,21 @@ TEXTURE_REQUIRED: dict[str, tuple[str, ...]] = {
     "srgb": ("color",),
     "uniform": ("value",),
 }
+NO_METAL = "none"  # the material of a conductor that is no metal but a perfect mirror; every metal has a colour
+METALS = _names(  # what Mitsuba brings along the index of
+    "Ag Al AlAs AlAs_palik AlSb AlSb_palik Au Be Be_palik Cr CsI CsI_palik Cu Cu2O Cu2O_palik CuO CuO_palik "
+    "Cu_palik Hg HgTe HgTe_palik Hg_palik Ir Ir_palik K K_palik Li Li_palik MgO MgO_palik Mo Mo_palik Na_palik Nb "
+    "Nb_palik Ni_palik Rh Rh_palik Se Se-e Se-e_palik Se_palik SiC SiC_palik SnTe SnTe_palik Ta Ta_palik Te Te-e "
+    "Te-e_palik Te_palik ThF4 ThF4_palik TiC TiC_palik TiN TiN_palik TiO2 TiO2-e TiO2-e_palik TiO2_palik VC "
+    "VC_palik VN VN_palik V_palik W a-C d-C d-C_palik"
+)
+MEDIA = (  # media whose index Mitsuba knows; capitals do not matter
+    *_names(
+        "vacuum helium hydrogen air water acetone ethanol glycerol benzene bromine pyrex polypropylene bk7 amber pet"
+    ),
+    *("diamond", "carbon dioxide", "carbon tetrachloride", "silicone oil", "water ice", "fused quartz"),
+    *("acrylic glass", "sodium chloride"),
+)
 COLORED_TYPES = ("bitmap", "d65", "hair", "measured", "mesh_attribute")
 
 _CONDUCTOR = {

@@ -95,7 +95,7 @@ def _integer(need: str, allows: Callable[[int], bool], advice: str = "") -> Call
     return check
 
 
-def _bounded_integer(need: str, least: int, most: int, advice: str = "") -> Callable[[object], int]:
+def _bounded_integer(need: str, least: float, most: int, advice: str = "") -> Callable[[object], int]:
     check_least = _integer(need, lambda n: n >= least, advice)
 
     def check(value: object) -> int:
@@ -253,10 +253,10 @@ GridCount = Annotated[
         {"type": "integer", "minimum": 1},
     ),
 ]
-BounceCount = Annotated[  # from 2 for a relay wall, where the document says so
+BounceCount = Annotated[  # the least depends on the scan type: config.line_of_sight
     int,
     Checked(
-        _bounded_integer("an integer >= 2 or null for no limit", 0, _MOST_BOUNCES, "3 is the third bounce."),
+        _bounded_integer("an integer, or null for no limit", -math.inf, _MOST_BOUNCES),
         {"type": "integer", "minimum": 0, "maximum": _MOST_BOUNCES},
     ),
 ]

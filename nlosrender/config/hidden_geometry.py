@@ -12,8 +12,6 @@ from pydantic import Field, ValidationInfo
 from nlosrender.config.bsdf import WHITE_DIFFUSE, BsdfMapping
 from nlosrender.config.bsdf_table import SHAPE_TYPES
 from nlosrender.config.fields import (
-    LONGEST,
-    SHORTEST,
     Angles3,
     Checked,
     Direction,
@@ -24,17 +22,16 @@ from nlosrender.config.fields import (
     Point3,
     Positive,
     Sizes3,
-    as_finite,
+    Text,
 )
 from nlosrender.config.frozen import FrozenDict
-from nlosrender.config.plugin_check import PluginCheck, checked_plugin, config_folder, existing_file
+from nlosrender.config.plugin_check import checked_plugin, config_folder, existing_file
 from nlosrender.config.refusal import Fault, refusal, refuse
 from nlosrender.config.section import Section, pose_faults
+from nlosrender.config.shape_check import check_shape
 
 LETTERS = string.ascii_uppercase + string.digits + " "
 MOST_LETTERS = 256
-_ROUND = ("sphere", "cylinder")  # shapes whose parameters give their box before Mitsuba loads them
-_POINTS = ("center", "p0", "p1")
 _MESH_SUFFIXES = (".ply", ".obj")
 _TOWARDS_WALL = (0.0, 0.0, -1.0)  # a default wall looks along +z
 _NO_ROTATION = (0.0, 0.0, 0.0)
@@ -57,36 +54,16 @@ def _mesh_file(value: object, validation: ValidationInfo) -> Path:
     if not isinstance(value, str) or not value.lower().endswith(_MESH_SUFFIXES):
         raise refuse(value, f"the name of a {' or '.join(_MESH_SUFFIXES)} file")
     path, problem = existing_file(value, config_folder(validation))
+    made_by = validation.data.get("made_by")
+    if made_by and not path.exists():
+        problem = f"got {value}, but there is no file at {path}. It is made by: {made_by}"
     if problem:
         raise Fault((), problem).as_error()
     return path
 
 
 def _shape(value: Any, validation: ValidationInfo) -> FrozenDict:
-    return checked_plugin(_check_shape, value, validation)
-
-
-def _check_shape(check: PluginCheck, value: Any) -> Any:
-    if check.plugin_type(value, (), SHAPE_TYPES, "Mitsuba shape") is None:
-        return value
-    result = {}
-    for key, item in value.items():
-        if key == "bsdf":
-            check.fault((key,), "the BSDF belongs beside shape, not in it; move it one level up.", at_key=True)
-        elif isinstance(item, dict) and key != "to_world":
-            check.refuse((key,), item, "a number, text or list", "Emitters and sensors cannot be part of a shape.")
-        elif key in _POINTS and value["type"] in _ROUND:
-            result[key] = check.numbers(item, (key,), 3, "3 finite numbers [x, y, z]")
-        elif key == "radius" and value["type"] in _ROUND:
-            number = as_finite(item)
-            if number is None or not SHORTEST <= number <= LONGEST:
-                check.refuse((key,), item, f"a number from {SHORTEST:g} to {LONGEST:g} m")
-            result[key] = item
-        else:
-            result[key] = check.generic(item, (key,))
-    if value["type"] == "cylinder" and result.get("p0", [0.0, 0.0, 0.0]) == result.get("p1", [0.0, 0.0, 1.0]):
-        check.fault((), "p0 and p1 are the same point, need the two ends of the axis.", at_key=True)
-    return result
+    return checked_plugin(check_shape, value, validation)
 
 
 LetterText = Annotated[str, Checked(_letters, {"type": "string", "pattern": "^[A-Z0-9 ]*[A-Z0-9][A-Z0-9 ]*$"})]
@@ -156,10 +133,12 @@ class LettersConfig(_FacingItem):
             yield Fault(("stroke_width",), message, needs=(("stroke_width",), ("height",)))
 
 
-class MeshConfig(_HiddenItem):
-    """A triangle mesh from a file: scaled, then rotated about x, then y, then z, then translated."""
+class FromFile(Section):
+    """What is read from a mesh file, and where it is put."""
 
-    type: Literal["mesh"]
+    # no part of the capture, so no part of its hash either; before filename, whose check wants to know it
+    made_by: Text | None = Field(default=None, exclude=True)
+    """the command that makes the file, told when it is missing"""
     filename: MeshFilename
     """a .ply or .obj file; relative names start at the YAML's folder"""
     scale: Positive = 1.0
@@ -168,6 +147,12 @@ class MeshConfig(_HiddenItem):
     """degrees about x, y, z, in this order"""
     translate: Point3 = (0.0, 0.0, 0.0)
     """m, scene coordinates"""
+
+
+class MeshConfig(FromFile, _HiddenItem):
+    """A triangle mesh from a file: scaled, then rotated about x, then y, then z, then translated."""
+
+    type: Literal["mesh"]
     face_normals: Flag = False
     """true: flat shading; false: the file's vertex normals"""
 

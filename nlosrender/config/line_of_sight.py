@@ -34,6 +34,7 @@ def line_of_sight_faults(scene: SceneConfig, capture: CaptureConfig, render: Ren
         if not getattr(render, key):
             message = "got false, but a line_of_sight capture has no such technique; remove it."
             yield Fault(("render", key), message, needs=(_SCAN,))
+    yield from _too_few_bounces(render, 0, "0 is the emitters alone, 1 what they light.")
 
 
 def _polarized_faults(scene: SceneConfig, capture: CaptureConfig, render: RenderConfig) -> Iterator[Fault]:
@@ -64,7 +65,10 @@ def relay_wall_faults(scene: SceneConfig, capture: CaptureConfig, render: Render
         yield Fault(("scene", "mitsuba"), message, "key", (_SCAN, ("scene", "mitsuba")))
     if render.polarized:
         yield from _polarized_faults(scene, capture, render)
-    if render.max_bounces is not None and render.max_bounces < _FEWEST_BOUNCES:
-        need = f"an integer >= {_FEWEST_BOUNCES} or null for no limit"
-        message = refusal(render.max_bounces, need, "3 is the third bounce.")
+    yield from _too_few_bounces(render, _FEWEST_BOUNCES, "3 is the third bounce.")
+
+
+def _too_few_bounces(render: RenderConfig, fewest: int, advice: str) -> Iterator[Fault]:
+    if render.max_bounces is not None and render.max_bounces < fewest:
+        message = refusal(render.max_bounces, f"an integer >= {fewest} or null for no limit", advice)
         yield Fault(("render", "max_bounces"), message, needs=(_SCAN, ("render", "max_bounces")))

@@ -8,22 +8,29 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated
-from xml.etree import ElementTree
-from xml.etree.ElementTree import Element
+from xml.etree.ElementTree import Element, SubElement
 
 from pydantic import ValidationInfo
 
-from nlosrender.config.bsdf_table import BSDF_TYPES, COLORED_TYPES, SHAPE_TYPES, TEXTURE_REQUIRED, TEXTURE_TYPES
+from nlosrender.config.bsdf_table import (
+    BSDF_TYPES,
+    COLORED_TYPES,
+    NO_METAL,
+    SHAPE_TYPES,
+    TEXTURE_REQUIRED,
+    TEXTURE_TYPES,
+)
 from nlosrender.config.fields import Checked
 from nlosrender.config.plugin_check import config_folder, existing_file
 from nlosrender.config.refusal import Fault, listed, refuse
 from nlosrender.config.xml_numbers import check_numbers
+from nlosrender.config.xml_shapes import at_line, check_xml_bsdf, check_xml_shape
+from nlosrender.config.xml_transforms import check_rotation
+from nlosrender.config.xml_tree import MAX_XML_BYTES, read_xml
 
-MAX_XML_BYTES = 16 * 2**20
-MAX_ELEMENTS = 100_000
-MAX_DEPTH = 64  # of elements in each other; scenes have five or six
 DEFAULT_FILM = (768, 576)  # Mitsuba's
 _PLUGINS = {  # element: the types it may have
     "scene": (),
@@ -37,6 +44,7 @@ _PLUGINS = {  # element: the types it may have
 }
 _VALUES = ("boolean", "float", "integer", "point", "ref", "rgb", "string", "vector")
 _PLAIN = (*_VALUES, "transform", "lookat", "matrix", "rotate", "scale", "translate")
+_RULES = {"bsdf": check_xml_bsdf, "shape": check_xml_shape}
 _LEFT_OUT = ("film", "integrator", "sampler")
 _VARIABLE = re.compile(r"\$\{?(\w+)\}?")
 _COLOR = re.compile(r"[\s,]+")
@@ -62,14 +70,7 @@ def read_mitsuba_xml(path: Path) -> tuple[Element, tuple[int, int] | None]:
     ValueError
         The file is no Mitsuba scene, too large, or holds something that is not allowed; says what.
     """
-    try:
-        with path.open("rb") as file:
-            text = file.read(MAX_XML_BYTES + 1)
-    except OSError as error:
-        raise ValueError(f"cannot be read: {error.strerror}") from error
-    if len(text) > MAX_XML_BYTES:
-        raise ValueError(f"it is larger than {MAX_XML_BYTES // 2**20} MiB; keep meshes in files of their own")
-    root = _parsed(text)
+    root = read_xml(path)
     if root.tag != "scene":
         raise ValueError(f"its root is <{root.tag}>, need <scene>")
     _substitute(root)
@@ -81,23 +82,18 @@ def read_mitsuba_xml(path: Path) -> tuple[Element, tuple[int, int] | None]:
 
 
 def is_colored_xml(root: Element) -> bool:
-    """Return whether a colour occurs in a scene, or may: textures from files and spectra count as coloured."""
+    """Return whether a colour occurs in a scene, or may: metals, textures from files and spectra count as coloured."""
     for element in root.iter():
-        if element.get("type") in COLORED_TYPES:
+        if element.get("type") in (*COLORED_TYPES, "envmap"):
             return True
         value = element.get("value", "").strip()
-        if element.tag == "rgb" and len(set(_channels(value))) > 1:
+        if element.tag == "string" and element.get("name") == "material" and value != NO_METAL:
+            return True
+        if element.tag == "rgb" and len(set(_COLOR.split(value))) > 1:
             return True
         if element.tag == "spectrum" and (":" in value or element.get("filename") is not None):
             return True
     return False
-
-
-def mesh_files(root: Element) -> Iterator[tuple[str, str]]:
-    """Yield file name and kind (``ply`` or ``obj``) of every mesh of a scene."""
-    for shape in root.iter("shape"):
-        if shape.get("type") in ("ply", "obj"):
-            yield _string(shape, "filename") or "", str(shape.get("type"))
 
 
 def image_files(root: Element) -> Iterator[Path]:
@@ -113,46 +109,6 @@ def named_files(root: Element) -> Iterator[Path]:
         for key in _file_keys(element):
             if element.get(key) is not None:
                 yield Path(str(element.get(key)))
-
-
-class _LimitedTree(ElementTree.TreeBuilder):
-    """Builds a scene's tree, or says what no scene needs while it is read, before it grows."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self._count = self._depth = 0
-
-    def doctype(self, name: str, pubid: str | None, system: str | None) -> None:
-        raise ValueError("it declares a document type or entities, which no Mitsuba scene needs")
-
-    def start(self, tag: str, attrs: dict[str, str]) -> Element:
-        self._count += 1
-        self._depth += 1
-        if self._count > MAX_ELEMENTS:
-            raise ValueError(f"it has more than {MAX_ELEMENTS} elements")
-        if self._depth > MAX_DEPTH:
-            raise ValueError(f"its elements lie in each other more than {MAX_DEPTH} deep")
-        return super().start(tag, attrs)
-
-    def end(self, tag: str) -> Element:
-        self._depth -= 1
-        return super().end(tag)
-
-
-def _parsed(text: bytes) -> Element:
-    parser = ElementTree.XMLParser(target=_LimitedTree())
-    try:
-        parser.feed(text)
-        root: Element = parser.close()
-    except (ElementTree.ParseError, LookupError) as error:  # LookupError: an encoding nobody knows
-        raise ValueError(f"it is not well-formed XML: {error}") from error
-    return root
-
-
-def _channels(value: str) -> list[str]:
-    if value.startswith("#"):
-        return [value[1 + 2 * i : 3 + 2 * i].lower() for i in range(3)]
-    return _COLOR.split(value)
 
 
 def _substitute(root: Element) -> None:
@@ -199,9 +155,9 @@ def _keep_one_sensor(root: Element) -> tuple[int, int] | None:
 def _add_film(root: Element, size: tuple[int, int]) -> None:
     """Give the sensor a plain film of its old film's size: Mitsuba's fov_axis and focal_length depend on its aspect."""
     for sensor in root.findall("sensor"):
-        film = ElementTree.SubElement(sensor, "film", type="hdrfilm")
+        film = SubElement(sensor, "film", type="hdrfilm")
         for name, pixels in zip(("width", "height"), size, strict=True):
-            ElementTree.SubElement(film, "integer", name=name, value=str(pixels))
+            SubElement(film, "integer", name=name, value=str(pixels))
 
 
 def _clean(element: Element, folder: Path) -> None:
@@ -210,21 +166,40 @@ def _clean(element: Element, folder: Path) -> None:
         if child.tag in _LEFT_OUT:
             element.remove(child)
             continue
-        if child.tag not in _PLUGINS and child.tag not in _PLAIN:
-            raise ValueError(f"<{child.tag}> is not supported; need {listed(sorted((*_PLUGINS, *_PLAIN)))}")
-        kind, allowed = child.get("type", ""), _PLUGINS.get(child.tag, ())
-        if allowed and kind not in allowed:
-            raise ValueError(f"<{child.tag} type={kind!r}> is not supported; need one of {listed(allowed)}")
-        if kind and not allowed:
-            raise ValueError(f"<{child.tag}> has a type {kind!r}, which is not supported")
-        for name in TEXTURE_REQUIRED.get(kind, ()) if child.tag == "texture" else ():
-            if all(item.get("name") != name for item in child):
-                raise ValueError(f"<texture type={kind!r}> has no {name}")
-        if kind in ("ply", "obj", "envmap") and _string(child, "filename") is None:
-            raise ValueError(f"<{child.tag} type={kind!r}> has no filename")
-        check_numbers(child)
-        _absolute_files(child, folder)
+        with _told_by_line(child):
+            _check(child, folder)
         _clean(child, folder)
+        if child.tag in _RULES:  # after its parts, whose line is the nearer one
+            with _told_by_line(child):
+                _RULES[child.tag](child, folder)
+
+
+@contextmanager
+def _told_by_line(element: Element) -> Iterator[None]:
+    try:
+        yield
+    except ValueError as error:
+        raise ValueError(at_line(element, error)) from error
+
+
+def _check(element: Element, folder: Path) -> None:
+    """Refuse an element that is not supported or lacks something, and make the file it names absolute."""
+    tag, kind, allowed = element.tag, element.get("type", ""), _PLUGINS.get(element.tag, ())
+    if tag not in _PLUGINS and tag not in _PLAIN:
+        raise ValueError(f"<{tag}> is not supported; need {listed(sorted((*_PLUGINS, *_PLAIN)))}")
+    if allowed and kind not in allowed:
+        raise ValueError(f"<{tag} type={kind!r}> is not supported; need one of {listed(allowed)}")
+    if kind and not allowed:
+        raise ValueError(f"<{tag}> has a type {kind!r}, which is not supported")
+    for name in TEXTURE_REQUIRED.get(kind, ()) if tag == "texture" else ():
+        if all(item.get("name") != name for item in element):
+            raise ValueError(f"<texture type={kind!r}> has no {name}")
+    if kind in ("ply", "obj", "envmap") and _string(element, "filename") is None:
+        raise ValueError(f"<{tag} type={kind!r}> has no filename")
+    check_numbers(element)
+    if tag == "rotate":
+        check_rotation(element)
+    _absolute_files(element, folder)
 
 
 def _absolute_files(element: Element, folder: Path) -> None:

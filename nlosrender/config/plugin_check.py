@@ -159,7 +159,8 @@ def existing_file(name: str, folder: Path) -> tuple[Path, str]:
         found = "a folder" if path.is_dir() else "no file"
     except (OSError, ValueError, RuntimeError):  # too long, a null character, a loop of links
         return Path(folder), f"got {shown(name)}, which is no possible file name."
-    hint = nearest(path.name, (entry.name for entry in path.parent.iterdir())) if path.parent.is_dir() else None
+    alike = (entry.name for entry in path.parent.glob("*") if entry.suffix.lower() == path.suffix.lower())
+    hint = nearest(path.name, alike) if path.parent.is_dir() else None
     advice = f" Did you mean {hint}?" if hint and found == "no file" else ""
     return path, f"got {name}, but there is {found} at {path}. Relative names start at the YAML's folder.{advice}"
 

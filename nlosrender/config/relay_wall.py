@@ -9,8 +9,8 @@ from typing import Annotated, Literal
 from pydantic import Field
 
 from nlosrender.config.bsdf import WHITE_DIFFUSE, BsdfMapping
-from nlosrender.config.fields import Angles3, Direction, Flag, Length, Point3, Positive
-from nlosrender.config.hidden_geometry import MeshFilename
+from nlosrender.config.fields import Direction, Flag, Length, Point3
+from nlosrender.config.hidden_geometry import FromFile, MeshFilename
 from nlosrender.config.refusal import Fault, shown
 from nlosrender.config.section import Section, pose_faults
 from nlosrender.config.vectors import height_above
@@ -97,18 +97,12 @@ class CylinderWallConfig(_Wall):
         return 2 * math.pi * self.radius, self.height
 
 
-class MeshWallConfig(Section):
+class MeshWallConfig(FromFile):
     """A mesh from a file, lit on the side of its faces' normals; wall coordinates are its (u, v) in metres."""
 
     type: Literal["mesh"]
     filename: MeshFilename
     """a .ply or .obj file with texture coordinates (u, v) from 0 to 1; relative names start at the YAML's folder"""
-    scale: Positive = 1.0
-    """m per unit of the file"""
-    rotate_deg: Angles3 = (0.0, 0.0, 0.0)
-    """degrees about x, y, z, in this order"""
-    translate: Point3 = (0.0, 0.0, 0.0)
-    """m, scene coordinates"""
     flip_normals: Flag = False
     """true: the wall is lit on the other side"""
     width: Length | None = None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from functools import cached_property
 from typing import Any
 
 from pydantic import model_validator
@@ -50,7 +51,7 @@ class SceneConfig(Section):
                 message = f"got a room in front of {wall} wall; a room needs a rectangle relay wall."
                 yield Fault((*path, "type"), message, needs=(path, ("relay_wall", "type")))
 
-    @property
+    @cached_property  # a Mitsuba scene is read for it
     def is_colored(self) -> bool:
         """Whether a BSDF differs between colour channels, or may: textures and measured spectra count as coloured."""
         if self.relay_wall is not None and is_colored(self.relay_wall.bsdf):

@@ -19,12 +19,8 @@ _LASER_KEYS: dict[ScanType, str] = {
 """,
 }
 
-_TEMPLATE = """\
-# A capture for nlosrender. Lengths in metres, times as optical path length (OPL) in metres.
-# Render it with: nlosrender render {file}
-name: {name}  # default: the name of this file
-
-scene:
+# What is there or, behind a comment sign, could be there.
+_WALL = """\
   relay_wall:                    # the visible surface
     type: rectangle              # rectangle | sphere | cylinder | mesh
     width: 2.0                   # m, along the wall's x axis (up x normal)
@@ -32,13 +28,46 @@ scene:
     center: [0, 0, 0]            # m; default [0, 0, 0]
     normal: [0, 0, 1]            # any direction; hidden geometry lies on this side; default [0, 0, 1]
     up: [0, 1, 0]                # the wall's y axis; default [0, 1, 0]
-    bsdf: {{type: diffuse, reflectance: 1.0}}  # any Mitsuba BSDF; reflectance: 0..1, [r, g, b], texture; default this
+    bsdf: {type: diffuse, reflectance: 1.0}  # any Mitsuba BSDF; reflectance: 0..1, [r, g, b], texture; default this
+"""
+_EMITTERS = """\
+  emitters:
+  - {type: rectangle, width: 0.5, height: 0.4, center: [0, 2, 0], normal: [0, -1, 0], up: [0, 0, 1], radiance: 10.0}
+  - {type: point, position: [0, 1, -1], intensity: [1.0, 0.9, 0.8]}
+  - {type: spot, position: [0, 1, -2], look_at: [0, 0, 0.8], intensity: 1.0, cutoff_deg: 20, beam_deg: null}
+"""
+_CAMERA = """\
+  camera:                        # line_of_sight, instead of everything about sensors and lasers below
+    {position: [0, 0.5, -3], look_at: [0, 0, 0.8], up: [0, 1, 0], fov_deg: 40, width: 64, height: 48}  # pixels
+"""
+_SENSOR_GRID = """\
+  sensor_grid:                   # the measured points: cell centres (i + 0.5) / n
+    nx: 32                       # integer >= 1
+    ny: 32                       # integer >= 1
+    width: 2.0                   # m; default null: the whole wall
+    height: 2.0                  # m; default null: the whole wall
+"""
+_DEVICES = """\
+  laser_position: [-0.5, 0, 0.25]     # m, in front of the wall; default null: 1 m in front of its centre
+  sensor_position: [-0.5, 0, 0.25]    # m, in front of the wall; default null: 1 m in front of its centre
+  laser_energy: 1.0              # J per pulse, > 0; default 1
+  laser_spot_radius: 0.0         # m, >= 0; default 0: the laser lights a point
+"""
+
+_TEMPLATE = """\
+# A capture for nlosrender. Lengths in metres, times as optical path length (OPL) in metres.
+# Render it with: nlosrender render {file}
+name: {name}  # default: the name of this file
+
+scene:
+{wall}\
   # A curved wall; inside: true (default) = lit from within; width, height: default extent of the grids.
   # relay_wall: {{type: sphere, center: [0, 0, 0], radius: 1.0, inside: true, width: 2.0, height: 1.0}}
   # relay_wall: {{type: cylinder, center: [0, 0, 0], axis: [0, 1, 0], radius: 1.0, height: 2.0, inside: true}}
   # A mesh with texture coordinates, which are its wall coordinates; width, height: what 0..1 is in m; default null.
   # relay_wall: {{type: mesh, filename: wall.ply, scale: 1, rotate_deg: [0, 0, 0], translate: [0, 0, 0],
-  #              flip_normals: false, width: null, height: null}}
+  #              flip_normals: false, width: null, height: null, made_by: null}}  # made_by: the command that makes a
+  #              file, told when it is missing; any mesh may have it
 
   hidden_geometry:               # a list; default [] (nothing hidden)
     - name: plate                # default: type and index, here rectangle-0
@@ -61,36 +90,23 @@ scene:
 
   # What a camera sees of the scene itself (capture.scan_type: line_of_sight): no relay_wall, but emitters that flash at
   # t = 0: any item as above with a radiance [W m^-2 sr^-1], or a point or a spot with an intensity [W sr^-1].
-  # emitters:
-  # - {{name: lamp, type: rectangle, width: 0.5, height: 0.4, center: [0, 2, 0], normal: [0, -1, 0], radiance: 10.0}}
-  # - {{type: point, position: [0, 1, 2], intensity: [1.0, 0.9, 0.8]}}
-  # - {{type: spot, position: [0, 1, 2], look_at: [0, 0, 0], intensity: 1.0, cutoff_deg: 20, beam_deg: null}}
+{emitters}\
   # mitsuba: scene.xml           # a whole Mitsuba scene in m; its camera is used where capture has none
 
 capture:
   scan_type: {scan_type}{pad}# single | confocal | exhaustive | line_of_sight
-  # camera:                      # line_of_sight, instead of everything about sensors and lasers below
-  #   {{position: [0, 1, 4], look_at: [0, 1, 0], up: [0, 1, 0], fov_deg: 40, width: 64, height: 48}}  # pixels
-  sensor_grid:                   # the measured points: cell centres (i + 0.5) / n
-    nx: 32                       # integer >= 1
-    ny: 32                       # integer >= 1
-    width: 2.0                   # m; default null: the whole wall
-    height: 2.0                  # m; default null: the whole wall
-{laser_keys}\
-  laser_position: [-0.5, 0, 0.25]     # m, in front of the wall; default null: 1 m in front of its centre
-  sensor_position: [-0.5, 0, 0.25]    # m, in front of the wall; default null: 1 m in front of its centre
-  laser_energy: 1.0              # J per pulse, > 0; default 1
-  laser_spot_radius: 0.0         # m, >= 0; default 0: the laser lights a point
+{camera}\
+{grids}\
   account_first_and_last_bounces: true  # count the legs laser to wall and wall to sensor in time; default true
 
 time_axis:
   start_opl: 0.0                 # m, start of bin 0; default 0
-  bin_width_opl: 0.003           # m, > 0; default 0.003 (10 ps)
+  bin_width_opl: {bin_width}{bin_pad}# m, > 0; default 0.003 (10 ps)
   n_bins: auto                   # auto | integer >= 1; default auto: up to the latest possible arrival
 
 render:
   engine: auto                   # auto | path | virtual_lights; default auto
-  max_bounces: 7                 # integer >= 2, or null for no limit; 3 = third bounce only; default 7
+  max_bounces: 7                 # integer >= 2 (line_of_sight: >= 0), or null for no limit; 3 = third bounce; default 7
   split_bounces: true            # each bounce on its own index of the file; default true
   target_error: 0.05             # relative L2 error of H to stop at, 0..1; default 0.05; or:
   # spp: 1024                    # paths per pair of laser and sensor point, instead of target_error
@@ -144,10 +160,24 @@ def starter_config(scan_type: ScanType = "confocal", name: str = "capture", file
     if readable.lower() in ("null", "true", "false"):
         readable = f"capture-{readable}"
     one_line = "".join(character for character in file if character.isprintable())
+    is_view = scan_type == "line_of_sight"
+    grids = _SENSOR_GRID + _LASER_KEYS.get(scan_type, _LASER_KEYS["single"]) + _DEVICES
+    bin_width = "0.05" if is_view else "0.003"
     return _TEMPLATE.format(
         name=readable,
         file=one_line,
         scan_type=scan_type,
         pad=" " * (20 - len(scan_type)),
-        laser_keys=_LASER_KEYS[scan_type],
+        wall=_commented(_WALL) if is_view else _WALL,
+        emitters=_EMITTERS if is_view else _commented(_EMITTERS),
+        camera=_CAMERA if is_view else _commented(_CAMERA),
+        grids=_commented(grids) if is_view else grids,
+        bin_width=bin_width,
+        bin_pad=" " * (16 - len(bin_width)),
     )
+
+
+def _commented(keys: str) -> str:
+    """Put a comment sign before every line that has none."""
+    lines = keys.splitlines(keepends=True)
+    return "".join(line if line.lstrip().startswith("#") else f"{line[:2]}# {line[2:]}" for line in lines)

@@ -22,11 +22,15 @@ def dot(a: Sequence[float], b: Sequence[float]) -> float:
     return sum(x * y for x, y in zip(a, b, strict=True))
 
 
+def cross(a: Sequence[float], b: Sequence[float]) -> tuple[float, float, float]:
+    """Return the vector product of ``a`` and ``b``, both (3,)."""
+    (ax, ay, az), (bx, by, bz) = a, b
+    return ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
+
+
 def parallel(a: Sequence[float], b: Sequence[float]) -> bool:
     """Return whether two non-zero vectors (3,) span no plane."""
-    (ax, ay, az), (bx, by, bz) = unit(a), unit(b)
-    sine = length((ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx))
-    return sine < 1e-6  # poses lose half their float64 digits there
+    return length(cross(unit(a), unit(b))) < 1e-6  # poses lose half their float64 digits there
 
 
 def height_above(point: Sequence[float], origin: Sequence[float], normal: Sequence[float]) -> float:

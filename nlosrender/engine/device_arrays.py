@@ -15,15 +15,14 @@ from numpy.typing import NDArray
 
 from nlosrender.capture.grids import Capture
 from nlosrender.capture.time_axis import TimeAxis
-from nlosrender.errors import RenderError
 from nlosrender.scene.build import WALL_ID, BuiltScene
+from nlosrender.scene.mesh_wall import SAME_FACE, too_fine
 from nlosrender.scene.pose import Float64
 
 KINDS = {"Float": np.float32, "UInt": np.uint32, "Int": np.int32}  # by Dr.Jit's names
 ALIGNMENT = 64  # bytes, the widest vectors there are
 MESH_LIFT = 1e-4  # engine units: less than any fold of a mesh wall, far more than the rounding of its points
 MESH_NUDGE = 1e-6  # engine units: off the edges of its triangles, where rays may slip through
-SAME_FACE = 1 - 1e-5  # least cosine between the normals of a face in float32 and float64
 
 
 def on_device(kind: Any, values: NDArray[np.generic]) -> Any:
@@ -125,8 +124,6 @@ def _on_mesh(built: BuiltScene, point: mi.Point3f, normal: mi.Vector3f) -> mi.Su
         found = found | is_own
     if not dr.all(found):
         missing = np.array(point).T[~np.array(found)][0] * built.unit
-        raise RenderError(
-            f"the wall's mesh is so fine at ({missing[0]:.6g}, {missing[1]:.6g}, {missing[2]:.6g}) m of its frame that "
-            "float32 does not find the point on it; use larger triangles there"
-        )
+        place = ", ".join(f"{coordinate:.6g}" for coordinate in missing)
+        raise too_fine(f"({place}) m of its frame: float32 does not find the point on it")
     return interaction

@@ -51,7 +51,7 @@ def scene_warnings(engine: Engine) -> tuple[str, ...]:
     max_bounces = engine.options.bounces.max_bounces
     window = window_warnings(capture, built.wall, built.hidden_bounds, time_axis, max_bounces)
     if isinstance(built, BuiltView):
-        return (*_view_warnings(built), *window, *_bin_warnings(engine, time_axis))
+        return (*built.warnings, *_view_warnings(built), *window, *_bin_warnings(engine, time_axis))
     return (
         *built.warnings,
         *_surface_warnings(built, capture, max_bounces),

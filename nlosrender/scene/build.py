@@ -24,7 +24,7 @@ from nlosrender.scene.hidden_geometry import (
     box_corners,
     joined_bounds,
 )
-from nlosrender.scene.materials import area_emitter, first_line, load_bsdf, rejected
+from nlosrender.scene.materials import area_emitter, check_surface, first_line, load_bsdf, medium_warnings, rejected
 from nlosrender.scene.mesh_file import read_mesh
 from nlosrender.scene.pose import Float64
 from nlosrender.scene.relay_wall import RelayWall
@@ -47,7 +47,7 @@ class BuiltScene:
     hidden_bounds: Bounds | None  # box around the hidden geometry [m, local frame]; None when there is none
     unit: float  # metres per engine unit of length, a power of two
     n_triangles: int  # of the hidden geometry; analytic shapes count as none
-    warnings: tuple[str, ...] = ()  # about what was left out
+    warnings: tuple[str, ...] = ()  # about what was left out, or hardly meant
 
     @property
     def all_flat(self) -> bool:
@@ -96,6 +96,7 @@ def build_scene(wall: RelayWall, wall_bsdf: Mapping[str, object], surfaces: Sequ
     hidden_bounds = joined_bounds(hidden_boxes)
     n_triangles = sum(int(shape.face_count()) for shape in hidden_shapes if shape.is_mesh())
     shapes = tuple(hidden_shapes)
+    warnings += medium_warnings((f"{surface.key}.bsdf", shape) for surface, shape in zip(surfaces, shapes, strict=True))
     return BuiltScene(scene, wall, wall_shape, tuple(surfaces), shapes, hidden_bounds, unit, n_triangles, warnings)
 
 
@@ -163,8 +164,11 @@ def load_surface(surface: Surface, shape: TriangleMesh | ShapeDescription, unit:
         Mitsuba rejects the shape or its BSDF, or float32 rounds it to nothing.
     """
     if isinstance(shape, TriangleMesh):
-        return _load_mesh(shape, surface, unit)
-    return _load_shape(shape.description, surface.bsdf, surface.key, surface.name, unit, surface.radiance)
+        loaded = _load_mesh(shape, surface, unit)
+    else:
+        loaded = _load_shape(shape.description, surface.bsdf, surface.key, surface.name, unit, surface.radiance)
+    check_surface(loaded, f"{surface.key}.bsdf")
+    return loaded
 
 
 def _load_mesh(mesh: TriangleMesh, surface: Surface, unit: float) -> mi.Mesh:

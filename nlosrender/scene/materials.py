@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+import re
+from collections.abc import Iterable, Iterator, Mapping
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +17,8 @@ from nlosrender.scene.images import check_image, image_files
 from nlosrender.scene.transforms import transform_matrix
 
 TEXEL_ROUNDING = 1e-3  # half-precision images and their filters may pass 1 a little
+_SOURCE = re.compile(r"\[\w+\.(?:cpp|h|py):\d+\] |At dictionary node \"root\": ")
+BENDING = ("RoughDielectric", "Principled")  # BSDF classes that refract in directions a connection can take
 TRANSFORMS = ("to_world", "to_uv")  # keys of a plugin that hold a matrix or a list of steps
 
 
@@ -31,9 +36,10 @@ def load_bsdf(bsdf: Mapping[str, object], key: str) -> mi.BSDF:
         loaded = mi.load_dict(mitsuba_value(bsdf))
     except (RuntimeError, TypeError, ValueError) as error:
         raise rejected(key, f"Mitsuba rejects this BSDF: {first_line(error)}") from error
-    for name, values in mi.traverse(loaded).items():
+    parameters = mi.traverse(loaded)
+    for name in parameters.keys():  # noqa: SIM118  # not its items: some of other parameters cannot be read
         if name.endswith(".data"):
-            _check_texels(np.asarray(values), name.removesuffix(".data"), f"{key}.{name.split('.')[0]}")
+            _check_texels(np.asarray(parameters[name]), name.removesuffix(".data"), f"{key}.{name.split('.')[0]}")
     return loaded
 
 
@@ -68,6 +74,85 @@ def mitsuba_spectrum(value: Radiance) -> dict[str, object]:
     return {"type": "uniform", "value": float(value)}
 
 
+def check_surface(shape: mi.Shape, key: str) -> None:
+    """Refuse a surface whose BSDF Mitsuba loads but cannot evaluate, or whose refraction is ambiguous.
+
+    Raises
+    ------
+    ConfigError
+        ``key`` is named.
+    """
+    bsdf = shape.bsdf()
+    what = f"{shape.class_name()} {shape.id()!r}" if shape.id() else shape.class_name()
+    try:
+        index_behind(bsdf)
+    except ValueError as error:
+        raise rejected(key, f"{what}: {error}.") from error
+    point = dr.zeros(mi.SurfaceInteraction3f)
+    point.shape = mi.ShapePtr(shape)
+    point.wi = mi.Vector3f(0.6, 0, 0.8)
+    point.sh_frame = mi.Frame3f(mi.Normal3f(0, 0, 1))
+    try:
+        bsdf.sample(mi.BSDFContext(), point, 0.5, mi.Point2f(0.5))  # recorded, never run
+    except RuntimeError as error:
+        advice = "Bump and normal maps need a bitmap with raw: true, a normal map one of three channels."
+        raise rejected(key, f"{what}: Mitsuba cannot evaluate its BSDF: {first_line(error)}. {advice}") from error
+
+
+def index_behind(bsdf: mi.BSDF) -> float:
+    """Return the relative refractive index behind a surface, for straight connections across it; 1 where none bends.
+
+    Smooth glass does not count: no connection crosses it.
+
+    Raises
+    ------
+    ValueError
+        The BSDF is made of several, and light that crosses it comes into different media.
+    """
+    connected = mi.BSDFFlags.DiffuseTransmission | mi.BSDFFlags.GlossyTransmission
+    indices = sorted({_index_of(part) for part in _innermost(bsdf) if part.flags() & connected})
+    if len(indices) > 1:
+        found = " and ".join(f"{index:.6g}" for index in indices)
+        raise ValueError(f"its parts let light into media of the refractive indices {found}, need one medium behind it")
+    return indices[0] if indices else 1.0
+
+
+def medium_warnings(surfaces: Iterable[tuple[str, mi.Shape]]) -> tuple[str, ...]:
+    """Return a sentence for each surface, told by its key, that light enters bent and unbent: a mask over glass.
+
+    Refractive indices are counted at every crossing, and a crossing that does not bend counts none.
+    """
+    return tuple(
+        f"{key}: light crosses it bent as well as unbent, and which medium it is in behind is a guess: arrival times "
+        "there are wrong. Leave out the mask, null or thin part of its BSDF, or its glass."
+        for key, shape in surfaces
+        if shape.bsdf().flags() & mi.BSDFFlags.Null and any(_bends(part) for part in _innermost(shape.bsdf()))
+    )
+
+
+def _bends(bsdf: mi.BSDF) -> bool:
+    bent = mi.BSDFFlags.DeltaTransmission | mi.BSDFFlags.GlossyTransmission
+    return bool(bsdf.class_name() in (*BENDING, "SmoothDielectric") and bsdf.flags() & bent)
+
+
+def _innermost(bsdf: mi.BSDF) -> Iterator[mi.BSDF]:
+    """Yield the BSDFs in a BSDF that hold no other: those in a blend, a mask, under a bump map; or itself."""
+    above = mi.traverse(bsdf).hierarchy  # of every part, textures too: what it is part of, and how deep
+    parts = [part for part in above if isinstance(part, mi.BSDF)]
+    holders = [above[part][0] for part in parts]
+    yield from (part for part in parts if part not in holders)
+
+
+def _index_of(bsdf: mi.BSDF) -> float:
+    if bsdf.class_name() not in BENDING:
+        return 1.0
+    parameters = dict(mi.traverse(bsdf))
+    if "eta" in parameters:
+        return float(np.ravel(parameters["eta"])[0])
+    # a principled BSDF told by its reflectance along the normal, 0.08 specular = ((eta - 1) / (eta + 1))^2
+    return float(2 / (1 - math.sqrt(0.08 * np.ravel(parameters["specular"])[0])) - 1)
+
+
 def _check_texels(values: NDArray, name: str, key: str) -> None:
     """Refuse images with values no reflectance has; numbers in the configuration have been checked before."""
     if values.dtype.kind == "u":
@@ -87,5 +172,5 @@ def rejected(key: str, message: str) -> ConfigError:
 
 
 def first_line(error: BaseException) -> str:
-    """Return what one of Mitsuba's errors says, on one line."""
-    return " ".join(str(error).split())[:400]
+    """Return what one of Mitsuba's errors says, on one line and without the places in Mitsuba's own source."""
+    return _SOURCE.sub("", " ".join(str(error).split())).rstrip(".!")[:400]

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from nlosrender.config.fields import LONGEST, SHORTEST
 from nlosrender.errors import ConfigError, Problem
 from nlosrender.scene.hidden_geometry import mesh_matrix
 from nlosrender.scene.mesh_file import read_mesh
@@ -20,6 +21,7 @@ from nlosrender.scene.wall_coordinates import on_wall, require_positive
 if TYPE_CHECKING:
     from nlosrender.config.relay_wall import MeshWallConfig
 
+SAME_FACE = 1 - 1e-5  # least cosine between the normals of a face in float32 and float64
 FLATNESS = 1e-7  # of the wall's size: what float32 coordinates of a file leave of a plane
 LEAST_MEAN_NORMAL = 0.1  # of the length it has on a plane: below it the wall closes round, and no side is its front
 UV_ROUNDING = 1e-6  # texture coordinates may pass 0 and 1 by so much
@@ -54,6 +56,7 @@ class MeshWall:
     _map: UvMap = field(init=False, repr=False)
     _face_normals: Float64 = field(init=False, repr=False)
     _is_planar: bool = field(init=False, repr=False)
+    _is_lost: NDArray[np.bool_] = field(init=False, repr=False)  # (n,) faces that float32 turns or flattens
 
     def __post_init__(self) -> None:
         require_positive("relay wall", width=self.width, height=self.height)
@@ -64,6 +67,9 @@ class MeshWall:
         object.__setattr__(self, "_face_normals", self.mesh.face_normals())
         flat = not self.mesh.vertices[:, 2].any() and bool((self._face_normals[:, 2] > 0).all())
         object.__setattr__(self, "_is_planar", flat)
+        rounded = TriangleMesh(self.mesh.vertices.astype(np.float32), self.mesh.faces).face_normals()
+        cosines = np.einsum("nk,nk->n", rounded, self._face_normals)
+        object.__setattr__(self, "_is_lost", ~flat & (cosines <= SAME_FACE))
 
     @property
     def is_planar(self) -> bool:
@@ -131,6 +137,13 @@ class MeshWall:
                 f"the relay wall's mesh has no triangle at wall coordinates ({x:.6g}, {y:.6g}) m, (u, v) = "
                 f"({u:.6g}, {v:.6g}); need laser and sensor points on it. Use a smaller grid, or close the hole."
             )
+        lost = np.flatnonzero(self._is_lost[faces])
+        if len(lost):
+            (x, y), corners = flat[lost[0]], self.mesh.vertices[self.mesh.faces[faces[lost[0]]]]
+            raise too_fine(
+                f"wall coordinates ({x:.6g}, {y:.6g}) m: the triangle there, of {np.ptp(corners, axis=0).max():.3g} m, "
+                "is a sliver whose normal float32 does not keep"
+            )
         return faces, weights
 
 
@@ -149,6 +162,9 @@ def mesh_wall_from_config(config: MeshWallConfig) -> MeshWall:
     try:
         mesh = read_mesh(str(config.filename), kind, face_normals=True).transformed(mesh_matrix(config))
         mesh = mesh.turned_round() if config.flip_normals else mesh
+        size = float(np.ptp(mesh.bounds(), axis=0).max())
+        if not SHORTEST <= size <= LONGEST:
+            raise ValueError(f"it is {size:.4g} m large, need {SHORTEST:g} to {LONGEST:g} m; check its scale")
         coordinates = _checked_uvs(mesh)
         if kind == "obj":  # reading one turns v round, as Mitsuba's textures need it
             coordinates = coordinates * [1.0, -1.0] + [0.0, 1.0]
@@ -219,6 +235,12 @@ def _flattened(mesh: TriangleMesh) -> TriangleMesh:
     if float(np.abs(mesh.vertices[:, 2]).max()) > FLATNESS * size:
         return mesh
     return replace(mesh, vertices=mesh.vertices * [1.0, 1.0, 0.0])
+
+
+def too_fine(where: str) -> ConfigError:
+    """Return the error about a laser or sensor point on a triangle that the renderer cannot find."""
+    message = f"the relay wall's mesh is too fine at {where}. Remove slivers or use larger triangles there, or move the"
+    return ConfigError(Problem("", "scene.relay_wall.filename", f"{message} laser and sensor points off it."))
 
 
 def _refused(message: str) -> ConfigError:

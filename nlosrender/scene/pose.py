@@ -43,7 +43,7 @@ class Pose:
         y = _unit(y, "up")
         y = y - np.dot(y, z) * z
         if np.linalg.norm(y) < 1e-9:
-            raise ValueError(f"up {list(np.ravel(up))} is parallel to normal {list(np.ravel(normal))}")
+            raise ValueError(f"up {np.ravel(up).tolist()} is parallel to normal {np.ravel(normal).tolist()}")
         y = y / np.linalg.norm(y)
         return cls(np.column_stack([np.cross(y, z), y, z]), np.asarray(center, dtype=np.float64))
 
@@ -95,5 +95,5 @@ def euler_xyz(rotate_deg: ArrayLike) -> Float64:
 def _unit(direction: Float64, name: str) -> Float64:
     length = float(np.linalg.norm(direction))
     if not np.isfinite(length) or length < 1e-12:
-        raise ValueError(f"{name} {list(direction)} has no direction: need a finite, non-zero vector")
+        raise ValueError(f"{name} {direction.tolist()} has no direction: need a finite, non-zero vector")
     return direction / length

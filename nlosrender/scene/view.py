@@ -5,17 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING
-from xml.etree import ElementTree
 
 import mitsuba as mi
 import numpy as np
 from numpy.typing import ArrayLike
 
 from nlosrender.config.emitters import PointLamp, SpotLamp
-from nlosrender.config.fields import LONGEST
-from nlosrender.config.mitsuba_xml import image_files, mesh_files, read_mitsuba_xml
 from nlosrender.scene.build import load_surface, read_mesh_of, shape_bounds
 from nlosrender.scene.camera import ImagePlane, image_plane
 from nlosrender.scene.hidden_geometry import (
@@ -26,18 +22,15 @@ from nlosrender.scene.hidden_geometry import (
     hidden_surfaces,
     joined_bounds,
 )
-from nlosrender.scene.images import check_image
-from nlosrender.scene.materials import first_line, mitsuba_spectrum, rejected
-from nlosrender.scene.mesh_file import read_mesh
+from nlosrender.scene.materials import check_surface, medium_warnings, mitsuba_spectrum, rejected
 from nlosrender.scene.pose import Float64, Pose
 from nlosrender.scene.relay_wall import relay_wall_from_config
 from nlosrender.scene.triangle_mesh import TriangleMesh
+from nlosrender.scene.xml_loading import WHERE, load_xml_scene
 
 if TYPE_CHECKING:
     from nlosrender.config.capture import CaptureConfig
     from nlosrender.config.scene import SceneConfig
-
-WHERE = "scene.mitsuba"
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,6 +45,7 @@ class BuiltView:
     frame: Pose  # of the engine, in the scene
     unit: float  # metres per engine unit of length, a power of two
     n_triangles: int
+    warnings: tuple[str, ...] = ()  # about what was hardly meant
 
     def to_engine(self, positions: ArrayLike) -> Float64:
         """Take positions (..., 3) [m] of the local frame to the engine's [engine units]."""
@@ -77,7 +71,7 @@ def build_view(scene_config: SceneConfig, capture_config: CaptureConfig) -> Buil
     ValueError
         A pose is degenerate; the message begins with the item's key.
     """
-    whole = None if scene_config.mitsuba is None else _load_xml(scene_config.mitsuba)
+    whole = None if scene_config.mitsuba is None else load_xml_scene(scene_config.mitsuba)
     plane = _image_plane(capture_config, whole)
     frame = _engine_frame(scene_config, plane)
     surfaces = tuple(_surfaces(scene_config, frame))
@@ -89,11 +83,14 @@ def build_view(scene_config: SceneConfig, capture_config: CaptureConfig) -> Buil
     shapes = [load_surface(surface, shape, unit) for surface, shape in zip(surfaces, loaded, strict=True)]
     contents: dict[str, object] = {f"lamp_{index}": _lamp(lamp, frame, unit) for index, lamp in enumerate(lamps)}
     if whole is not None:
-        _check_extents(whole.shapes())
         shapes += whole.shapes()
+        for shape in whole.shapes():
+            check_surface(shape, WHERE)
         far = [emitter for emitter in whole.emitters() if not emitter.flags() & mi.EmitterFlags.Surface]
         contents |= {f"emitter_{index}": emitter for index, emitter in enumerate(far)}
     contents |= {f"shape_{index}": shape for index, shape in enumerate(shapes)}
+    keys = [f"{surface.key}.bsdf" for surface in surfaces]
+    keys += [f"{WHERE} ({shape.class_name()} {shape.id()!r})" for shape in shapes[len(surfaces) :]]
     boxes = [shape_bounds(shape, unit) for shape in shapes] + [(point, point) for point in points]
     return BuiltView(
         scene=mi.load_dict({"type": "scene", **contents}),
@@ -104,6 +101,7 @@ def build_view(scene_config: SceneConfig, capture_config: CaptureConfig) -> Buil
         frame=frame,
         unit=unit,
         n_triangles=sum(int(shape.face_count()) for shape in shapes if shape.is_mesh()),
+        warnings=medium_warnings(zip(keys, shapes, strict=True)),
     )
 
 
@@ -155,35 +153,6 @@ def _image_plane(capture_config: CaptureConfig, whole: mi.Scene | None) -> Image
     position, forward, up = to_world[:3, 3], to_world[:3, 2], to_world[:3, 1]
     fov = float(np.ravel(parameters["x_fov"])[0])
     return image_plane(position, position + forward / np.linalg.norm(forward), up, fov, pixels)
-
-
-def _load_xml(path: Path) -> mi.Scene:
-    try:
-        root, _ = read_mitsuba_xml(path)
-        for filename, kind in mesh_files(root):
-            _check_mesh(filename, kind)
-        for image in image_files(root):
-            check_image(image)
-        return mi.load_string(ElementTree.tostring(root, encoding="unicode"))
-    except (RuntimeError, TypeError, ValueError) as error:
-        raise rejected(WHERE, f"{path}: {first_line(error)}") from error
-
-
-def _check_mesh(filename: str, kind: str) -> None:
-    """Read a mesh before Mitsuba does, whose readers end the process on a wrong index."""
-    try:
-        read_mesh(filename, kind, face_normals=False)
-    except ValueError as error:
-        raise ValueError(f"{filename} cannot be used as a mesh: {error}") from error
-
-
-def _check_extents(shapes: Sequence[mi.Shape]) -> None:
-    """Refuse what transformations have made of a scene's numbers: nothing, or more than float32 can square."""
-    for shape in shapes:
-        box = shape_bounds(shape, 1.0)
-        if box is None or not float(np.abs(box).max()) <= LONGEST:
-            extent = "has no extent" if box is None else f"reaches {float(np.abs(box).max()):.4g} m from the origin"
-            raise rejected(WHERE, f"its {shape.class_name()} {shape.id()!r} {extent}. Check its transformation.")
 
 
 def _lamp(lamp: PointLamp | SpotLamp, frame: Pose, unit: float) -> mi.Emitter:

@@ -176,7 +176,7 @@ def test_a_wrong_override_is_placed_at_the_override(override: str, key: str, mes
 # --- starter ---
 
 
-@pytest.mark.parametrize("scan_type", ["single", "confocal", "exhaustive"])
+@pytest.mark.parametrize("scan_type", ["single", "confocal", "exhaustive", "line_of_sight"])
 def test_the_starter_is_valid_and_has_the_asked_scan(scan_type) -> None:
     """What `new` writes can be rendered as it is, without a warning."""
     config = parse(starter_config(scan_type, "two planes #1"))
@@ -191,7 +191,7 @@ def test_the_starter_survives_any_file_name(name: str) -> None:
     assert parse(starter_config("single", name, f"{name}.yaml")).name
 
 
-@pytest.mark.parametrize("scan_type", ["single", "confocal", "exhaustive"])
+@pytest.mark.parametrize("scan_type", ["single", "confocal", "exhaustive", "line_of_sight"])
 def test_the_starter_names_every_key(scan_type) -> None:
     """Every key of every section and item type is in the starter, as a value or an example, with a comment."""
     text = starter_config(scan_type)

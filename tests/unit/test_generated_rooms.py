@@ -2,15 +2,24 @@
 
 from __future__ import annotations
 
+import contextlib
+import os
 from pathlib import Path
 
 import numpy as np
 import pytest
+from rendering import configured, flat_wall
 
 from nlosrender.bench.meshes import grid_faces, write_ply
 from nlosrender.bench.paper.room_meshes import block, ellipsoid, write_furniture, write_statue
+from nlosrender.bench.paper.rooms import ROOMS, Room, write_meshes
+from nlosrender.bench.paper.study import Study
+from nlosrender.config.load import config_hash, load_config
+from nlosrender.errors import ConfigError, FileError
 from nlosrender.scene.mesh_file import read_mesh
 from nlosrender.scene.triangle_mesh import TriangleMesh
+
+PROJECT = Path(__file__).parents[2]
 
 
 def volume(mesh: TriangleMesh) -> float:
@@ -54,3 +63,58 @@ def test_a_written_mesh_is_read_as_it_was(tmp_path: Path) -> None:
     mesh = read_mesh(str(tmp_path / "a.ply"), "ply", face_normals=True)
     np.testing.assert_array_equal(mesh.vertices, vertices)
     np.testing.assert_array_equal(mesh.faces, faces)
+
+
+def test_a_mesh_appears_whole_or_not_at_all(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A write that fails leaves neither half a mesh, which the next run would take for a whole one, nor a remnant."""
+
+    def full(partial: Path, target: Path) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "replace", full)
+    with pytest.raises(FileError, match=r"a\.ply: cannot be written: No space left"):
+        write_ply(tmp_path / "a.ply", np.eye(3), np.array([[0, 1, 2]]))
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_room_that_has_no_mesh_yet_says_what_makes_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The configurations that come along are valid once the command that their error names has run, and only then."""
+    folder = tmp_path / "configs" / "paper"
+    folder.mkdir(parents=True)
+    study = Study(folder, tmp_path / "out" / "paper", quick=True)
+    small = tuple(Room(room.config, 20_000, ROOMS[0].write) for room in ROOMS)
+    monkeypatch.setattr("nlosrender.bench.paper.rooms.ROOMS", small)
+    for room in ROOMS:
+        copy = folder / f"{room.config}.yaml"
+        copy.write_text((PROJECT / "configs" / "paper" / copy.name).read_text(encoding="utf-8"), encoding="utf-8")
+        with pytest.raises(ConfigError, match=r"there is no file at .* made by: nlosrender paper --meshes-only"):
+            load_config(copy)
+    assert [path.name for path in write_meshes(study)] == [f"{room.config}.ply" for room in ROOMS]
+    for room in ROOMS:
+        assert load_config(folder / f"{room.config}.yaml").scene.hidden_geometry[1].name in room.config
+
+
+@pytest.mark.parametrize("path", sorted((PROJECT / "configs").rglob("*.yaml")), ids=lambda path: path.stem)
+def test_every_configuration_is_valid_or_names_the_command_that_makes_its_mesh(path: Path) -> None:
+    """On a fresh clone nothing else is missing."""
+    with contextlib.suppress(ConfigError):
+        load_config(path)
+        return
+    with pytest.raises(ConfigError) as caught:
+        load_config(path)
+    (problem,) = caught.value.problems
+    assert problem.message.endswith("It is made by: nlosrender paper --meshes-only")
+
+
+def test_how_a_mesh_is_made_is_no_part_of_the_capture(tmp_path: Path) -> None:
+    """Two configurations that differ in ``made_by`` alone are one capture, for meshes and mesh walls."""
+    write_ply(tmp_path / "a.ply", np.eye(3), np.array([[0, 1, 2]]))
+    mesh = {"type": "mesh", "filename": "a.ply"}
+    made = {**mesh, "made_by": "make meshes"}
+    hashes = {config_hash(configured(flat_wall(item) | {"name": "one"}, folder=tmp_path)) for item in (mesh, made)}
+    walls = set()
+    for wall in (mesh, made):
+        config = flat_wall(capture={"sensor_grid": {"nx": 3, "ny": 2, "width": 1, "height": 1}})
+        config["scene"]["relay_wall"] = wall
+        walls.add(config_hash(configured(config, folder=tmp_path)))
+    assert len(hashes) == len(walls) == 1

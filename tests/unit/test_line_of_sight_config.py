@@ -60,7 +60,8 @@ def test_pixels_are_the_sensor_grid() -> None:
         ({"camera": {"width": 0}}, "capture.camera.width", r"got 0, need an integer >= 1"),
         ({"render": {"engine": "virtual_lights"}}, "render.engine", r"need a relay wall"),
         ({"render": {"hidden_geometry_sampling": False}}, "render.hidden_geometry_sampling", r"no such technique"),
-        ({"render": {"max_bounces": -1}}, "render.max_bounces", r"got -1"),
+        ({"render": {"max_bounces": -1}}, "render.max_bounces", r"got -1, need an integer >= 0 or null"),
+        ({"render": {"max_bounces": 1.5}}, "render.max_bounces", r"got 1.5, need an integer, or null"),
         ({"render": {"polarized": True, "color": "rgb"}}, "render.polarized", r"rendered in grey"),
         ({"render": {"temporal_kernel_opl": 0.1}}, "render.temporal_kernel_opl", r"has plain bins"),
     ],
@@ -209,7 +210,7 @@ def test_what_is_left_of_a_mitsuba_scene(tmp_path: Path) -> None:
     assert not list(root.iter("integrator")) + list(root.iter("default"))
     (film,) = root.iter("film")
     assert [(item.get("name"), item.get("value")) for item in film] == [("width", "48"), ("height", "32")]
-    assert not is_colored_xml(root)
+    assert is_colored_xml(root)  # the mirror is silver
     for value in ("<rgb name='reflectance' value='0.5 0.1 0.1'/>", "<spectrum name='r' value='400:0.1, 700:0.5'/>"):
         content = f"<scene><bsdf type='diffuse'>{value}</bsdf></scene>"
         (tmp_path / "colored.xml").write_text(content, encoding="utf-8")

@@ -165,3 +165,41 @@ def test_every_point_of_a_scrambled_mesh_is_found(tmp_path: Path) -> None:
 
 def _placed(vertices: Any, uvs: Any, faces: Any) -> tuple[Any, Any, float, float]:
     return Pose.identity(), TriangleMesh(vertices, faces, uvs), WIDTH, HEIGHT
+
+
+def strips(sliver: float) -> tuple[Any, Any, Any]:
+    """Return three curved strips of triangles, the middle one ``sliver`` m wide but with 40 % of u."""
+    x, u = np.array([-1.0, 0.0, sliver, 1.0]), np.array([0.0, 0.3, 0.7, 1.0])
+    x, v = (values.ravel() for values in np.meshgrid(x, [0.0, 1.0]))
+    uvs = np.stack([np.tile(u, 2), v], axis=1)
+    y = (v - 0.5) * HEIGHT
+    first = np.arange(3)
+    faces = np.concatenate([np.stack([first, first + 1, first + 5], 1), np.stack([first, first + 5, first + 4], 1)])
+    return np.stack([x, y, 0.1 * np.sin(5 * x + y)], axis=1), uvs, faces
+
+
+@pytest.mark.parametrize("sliver", [1e-9, 1e-12])
+def test_a_point_on_a_sliver_is_refused_before_the_render(sliver: float, tmp_path: Path) -> None:
+    """float32 turns a triangle of 1.6 m x 1 nm any way: nothing of it can be lit, and the mistake is the mesh's."""
+    config = flat_wall(sensors=(8, 7), capture={"laser_point": [0, 0], "sensor_grid": {"nx": 8, "ny": 7, "width": 1}})
+    config["scene"]["relay_wall"] = {"type": "mesh", "filename": write_ply(tmp_path / "wall.ply", *strips(sliver))}
+    validated = configured(config, folder=tmp_path)
+    wall, _ = place_scene(validated)
+    with pytest.raises(ConfigError, match=r"too fine at wall coordinates .* a sliver .* Remove slivers") as caught:
+        build_capture(validated.capture, wall)
+    assert caught.value.exit_code == 3
+    assert caught.value.problems[0].key == "scene.relay_wall.filename"
+
+
+def test_slivers_beside_the_points_are_no_matter(tmp_path: Path) -> None:
+    """A wall may have triangles that float32 loses where no laser or sensor point lies."""
+    wall = MeshWall(*_placed(*strips(1e-9)))
+    corner = [-0.49 * wall.width, 0.2 * wall.height]
+    assert wall.positions(corner)[0] == pytest.approx(-1 + 0.01 / 0.3, abs=1e-6)
+    with pytest.raises(ConfigError, match="sliver"):
+        wall.positions([0.0, 0.0])
+
+
+def test_a_wall_of_no_size_is_refused(tmp_path: Path) -> None:
+    """A mesh in the wrong unit is told how large it is."""
+    assert "it is 1e-20 m large, need 1e-09 to 1e+09 m" in refused(tmp_path, *sheet(flat(1e-20, 1e-20), 3, 2))

@@ -83,10 +83,29 @@ def closed_rooms(study: Study) -> PaperFigure:
     )
 
 
+def write_meshes(study: Study) -> list[Path]:
+    """Write the meshes that the rooms' configurations name, where they are not there yet, and return where.
+
+    Raises
+    ------
+    FileError
+        A folder or file cannot be written.
+    """
+    study.make_folders()
+    return [write_mesh(study, room) for room in ROOMS]
+
+
 def write_mesh(study: Study, room: Room) -> Path:
-    """Write a room's mesh where it is not there yet, and return where."""
+    """Write a room's mesh where it is not there yet, and return where: whole or not at all.
+
+    Raises
+    ------
+    FileError
+        The file cannot be written.
+    """
     path = study.folder / "meshes" / f"{room.config}.ply"
     if not path.exists():
+        study.progress(str(path))
         room.write(path, room.n_triangles)
     return path.resolve()
 

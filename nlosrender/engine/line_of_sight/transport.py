@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import drjit as dr
@@ -13,10 +12,10 @@ from numpy.typing import NDArray
 from nlosrender.capture.bounces import BounceAxis
 from nlosrender.capture.grids import Capture
 from nlosrender.capture.time_axis import TimeAxis
+from nlosrender.scene.materials import index_behind
 from nlosrender.scene.view import BuiltView
 
 STOKES = 4  # components of a Stokes vector: channels of a polarised capture
-BENDING = ("RoughDielectric", "Principled")  # BSDF classes that refract in directions a connection can take
 
 
 @dataclass(frozen=True)
@@ -93,20 +92,10 @@ def refractive_indices(scene: mi.Scene) -> mi.Float:
     numbers = np.array(dr.reinterpret_array(mi.UInt32, shapes)) if dr.width(shapes) else np.zeros(0, dtype=np.uint32)
     table = np.ones(int(numbers.max(initial=0)) + 1, dtype=np.float32)
     for number, shape in zip(numbers, scene.shapes(), strict=True):
-        table[number] = _index_behind(shape.bsdf())
+        table[number] = index_behind(shape.bsdf())
     return mi.Float(table)
 
 
 def crosses_rough_surfaces(scene: mi.Scene) -> bool:
     """Return whether a straight connection may pass through a refracting surface of the scene."""
-    return bool(any(_index_behind(shape.bsdf()) != 1.0 for shape in scene.shapes()))
-
-
-def _index_behind(bsdf: mi.BSDF) -> float:
-    if bsdf.class_name() not in BENDING:
-        return 1.0
-    parameters = dict(mi.traverse(bsdf))
-    if "eta" in parameters:
-        return float(np.ravel(parameters["eta"])[0])
-    # a principled BSDF told by its reflectance along the normal, 0.08 specular = ((eta - 1) / (eta + 1))^2
-    return float(2 / (1 - math.sqrt(0.08 * np.ravel(parameters["specular"])[0])) - 1)
+    return bool(any(index_behind(shape.bsdf()) != 1.0 for shape in scene.shapes()))
