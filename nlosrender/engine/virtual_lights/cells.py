@@ -29,6 +29,7 @@ class Cells:
 
     corners: Float64  # (n, 3, 3) [engine units]
     weights: Float64  # (n, 3, 3) barycentric coordinates of the corners in the mesh's triangle
+    shading: Float64  # (n, 3) unit shading normal at the centre
     shapes: NDArray[np.uint32]  # (n,) index into the scene's shapes
     primitives: NDArray[np.uint32]  # (n,) triangle of the mesh
     sizes: Float64  # (n,) longest edge
@@ -36,18 +37,22 @@ class Cells:
 
     def at(self, chosen: NDArray[np.bool_]) -> Cells:
         """Return the cells that are ``chosen``."""
+        if chosen.all():
+            return self
         return Cells(*(values[chosen] for values in self._arrays()))
 
     @classmethod
     def joined(cls, parts: list[Cells]) -> Cells:
         """Return the cells of all parts."""
+        if len(parts) == 1:
+            return parts[0]
         if not parts:
             none, index = np.zeros((0, 3, 3)), np.zeros(0, np.uint32)
-            return cls(none, none, index, index, np.zeros(0), np.zeros(0))
+            return cls(none, none, np.zeros((0, 3)), index, index, np.zeros(0), np.zeros(0))
         return cls(*(np.concatenate(values) for values in zip(*(part._arrays() for part in parts), strict=True)))
 
     def _arrays(self) -> tuple[NDArray, ...]:
-        return self.corners, self.weights, self.shapes, self.primitives, self.sizes, self.distances
+        return self.corners, self.weights, self.shading, self.shapes, self.primitives, self.sizes, self.distances
 
 
 @dataclass(frozen=True)
@@ -144,7 +149,7 @@ def cells_of_mesh(built: BuiltScene, index: int, mesh: mi.Mesh, distance: WallDi
     weights = np.broadcast_to(np.eye(3), corners.shape)
     done: list[Cells] = []
     while len(corners):
-        sizes, centres = longest_edges(corners), corners.mean(axis=1)
+        sizes, centres = longest_edges(corners), middles(corners)
         if is_wall:
             distances = np.maximum(distance.out_of_plane(centres), NEAREST)
         else:
@@ -152,11 +157,24 @@ def cells_of_mesh(built: BuiltScene, index: int, mesh: mi.Mesh, distance: WallDi
             close = distances < NEAREST
             distances[close] = distance.of_planes(centres[close], normals_and_areas(corners[close])[0])
         large = sizes > distances
-        small = Cells(corners, weights, np.full(len(corners), index, np.uint32), primitives, sizes, distances)
+        shading = _shading_normals(mesh, corners, weights, primitives)
+        shapes = np.full(len(corners), index, np.uint32)
+        small = Cells(corners, weights, shading, shapes, primitives, sizes, distances)
         done.append(small.at(~large))
         corners, weights = _quartered(corners[large]), _quartered(weights[large])
         primitives = np.tile(primitives[large], 4)
     return Cells.joined(done)
+
+
+def _shading_normals(mesh: mi.Mesh, corners: Float64, weights: Float64, primitives: NDArray[np.uint32]) -> Float64:
+    """Return the unit shading normals (n, 3) at the centres of parts of a mesh's triangles."""
+    if not mesh.has_vertex_normals():
+        return normals_and_areas(corners)[0]
+    parameters = mi.traverse(mesh)
+    at_vertices = np.asarray(parameters["vertex_normals"], dtype=np.float64).reshape(-1, 3)
+    at_corners = at_vertices[np.asarray(parameters["faces"]).reshape(-1, 3)[primitives]]
+    normals = np.einsum("nk,nkx->nx", middles(weights), at_corners)
+    return normals / np.maximum(np.linalg.norm(normals, axis=1), 1e-300)[:, None]
 
 
 def normals_and_areas(triangles: Float64) -> tuple[Float64, Float64]:
@@ -168,7 +186,13 @@ def normals_and_areas(triangles: Float64) -> tuple[Float64, Float64]:
 
 def longest_edges(triangles: Float64) -> Float64:
     """Return the length (n,) of the longest edge of triangles (n, 3, 3)."""
-    return np.linalg.norm(triangles - np.roll(triangles, 1, axis=1), axis=-1).max(axis=1)
+    squares = [np.square(triangles[:, k] - triangles[:, k - 1]).sum(axis=1) for k in range(3)]
+    return np.sqrt(np.maximum(np.maximum(*squares[:2]), squares[2]))
+
+
+def middles(triangles: Float64) -> Float64:
+    """Return the means (n, m) of the corners of triangles (n, 3, m); numpy's own mean takes five times as long."""
+    return (triangles[:, 0] + triangles[:, 1] + triangles[:, 2]) / 3
 
 
 def _quartered(triangles: Float64) -> Float64:

@@ -1,154 +1,168 @@
 """Neighbouring triangles -> one patch: detail that time and distance cannot tell apart costs nothing.
 
-A cluster has the area of its members, their mean normal, and a parallelogram with their second moments as its footprint
-in time. Whether it is seen is asked of one member, drawn by area: two sheets in one cluster still hide each other, on
+A cluster has a parallelogram with its members' second moments as its footprint in time. It is lit and seen by one
+normal n and area A although its members have normals n_i of their own: a Lambertian surface sends light on from
+direction l to direction s by l^T M s, with M the sum of A_i n_i n_i^T. With u = M r for one direction r, the matrix of
+rank one u u^T / (r . u) does the same wherever l or s is r, and errs elsewhere by the product of their differences
+from r (Nystrom's approximation); so n = u / |u| and A = |u|^2 / (r . u), with r towards the lasers. The sum of the
+A_i for A would be too bright: 1.5 times for half a sphere, lit and seen from above.
+
+Whether it is seen is asked of one member, drawn by area: two sheets in one cluster still hide each other, on
 average, and the difference of two resolutions shows the noise of the draw.
 """
 
 from __future__ import annotations
 
+import math
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
-from nlosrender.engine.virtual_lights.cells import Cells
+from nlosrender.engine.virtual_lights.cells import Cells, middles
+from nlosrender.engine.virtual_lights.grains import Grains, Int64
 from nlosrender.engine.virtual_lights.patches import Patches
 from nlosrender.scene.pose import Float64
 
-GRID = 0.8  # edge of a cluster's box per size allowed
-TALL = 3.0  # height of a box per edge
-SLOPES = 1.5  # width of the classes that slopes within a box are sorted into, at coarseness 1
+STEEPEST = 0.5  # cosine to the lasers, below which members may face away from them
+RIDGE = 1e-6  # of the squared extent: keeps planes through points on a line defined
+PLACE = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])  # in PAIRS
+FINER = 2  # times half the size of the clusters: the grains they are made of
+WORTHWHILE = 4  # cells per grain
 
 
-def cluster(
-    cells: Cells, normals: Float64, areas: Float64, allowed: Float64, coarseness: float, seed: int = 0
-) -> Patches:
-    """Merge cells, all of them far smaller than allowed, into one patch per box and class of slopes.
+class Merger:
+    """Merges cells far smaller than they need to be into one patch per box, at any coarseness.
+
+    Coarse clusters are made of finer ones where these are far fewer than the cells: once summed up, the cells are
+    not looked at again.
 
     Parameters
     ----------
     cells
-        Cells to merge.
+        Cells of all shapes.
     normals, areas
         (n, 3) and (n,) of the cells.
     allowed
         (n,) size a patch may have at coarseness 1 [engine units].
-    coarseness
-        Scales it.
-    seed
-        Of the draw of the members that stand for their clusters.
+    light
+        (3,) middle of the laser points [engine units].
     """
-    centres = cells.corners.mean(axis=1)
-    order, starts = _groups(_keys(cells, centres, normals, allowed, coarseness))
-    areas, normals, centres = areas[order], normals[order], centres[order]
-    corners, shapes, primitives = cells.corners[order], cells.shapes[order], cells.primitives[order]
-    total = np.add.reduceat(areas, starts)
-    mean = np.add.reduceat(areas[:, None] * centres, starts) / total[:, None]
-    normal = np.add.reduceat(areas[:, None] * normals, starts)
-    normal /= np.maximum(np.linalg.norm(normal, axis=1), 1e-300)[:, None]
-    sizes = np.diff(np.append(starts, len(areas)))
-    owner = np.repeat(np.arange(len(starts)), sizes)
-    stands = _drawn(areas, starts, sizes, np.random.default_rng(seed))
-    return Patches(
-        _footprints(corners, areas, owner, starts, total, mean, normal),
-        total,
-        mean,
-        normal,
-        shapes[stands],
-        primitives[stands],
-        cells.weights[order][stands].mean(axis=1)[:, 1:],
-        np.zeros(len(starts)),
-        centres[stands],
-        np.ones(len(starts), bool),
-    )
+
+    def __init__(self, cells: Cells, normals: Float64, areas: Float64, allowed: Float64, light: Float64):
+        self.cells, self.light = cells, light
+        self._cells = Grains.of(cells, normals, areas, allowed)
+        self._grains: dict[float, Grains] = {}  # per coarseness
+
+    @property
+    def boxes(self) -> Float64:
+        """How many clusters the cells (n,) are at coarseness 1; their number goes with coarseness^-2."""
+        return self._cells.boxes
+
+    def clusters(self, chosen: NDArray[np.bool_], coarseness: float, seed: int = 0) -> Patches:
+        """Return the clusters of the cells that are ``chosen``.
+
+        Parameters
+        ----------
+        chosen
+            (n,) which cells; at least one.
+        coarseness
+            Scales the sizes allowed.
+        seed
+            Of the draw of the members that stand for their clusters.
+        """
+        level = 2.0 ** (math.floor(math.log2(coarseness)) - FINER)
+        members = self._grains_of(level) if chosen.all() else self._cells.at(chosen)
+        merged = members.merged(coarseness, np.random.default_rng(seed))
+        footprint, stands = _Footprint.of(merged), merged.stands
+        areas, normals = _as_one(merged, self.light - footprint.mean)
+        return Patches(
+            footprint.corners(),
+            areas,
+            footprint.mean,
+            normals,
+            self.cells.shapes[stands],
+            self.cells.primitives[stands],
+            middles(self.cells.weights[stands])[:, 1:],
+            np.zeros(len(merged)),
+            middles(self.cells.corners[stands]),
+            np.ones(len(merged), bool),
+        )
+
+    def _grains_of(self, coarseness: float) -> Grains:
+        """Return all cells, merged to a coarseness that is a power of two where that leaves far fewer."""
+        if WORTHWHILE * self.boxes.sum() > coarseness**2 * len(self._cells):
+            return self._cells
+        if coarseness not in self._grains:
+            finer = self._grains_of(coarseness / 2)
+            self._grains[coarseness] = finer.merged(coarseness, np.random.default_rng(1))
+        return self._grains[coarseness]
 
 
-def _keys(
-    cells: Cells, centres: Float64, normals: Float64, allowed: Float64, coarseness: float
-) -> tuple[NDArray[np.int64], ...]:
-    """Return what members of a cluster have in common: shape, scale, box and slopes.
-
-    A box stands upright on the axis its normals are nearest to: a tilted or bent surface is cut along the two others
-    only, into parallelograms.
-    """
-    scale = np.floor(np.log2(allowed)).astype(np.int64)  # the same at every coarseness, so that clusters scale with it
-    edge = coarseness * GRID * 2.0**scale
-    upright, across = _axes(normals)
-    rows = np.arange(len(normals))
-    along_normal = normals[rows, upright]
-    slopes = normals[rows[:, None], across] / np.abs(along_normal)[:, None]
-    box = np.floor(centres[rows[:, None], across] / edge[:, None])
-    height = np.floor(centres[rows, upright] / (TALL * edge))
-    tilt = np.rint(slopes / (SLOPES * coarseness))
-    facing = upright * 2 + (along_normal > 0)
-    return tuple(
-        np.asarray(key, np.int64)
-        for key in (cells.shapes, scale, facing, box[:, 0], box[:, 1], height, tilt[:, 0], tilt[:, 1])
-    )
+def _as_one(merged: Grains, towards: Float64) -> tuple[Float64, Float64]:
+    """Return the area (n,) and normal (n, 3) that stand for those of all members; ``towards`` (n, 3) the lasers."""
+    matrices = merged.light.reshape(-1, 3, 3)
+    axis, sign = merged.facing // 2, 2 * (merged.facing % 2) - 1
+    # no member is more than 55 degrees off the axis it faces along, or against: this goes along their mean normal
+    own = _unit(matrices[np.arange(len(merged)), :, axis] * sign[:, None])
+    towards = _unit(towards)
+    is_lit = np.einsum("nx,nx->n", own, towards) > STEEPEST
+    reference = np.where(is_lit[:, None], towards, own)
+    light = np.einsum("nxy,ny->nx", matrices, reference)
+    onto = np.einsum("nx,nx->n", light, reference)
+    # shading normals against those of the triangles: nothing is lit
+    areas = np.where(onto > 0, np.einsum("nx,nx->n", light, light) / np.maximum(onto, 1e-300), 0.0)
+    return np.minimum(areas, merged.areas), _unit(light)
 
 
-def _axes(normals: Float64) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return the axis (n,) nearest to each normal, and the two others (n, 2)."""
-    upright = np.abs(normals).argmax(axis=1)
-    return upright, np.stack([(upright + 1) % 3, (upright + 2) % 3], axis=1)
+@dataclass(frozen=True, eq=False)
+class _Footprint:
+    """Where clusters lie: middles, steepness, and second moments across the axes their boxes stand on."""
+
+    mean: Float64  # (n, 3)
+    upright: Int64  # (n,) that axis
+    slopes: Float64  # (n, 2) of the best plane through the members, along the two axes that follow
+    moments: Float64  # (n, 3) about the middle: of the first of them, mixed, of the second
+
+    @classmethod
+    def of(cls, merged: Grains) -> _Footprint:
+        """Return where the members lie."""
+        sums = merged.places[:, 1:] / np.maximum(merged.areas, 1e-300)[:, None]
+        mean, upright, rows = sums[:, :3], merged.facing // 2, np.arange(len(merged))
+
+        def moment(one: Int64, other: Int64) -> Float64:
+            """Return the second moments along two axes about the middles."""
+            return sums[rows, 3 + PLACE[one, other]] - mean[rows, one] * mean[rows, other]
+
+        first, second = (upright + 1) % 3, (upright + 2) % 3
+        uu, uv, vv = moment(first, first), moment(first, second), moment(second, second)
+        uh, vh = moment(first, upright), moment(second, upright)
+        ridge = RIDGE * (uu + vv) + 1e-300
+        determinant = (uu + ridge) * (vv + ridge) - uv**2
+        slopes = np.stack([(vv + ridge) * uh - uv * vh, (uu + ridge) * vh - uv * uh], axis=1) / determinant[:, None]
+        return cls(mean, upright, slopes, np.stack([uu, uv, vv], axis=1))
+
+    def corners(self) -> Float64:
+        """Return three corners (n, 3, 3) in a row of parallelograms with these moments.
+
+        The moments of one spanned by 2 p and 2 q are (p p^T + q q^T) / 3, so p and q are the columns of a Cholesky
+        factor of 3 times the moments: a rectangle stays that rectangle.
+        """
+        uu, uv, vv = 3 * self.moments.T
+        first = np.sqrt(np.maximum(uu, 0))
+        shear = uv / np.maximum(first, 1e-300)
+        second = np.sqrt(np.maximum(vv - shear**2, 0))
+        p, q = self._on_plane(first, shear), self._on_plane(np.zeros_like(second), second)
+        return np.stack([self.mean - p - q, self.mean + p - q, self.mean + p + q], axis=1)
+
+    def _on_plane(self, one: Float64, other: Float64) -> Float64:
+        """Return steps (n, 3) in the planes, of given components along the two axes after ``upright``."""
+        rows, steps = np.arange(len(one)), np.empty_like(self.mean)
+        steps[rows, (self.upright + 1) % 3], steps[rows, (self.upright + 2) % 3] = one, other
+        steps[rows, self.upright] = one * self.slopes[:, 0] + other * self.slopes[:, 1]
+        return steps
 
 
-def _groups(keys: tuple[NDArray[np.int64], ...]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return an order in which equal keys lie together, and where each group starts."""
-    joined = np.zeros(len(keys[0]), np.int64)
-    for key in keys:  # a number per combination: each key is within a known range, so none overlaps
-        low, high = int(key.min()), int(key.max())
-        joined = joined * (high - low + 1) + (key - low)
-    order = np.argsort(joined, kind="stable")
-    ordered = joined[order]
-    return order, np.flatnonzero(np.append(True, ordered[1:] != ordered[:-1]))
-
-
-def _drawn(
-    areas: Float64, starts: NDArray[np.int64], sizes: NDArray[np.int64], generator: np.random.Generator
-) -> NDArray[np.int64]:
-    """Draw one member of every group with probability in proportion to its area."""
-    cumulative = np.cumsum(areas)
-    before = cumulative[starts] - areas[starts]
-    last = starts + sizes - 1
-    at = before + generator.random(len(starts)) * (cumulative[last] - before)
-    return np.clip(np.searchsorted(cumulative, at, side="right"), starts, last)
-
-
-def _footprints(
-    corners: Float64,
-    areas: Float64,
-    owner: NDArray[np.int64],
-    starts: NDArray[np.int64],
-    total: Float64,
-    mean: Float64,
-    normal: Float64,
-) -> Float64:
-    """Return three corners (n, 3, 3) in a row of the parallelograms with the clusters' second moments.
-
-    Moments are taken along the two axes across a box. That of a triangle is the sum of v v^T over its corners and of
-    9 c c^T for its centre c, / 12; that of a parallelogram spanned by 2 p and 2 q is (p p^T + q q^T) / 3, so p and q
-    are the columns of a Cholesky factor of 3 times the moments: a rectangle stays that rectangle.
-    """
-    upright, across = _axes(normal)
-    spread = corners - mean[owner][:, None]  # (n, 3 corners, 3)
-    u, v = (np.take_along_axis(spread, across[owner][:, None, k, None], axis=2)[..., 0] for k in range(2))
-    cu, cv = u.mean(axis=1), v.mean(axis=1)
-    uu, uv, vv = (
-        np.add.reduceat(areas * ((a * b).sum(axis=1) + 9 * ca * cb) / 12, starts) / total
-        for a, b, ca, cb in ((u, u, cu, cu), (u, v, cu, cv), (v, v, cv, cv))
-    )
-    first = np.sqrt(3 * uu)
-    shear = 3 * uv / np.maximum(first, 1e-300)
-    second = np.sqrt(np.maximum(3 * vv - shear**2, 0))
-    p = _in_plane(np.stack([first, shear], axis=1), normal, upright, across)
-    q = _in_plane(np.stack([np.zeros_like(second), second], axis=1), normal, upright, across)
-    return np.stack([mean - p - q, mean + p - q, mean + p + q], axis=1)
-
-
-def _in_plane(steps: Float64, normal: Float64, upright: NDArray[np.int64], across: NDArray[np.int64]) -> Float64:
-    """Return vectors (n, 3) with components ``steps`` along the two axes ``across``, in the planes of the normals."""
-    vector = np.zeros_like(normal)
-    np.put_along_axis(vector, across, steps, axis=1)
-    rows = np.arange(len(normal))
-    vector[rows, upright] = -np.einsum("nk,nk->n", vector, normal) / normal[rows, upright]
-    return vector
+def _unit(vectors: Float64) -> Float64:
+    """Return vectors (n, 3) at unit length; zero stays zero."""
+    return vectors / np.maximum(np.linalg.norm(vectors, axis=1), 1e-300)[:, None]

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from nlosrender.capture.grids import Capture
 from nlosrender.engine.virtual_lights.cells import Cells, WallDistance, cells_of_mesh, normals_and_areas
-from nlosrender.engine.virtual_lights.clusters import cluster
-from nlosrender.engine.virtual_lights.patches import Patches, split_cells
+from nlosrender.engine.virtual_lights.clusters import Merger
+from nlosrender.engine.virtual_lights.patches import Patches, no_patches, split_cells
 from nlosrender.engine.virtual_lights.round_shapes import ROUND_PLUGINS, RoundShape
 from nlosrender.scene.build import WALL_ID, BuiltScene
 from nlosrender.scene.pose import Float64
@@ -27,7 +27,7 @@ MOST_KEPT = 200_000  # patches of one resolution that are kept for the next call
 # Engine units: of surfaces so near to a point, a dozen cells around its foot make up H. Their numbers of parts have to
 # follow the coarseness in small steps, or two resolutions would differ less than either errs.
 CLOSE = 1e-2
-MERGED = 0.4  # of the size allowed: smaller cells are merged
+MERGED = 0.5  # of the size allowed: smaller cells are merged
 
 
 class Tessellator:
@@ -64,6 +64,7 @@ class Tessellator:
                 self.round_shapes.append(RoundShape.of(index, shape))
         self.cells = Cells.joined(cells)
         self._allowed = self._allowed_at(self.cells.distances)
+        self._ratios = self.cells.sizes / self._allowed  # of the sizes to those allowed at coarseness 1
         self._normals, self._areas = normals_and_areas(self.cells.corners)
         self._kept_patches = lru_cache(maxsize=4)(self._make_patches)
 
@@ -74,13 +75,18 @@ class Tessellator:
         return self._kept_patches(coarseness)
 
     def _make_patches(self, coarseness: float) -> Patches:
-        far_smaller = self._far_smaller(coarseness)
-        parts = [split_cells(self.cells.at(~far_smaller), self._splits(coarseness)[~far_smaller])]
-        if far_smaller.any():
-            small, normals, areas = self.cells.at(far_smaller), self._normals[far_smaller], self._areas[far_smaller]
-            parts.append(cluster(small, normals, areas, self._allowed[far_smaller], coarseness))
+        is_small = self._ratios < MERGED * coarseness
+        parts = [self._merger.clusters(is_small, coarseness)] if is_small.any() else []
+        if not is_small.all():
+            splits = np.ceil(self._ratios[~is_small] / coarseness).astype(np.int64)
+            parts.append(split_cells(self.cells.at(~is_small), splits))
         parts += [shape.patches(self._allowed_on(shape, coarseness)) for shape in self.round_shapes]
-        return Patches.joined(parts)
+        return Patches.joined(parts) if parts else no_patches()
+
+    @cached_property
+    def _merger(self) -> Merger:
+        light = self.capture.laser_grid.positions.reshape(-1, 3).mean(axis=0) / self.built.unit
+        return Merger(self.cells, self._normals, self._areas, self._allowed, light)
 
     def count(self, coarseness: float) -> int:
         """Return about how many patches ``patches`` would make, without making them; exactly where none merge."""
@@ -88,18 +94,18 @@ class Tessellator:
 
     def counts(self, coarseness: float) -> tuple[int, int]:
         """Return ``count`` of the hidden surfaces, and of a wall that sees itself."""
-        hidden = self._hidden()
-        far_smaller = self._far_smaller(coarseness)
-        # an equilateral triangle of the size allowed has 0.43 of its square as area
-        merged = self._areas / (0.43 * (coarseness * self._allowed) ** 2)
-        splits = self._splits(coarseness) ** 2
-        counts = [
-            int(splits[~far_smaller & chosen].sum()) + math.ceil(merged[far_smaller & chosen].sum())
-            for chosen in (hidden, ~hidden)
-        ]
+        hidden, wall = (count.at(coarseness) for count in self._counts)
         for shape in self.round_shapes:
-            counts[shape.index == self.wall_index] += shape.count(self._allowed_on(shape, coarseness))
-        return counts[0], counts[1]
+            more = shape.count(self._allowed_on(shape, coarseness))
+            hidden, wall = (hidden, wall + more) if shape.index == self.wall_index else (hidden + more, wall)
+        return hidden, wall
+
+    @cached_property
+    def _counts(self) -> tuple[_CellCount, _CellCount]:
+        hidden = self._hidden()
+        boxes = self._merger.boxes
+        on_wall = _CellCount(self._ratios[~hidden], boxes[~hidden])
+        return _CellCount(self._ratios[hidden], boxes[hidden]), on_wall
 
     @property
     def nearest(self) -> float:
@@ -135,13 +141,6 @@ class Tessellator:
         graded = np.where(distance < CLOSE, distance / 2, distance)
         return np.minimum(graded, 2 * np.sqrt(distance * self.bin_width))
 
-    def _splits(self, coarseness: float) -> NDArray[np.int64]:
-        return np.maximum(np.ceil(self.cells.sizes / (coarseness * self._allowed)), 1).astype(np.int64)
-
-    def _far_smaller(self, coarseness: float) -> NDArray[np.bool_]:
-        """Return which cells are so small that several make one patch."""
-        return self.cells.sizes < MERGED * coarseness * self._allowed
-
     def _allowed_on(self, shape: RoundShape, coarseness: float) -> float:
         if shape.index == self.wall_index:
             # cos cos / r^2 varies over the radius only, however near: 1 / (4 radius^2) between points of a sphere
@@ -149,6 +148,29 @@ class Tessellator:
         else:
             nearest = max(shape.nearest(self.distance), abs(shape.radius) / 8)
         return coarseness * min(float(self._allowed_at(np.array([nearest]))[0]), abs(shape.radius))
+
+
+class _CellCount:
+    """Counts the patches that some cells make, quickly: it is asked many times.
+
+    Parameters
+    ----------
+    ratios
+        (n,) sizes of the cells over the sizes allowed.
+    boxes
+        (n,) ``Merger.boxes``.
+    """
+
+    def __init__(self, ratios: Float64, boxes: Float64):
+        order = np.argsort(ratios)
+        self._ratios = ratios[order]
+        self._boxes = np.append(0.0, np.cumsum(boxes[order]))  # of all smaller cells
+
+    def at(self, coarseness: float) -> int:
+        """Return the number of patches: one per box, per cell, or per part of a cell."""
+        merged, whole = np.searchsorted(self._ratios, [MERGED * coarseness, coarseness])
+        parts = np.ceil(self._ratios[whole:] / coarseness).astype(np.int64)
+        return math.ceil(self._boxes[merged] / coarseness**2) + int(whole - merged) + int((parts**2).sum())
 
 
 def can_tessellate(built: BuiltScene) -> bool:

@@ -27,6 +27,8 @@ from nlosrender.engine.virtual_lights.tessellator import MAX_PATCHES, Tessellato
 FIRST_COARSENESS = 1.0
 NEAR = 1e-3  # engine units: the centres of nearer patches are rounded by more than 1e-4 of their distance
 REFINEMENT = 3.0  # at least so many times more patches between the two resolutions that are compared
+APART = 2.5  # at least so many times fewer patches has what a resolution is compared with, where there is any
+SAME = 0.05  # relative difference in coarseness of resolutions that are as good as one another
 STUCK = 0.9  # of the error before, with twice the patches: refining further is in vain
 ROUGH = 0.2  # an error beyond which the law of its decrease does not hold yet
 MARGIN = 1.1  # on the patches that an extrapolated error asks for
@@ -38,6 +40,8 @@ class Gathered:
 
     values: NDArray[np.float64]
     n_patches: int
+    coarseness: float
+    merged: float  # share of the area that is in clusters
 
     @property
     def squares(self) -> float:
@@ -78,12 +82,15 @@ class ThirdBounce:
         shape = self.shape(batch)
         patches = self.tessellator.patches(coarseness)
         if not len(patches):  # nothing faces the wall
-            return Gathered(np.zeros((shape.channels, shape.slots, shape.lasers, shape.sensors, shape.row)), 1)
+            return Gathered(
+                np.zeros((shape.channels, shape.slots, shape.lasers, shape.sensors, shape.row)), 1, coarseness, 0.0
+            )
         transport, slice_of_lane, order = self._transport(batch, shape)
         histogram = BlockHistogram(shape, order)
         lights = self._lights(transport, shape, patches)
         gather_third_bounce(self.settings, transport, lights, histogram, slice_of_lane)
-        return Gathered(histogram.on_host(), len(patches))
+        merged = float(patches.areas[patches.is_cluster].sum() / patches.areas.sum())
+        return Gathered(histogram.on_host(), len(patches), coarseness, merged)
 
     def lit_patches(self, batch: Batch | Pilot, coarseness: float) -> LitPatches:
         """Return the patches that the gather of a batch goes through, in its order."""
@@ -106,23 +113,27 @@ class ThirdBounce:
 
     def settle(self, pilot: Pilot, target: float) -> tuple[float, Gathered]:
         """Return the fineness whose estimated error is at most ``target``, and the pilot's third bounce at it."""
-        coarse = self.gather(pilot, FIRST_COARSENESS)
+        tried = [(self.gather(pilot, FIRST_COARSENESS), math.inf)]  # and its error, coarse to fine
         fineness = self.finer(FIRST_COARSENESS, REFINEMENT)
-        earlier = math.inf
         while True:
             fine = self.gather(pilot, fineness)
+            # None nearer: two that differ in few patches only differ by more than either errs, by how they are cut.
+            tried = tried[_last_at_most(tried, fine.n_patches / APART) :]
+            coarse = tried[0][0]
             error = estimated_error(coarse, fine)
-            if error <= target:  # as the render will estimate it, from the pair of resolutions that is nearer
-                error = max(error, estimated_error(self.gather(pilot, self.coarser(fineness)), fine))
+            coarser = self.coarser(fineness)
+            if error <= target and not math.isclose(coarse.coarseness, coarser, rel_tol=SAME):
+                # as the render will estimate it, from the pair of resolutions that it has
+                error = max(error, estimated_error(self.gather(pilot, coarser), fine))
             needed = fine.n_patches * error / target
             # float32 path lengths and grazing contacts leave an error that no refinement takes away
+            earlier = tried[_last_at_most(tried, fine.n_patches / 2)][1]
             is_stuck = STUCK * earlier < error < ROUGH and fine.n_patches > 2 * coarse.n_patches
             in_vain = is_stuck or (error < ROUGH and needed > MAX_PATCHES)
             if error <= target or in_vain or 2 * fine.n_patches > MAX_PATCHES:
                 return fineness, fine
-            earlier = error
-            # In small steps: where the coarser one merges much of a mesh, its error says little of the finer one's.
-            coarse, fineness = fine, self.finer(fineness, min(max(MARGIN * error / target, 1.25), REFINEMENT))
+            tried.append((fine, error))
+            fineness = self.finer(fineness, min(max(MARGIN * error / target, 1.25), REFINEMENT))
 
     def finer(self, coarseness: float, factor: float) -> float:
         """Return a coarseness with at least ``factor`` times the patches (a mesh may be finer than asked for).
@@ -142,7 +153,7 @@ class ThirdBounce:
         while coarser < FIRST_COARSENESS and any(
             less > count / REFINEMENT for less, count in zip(self.tessellator.counts(coarser), counts, strict=True)
         ):
-            coarser *= 1.1
+            coarser = min(1.1 * coarser, FIRST_COARSENESS)  # beyond it the law of the error's decrease does not hold
         return coarser
 
     def shape(self, batch: Batch | Pilot) -> HistogramShape:
@@ -168,6 +179,11 @@ class ThirdBounce:
         return replace(transport, sensors=sensors, first_laser=first_laser), slice_of_lane, order
 
 
+def _last_at_most(tried: list[tuple[Gathered, float]], n_patches: float) -> int:
+    """Return the index of the finest resolution of at most so many patches, of the coarsest if all have more."""
+    return max((index for index, (gathered, _) in enumerate(tried) if gathered.n_patches <= n_patches), default=0)
+
+
 def estimated_error(coarse: Gathered, fine: Gathered) -> float:
     """Return the relative L2 error of the finer resolution."""
     noise = _squares(fine.values - coarse.values) / difference_divisor(coarse, fine) ** 2
@@ -177,11 +193,15 @@ def estimated_error(coarse: Gathered, fine: Gathered) -> float:
 def difference_divisor(coarse: Gathered, fine: Gathered) -> float:
     """Return what to divide the difference of two resolutions by to have the error of the finer one.
 
-    The discretisation error falls as 1 / n patches: the difference is (r - 1) times the finer's error, with r the
-    ratio of the counts. The error of random visibility rays falls as n^(-3/4) and is independent: sqrt(r^1.5 + 1).
+    The error of patches cut from the same surfaces falls as 1 / n patches: the difference is (r - 1) times the
+    finer's error, with r the ratio of the counts. The error of random visibility rays falls as n^(-3/4) and is
+    independent: sqrt(r^1.5 + 1). So are those of clusters, whose boxes lie elsewhere at every coarseness; they fall at
+    least as fast, with the boxes' size: where small triangles cease to be merged there may be many more patches.
     """
-    ratio = max(fine.n_patches / coarse.n_patches, 1.0 + 1e-9)
-    return min(ratio - 1, math.sqrt(ratio**1.5 + 1))
+    ratio = min(fine.n_patches / coarse.n_patches, (coarse.coarseness / fine.coarseness) ** 2)
+    ratio = max(ratio, 1.0 + 1e-9)
+    independent = math.sqrt(ratio**1.5 + 1)
+    return (1 - fine.merged) * min(ratio - 1, independent) + fine.merged * independent
 
 
 def _squares(values: NDArray[np.float64]) -> float:
