@@ -14,6 +14,7 @@ from nlosrender.config.load import parse_config
 
 Truth = Literal["quadrature", "refined", "long run"]
 
+WALL_SIZE = 2.0  # m, of every relay wall
 PLATE_SIZE = 0.8  # m
 PLATE_DISTANCE = 1.0  # m
 PLATE_REFLECTANCE = 0.7
@@ -107,11 +108,11 @@ def wavy_sheet(mesh: Path, n: int = 32) -> BenchScene:
     return BenchScene("sheet", "wavy sheet", 0.02, "refined", sections)
 
 
-def many_lasers(n_lasers: int, n: int = 16) -> BenchScene:
-    """The plate scanned exhaustively by ``n_lasers`` x ``n_lasers`` laser points."""
+def many_lasers(n_lasers: int, n: int = 16, width: float = 1.5) -> BenchScene:
+    """The plate scanned exhaustively by ``n_lasers`` x ``n_lasers`` laser points over ``width`` squared."""
     base = plate(n).sections
     capture = {**base["capture"], "scan_type": "exhaustive"}
-    capture["laser_grid"] = {"nx": n_lasers, "ny": n_lasers, "width": 1.5, "height": 1.5}
+    capture["laser_grid"] = {"nx": n_lasers, "ny": n_lasers, "width": width, "height": width}
     return BenchScene("lasers", "exhaustive", 0.02, "refined", {**base, "capture": capture})
 
 
@@ -132,7 +133,7 @@ def _sections(
     wall_reflectance: float = 1.0,
 ) -> dict[str, Any]:
     """Return scene, capture and time axis: a wall of 2 m, legs not counted, the laser at its centre."""
-    wall = {"type": "rectangle", "width": 2.0, "height": 2.0, "bsdf": _diffuse(wall_reflectance)}
+    wall = {"type": "rectangle", "width": WALL_SIZE, "height": WALL_SIZE, "bsdf": _diffuse(wall_reflectance)}
     capture = {"scan_type": scan, "sensor_grid": {"nx": n, "ny": n}, "account_first_and_last_bounces": False}
     return {
         "scene": {"relay_wall": wall, "hidden_geometry": items},

@@ -9,15 +9,19 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from nlosrender.bench.runs import Float64, LoadedScene, Timer, load
-from nlosrender.bench.scenes import BenchScene, closed_room
+from nlosrender.bench.scenes import WALL_SIZE, BenchScene, closed_room, many_lasers
 
 if TYPE_CHECKING:
+    from nlosrender.capture.plan import Plan
     from nlosrender.engine.path_engine import PathEngine
     from nlosrender.engine.virtual_lights.engine import VirtualLightEngine
 
 ROUNDS = 3
 GATHER_TARGET = 0.01
 PATHS = 1024  # per sensor point
+ROOM_POINTS = 64  # sensor points along each side: enough for regions
+LASERS = 12  # along each side, and as many sensor points
+FINENESS = 0.3
 MIXTURE = 0.5  # of BSDF and hidden geometry sampling at the wall, where one of them suffices
 
 
@@ -51,19 +55,16 @@ def measure_skips(scenes: Sequence[BenchScene]) -> list[Saving]:
         savings += _of_gather(load(scene))
         savings += _of_paths(load(scene))
     savings += _of_paths(load(closed_room(16)))
+    savings += _of_regions(load(closed_room(ROOM_POINTS)))
+    savings += _of_reciprocity(load(many_lasers(LASERS, LASERS, WALL_SIZE)))
     return savings
 
 
 def _of_gather(loaded: LoadedScene) -> Iterator[Saving]:
     """Yield what the gather leaves out: rays nothing can stop, the dark patches, colour."""
-    from nlosrender import pipeline
     from nlosrender.engine.path_engine import Budget
-    from nlosrender.engine.virtual_lights.engine import VirtualLightEngine
 
-    config = loaded.scene.config(engine="virtual_lights", split_bounces=False)
-    plan, engine = pipeline.prepare(config, loaded.backend, loaded.built, loaded.capture, loaded.time_axis)
-    if not isinstance(engine, VirtualLightEngine):
-        return
+    plan, engine = _virtual_lights(loaded)
     fineness = engine.settle(Budget(target_error=GATHER_TARGET)).fineness or 1.0
 
     def gather() -> Float64:
@@ -103,6 +104,42 @@ def _without_hull(engine: VirtualLightEngine, gather: Callable[[], Float64]) -> 
             hull.corners = corners
 
     return traced
+
+
+def _of_regions(loaded: LoadedScene) -> Iterator[Saving]:
+    """Yield what patches of their own close to the wall save the parts of the sensor grid."""
+    from nlosrender.engine.virtual_lights.tessellator import Tessellator
+    from nlosrender.engine.virtual_lights.third_bounce import ThirdBounce
+
+    plan, engine = _virtual_lights(loaded)
+    third, bin_width = engine.third, engine.tessellator.grading.bin_width
+    undivided = Tessellator(engine.built, engine.capture, bin_width, may_divide=False)
+    one = ThirdBounce(third.paths, undivided, third.settings, third.lanes)
+    ways = [lambda of=of: of.gather(plan.batches[0], FINENESS).values for of in (third, one)]
+    yield _saving("patches of other regions of the wall", loaded, *ways)
+
+
+def _of_reciprocity(loaded: LoadedScene) -> Iterator[Saving]:
+    """Yield what taking half of an exhaustive capture from the other half saves."""
+    from nlosrender.engine.virtual_lights.third_bounce import ThirdBounce
+
+    plan, engine = _virtual_lights(loaded)
+    third = engine.third
+    every = ThirdBounce(third.paths, third.tessellator, third.settings, third.lanes, is_reciprocal=False)
+    ways = [lambda of=of: of.gather(plan.batches[0], FINENESS).values for of in (third, every)]
+    yield _saving("pairs of points that reciprocity gives", loaded, *ways)
+
+
+def _virtual_lights(loaded: LoadedScene) -> tuple[Plan, VirtualLightEngine]:
+    from nlosrender import pipeline
+    from nlosrender.engine.virtual_lights.engine import VirtualLightEngine
+    from nlosrender.errors import RenderError
+
+    config = loaded.scene.config(engine="virtual_lights", split_bounces=False)
+    plan, engine = pipeline.prepare(config, loaded.backend, loaded.built, loaded.capture, loaded.time_axis)
+    if not isinstance(engine, VirtualLightEngine):
+        raise RenderError(f"{loaded.scene.name}: the virtual-light engine does not take this scene")
+    return plan, engine
 
 
 def _of_paths(loaded: LoadedScene) -> Iterator[Saving]:

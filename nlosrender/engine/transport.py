@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
@@ -57,6 +57,12 @@ class Transport:
     lasers_per_lane: int
     n_lasers: mi.UInt32  # opaque copy of ``lasers_per_lane``: its value is not part of the kernel
     bins_per_unit: mi.Float  # engine unit / bin width, opaque
+
+    def of_lanes(self, index: mi.UInt32) -> Transport:
+        """Return what the lanes at ``index`` read."""
+        sensors, first_laser = self.sensors.gather(index), dr.gather(mi.UInt32, self.first_laser, index)
+        dr.eval(sensors.interaction, sensors.delay_bins, sensors.delay_fraction, first_laser)
+        return replace(self, sensors=sensors, first_laser=first_laser)
 
 
 @dataclass(frozen=True, eq=False)

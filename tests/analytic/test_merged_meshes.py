@@ -56,12 +56,14 @@ def test_clusters_lie_where_their_members_do(tmp_path: Path, coarseness: float) 
     assert len(patches) < len(cells.sizes) / 4
     a, b, c = (patches.corners[:, k] for k in range(3))
     halves = np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, a + c - b], axis=1)])
-    total = tessellator._areas.sum()
+    total = tessellator.shared.areas.sum()
     assert patches.areas.sum() == pytest.approx(total, rel=1e-9)  # flat: one normal
     middle = np.einsum("n,nx->x", patches.areas, patches.centres)
-    assert middle == pytest.approx(np.einsum("n,nx->x", tessellator._areas, cells.corners.mean(axis=1)), rel=1e-9)
+    assert middle == pytest.approx(np.einsum("n,nx->x", tessellator.shared.areas, cells.corners.mean(axis=1)), rel=1e-9)
     found = second_moments(halves, np.tile(patches.areas / 2, 2))
-    assert found == pytest.approx(second_moments(cells.corners, tessellator._areas), rel=1e-5)  # the planes' ridge
+    assert found == pytest.approx(
+        second_moments(cells.corners, tessellator.shared.areas), rel=1e-5
+    )  # the planes' ridge
 
 
 @pytest.mark.parametrize("face_normals", [True, False])
@@ -76,12 +78,12 @@ def test_clusters_send_on_the_light_of_their_members(
     from nlosrender.engine.virtual_lights.clusters import Merger
 
     tessellator = tessellated(sheet(tmp_path, N_FINE) | {"face_normals": face_normals}, folder=tmp_path)
-    cells, normals, areas = tessellator.cells, tessellator._normals, tessellator._areas
-    assert np.allclose(cells.shading, normals, atol=1e-6) == face_normals
+    cells, normals, areas = tessellator.cells, tessellator.shared.normals, tessellator.shared.areas
+    assert np.allclose(cells.shading_normals, normals, atol=1e-6) == face_normals
     to_light = np.array([0.2, -0.1, -1.0]) / np.linalg.norm([0.2, -0.1, -1.0])
-    merger = Merger(cells, normals, areas, tessellator._allowed, 1e9 * to_light)
+    merger = Merger(cells, normals, areas, tessellator.shared.allowed, 1e9 * to_light)
     patches = merger.clusters(np.ones(len(areas), bool), 2.0)
-    expected = np.einsum("n,n,n->", areas, cells.shading @ to_light, normals @ np.array(to_sensor))
+    expected = np.einsum("n,n,n->", areas, cells.shading_normals @ to_light, normals @ np.array(to_sensor))
     found = np.einsum("n,n,n->", patches.areas, patches.normals @ to_light, patches.normals @ np.array(to_sensor))
     # 1e9 units away directions differ by 1e-9; nothing is steeper than 60 degrees to the laser. A cluster's area is no
     # more than its members', which binds where it is flat and its shading normals lie off by their float32 rounding.
@@ -93,7 +95,7 @@ def test_what_a_cluster_is_made_of_does_not_matter(tmp_path: Path) -> None:
     """Cells merged in two steps have the sums of cells merged in one, and a member of each cluster lies in it."""
     tessellator = tessellated(sheet(tmp_path, N_FINE), folder=tmp_path)
     generator = np.random.default_rng(0)
-    finest = tessellator._merger._cells
+    finest = tessellator.shared.merger._cells
     coarse = finest.merged(1.0, generator)
     twice = finest.merged(0.25, generator).merged(1.0, generator)
     assert len(twice) < 1.1 * len(coarse) < 0.1 * len(finest)
@@ -127,8 +129,8 @@ def rendered(
     result = engine.render(stage.batch, budget)
     stated = float(np.sqrt(result.variance.sum() / (result.mean**2).sum()))
     used = len(engine.tessellator.patches(budget.fineness))
-    engine.tessellator._kept_patches.cache_clear()
-    monkeypatch.setattr("nlosrender.engine.virtual_lights.tessellator.MERGED", 0.0)
+    engine.tessellator._kept.cache_clear()
+    monkeypatch.setattr("nlosrender.engine.virtual_lights.graded_cells.MERGED", 0.0)
     truth = engine.third.gather(stage.batch, min(budget.fineness, 1.0) / 2).values[0, 0, ..., :-1] * engine.paths.scale
     return result.mean[0, stage.bounces.slot(3)], stated, truth, used
 

@@ -64,8 +64,14 @@ class BlockHistogram:
             row = self._row(lane, laser, channel)
             dr.scatter_add(self.outside, mi.Float64(value[channel]), row, active, dr.ReduceMode.NoConflicts)
 
-    def on_host(self) -> NDArray[np.float64]:
-        """Return the sums over the lanes of a sensor point, (channel, 1, laser, sensor, row)."""
+    def on_host(self, *, is_symmetric: bool = False) -> NDArray[np.float64]:
+        """Return the sums over the lanes of a sensor point, (channel, 1, laser, sensor, row).
+
+        Parameters
+        ----------
+        is_symmetric
+            Whether light from laser i to sensor point j is only there for i <= j, and the same from j to i.
+        """
         shape = self.shape
         places = np.empty(shape.sensors, np.uint32)
         places[self.order] = np.arange(shape.sensors)
@@ -73,6 +79,8 @@ class BlockHistogram:
         entry, rest = index % shape.row, index // shape.row
         sensor, rest = rest % shape.sensors, rest // shape.sensors
         laser, channel = rest % shape.lasers, rest // shape.lasers
+        if is_symmetric:
+            laser, sensor = dr.minimum(laser, sensor), dr.maximum(laser, sensor)
         inside = entry < shape.n_bins
         lane = dr.gather(mi.UInt32, on_device(mi.UInt32, places), sensor)
         total = mi.Float64(0)

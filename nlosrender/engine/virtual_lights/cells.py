@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import mitsuba as mi
@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 
 from nlosrender.capture.grids import Capture, PointGrid
 from nlosrender.engine.surface_sampler import facing_triangles
-from nlosrender.scene.build import WALL_ID, BuiltScene
+from nlosrender.scene.build import BuiltScene
 from nlosrender.scene.pose import Float64
 
 NEAREST = 1e-3  # engine units: nothing is cut finer where the nearest laser or sensor point is in its plane
@@ -29,7 +29,7 @@ class Cells:
 
     corners: Float64  # (n, 3, 3) [engine units]
     weights: Float64  # (n, 3, 3) barycentric coordinates of the corners in the mesh's triangle
-    shading: Float64  # (n, 3) unit shading normal at the centre
+    shading: Float64  # (n, 3, 3) shading normals at the corners, as the mesh interpolates them
     shapes: NDArray[np.uint32]  # (n,) index into the scene's shapes
     primitives: NDArray[np.uint32]  # (n,) triangle of the mesh
     sizes: Float64  # (n,) longest edge
@@ -41,6 +41,12 @@ class Cells:
             return self
         return Cells(*(values[chosen] for values in self._arrays()))
 
+    @property
+    def shading_normals(self) -> Float64:
+        """Unit shading normals (n, 3) at the middles."""
+        normals = middles(self.shading)
+        return normals / np.maximum(np.linalg.norm(normals, axis=1), 1e-300)[:, None]
+
     @classmethod
     def joined(cls, parts: list[Cells]) -> Cells:
         """Return the cells of all parts."""
@@ -48,7 +54,7 @@ class Cells:
             return parts[0]
         if not parts:
             none, index = np.zeros((0, 3, 3)), np.zeros(0, np.uint32)
-            return cls(none, none, np.zeros((0, 3)), index, index, np.zeros(0), np.zeros(0))
+            return cls(none, none, none, index, index, np.zeros(0), np.zeros(0))
         return cls(*(np.concatenate(values) for values in zip(*(part._arrays() for part in parts), strict=True)))
 
     def _arrays(self) -> tuple[NDArray, ...]:
@@ -139,42 +145,68 @@ class WallDistance:
         return distances[np.arange(len(points)), apart.argmax(axis=1)]
 
 
-def cells_of_mesh(built: BuiltScene, index: int, mesh: mi.Mesh, distance: WallDistance) -> Cells:
-    """Quarter the triangles of shape ``index`` until none is longer than its distance from the nearest point.
-
-    The points lie on those of the wall: there only points in the planes of other triangles count.
-    """
-    is_wall = mesh.id() == WALL_ID
+def triangles_of_mesh(built: BuiltScene, index: int, mesh: mi.Mesh) -> Cells:
+    """Return the triangles of shape ``index`` that the wall may see lit, one cell each, at no distance yet."""
     corners, primitives = facing_triangles(built, mesh)
+    count = len(corners)
     weights = np.broadcast_to(np.eye(3), corners.shape)
+    shapes = np.full(count, index, np.uint32)
+    shading = _shading_normals(mesh, corners, primitives)
+    return Cells(corners, weights, shading, shapes, primitives, longest_edges(corners), np.zeros(count))
+
+
+def quartered(cells: Cells, distance: WallDistance, wall_index: int | None, least: float = 0.0) -> Cells:
+    """Quarter cells until none is longer than its distance from the nearest point.
+
+    Parameters
+    ----------
+    cells
+        Triangles or parts of them; their distances are not looked at.
+    distance
+        Tells them.
+    wall_index
+        Of the wall among the scene's shapes. The points lie on those of the wall: there only points in the planes of
+        other triangles count.
+    least
+        No cell is quartered that is not longer than this [engine units].
+    """
     done: list[Cells] = []
-    while len(corners):
-        sizes, centres = longest_edges(corners), middles(corners)
-        if is_wall:
-            distances = np.maximum(distance.out_of_plane(centres), NEAREST)
-        else:
-            distances = distance(centres)
-            close = distances < NEAREST
-            distances[close] = distance.of_planes(centres[close], normals_and_areas(corners[close])[0])
-        large = sizes > distances
-        shading = _shading_normals(mesh, corners, weights, primitives)
-        shapes = np.full(len(corners), index, np.uint32)
-        small = Cells(corners, weights, shading, shapes, primitives, sizes, distances)
-        done.append(small.at(~large))
-        corners, weights = _quartered(corners[large]), _quartered(weights[large])
-        primitives = np.tile(primitives[large], 4)
+    while len(cells.sizes):
+        distances = _distances(cells, distance, wall_index)
+        large = cells.sizes > np.maximum(distances, least)
+        done.append(replace(cells, distances=distances).at(~large))
+        corners = _quartered(cells.corners[large])
+        cells = Cells(
+            corners,
+            _quartered(cells.weights[large]),
+            _quartered(cells.shading[large]),
+            np.tile(cells.shapes[large], 4),
+            np.tile(cells.primitives[large], 4),
+            longest_edges(corners),
+            np.zeros(len(corners)),
+        )
     return Cells.joined(done)
 
 
-def _shading_normals(mesh: mi.Mesh, corners: Float64, weights: Float64, primitives: NDArray[np.uint32]) -> Float64:
-    """Return the unit shading normals (n, 3) at the centres of parts of a mesh's triangles."""
+def _shading_normals(mesh: mi.Mesh, corners: Float64, primitives: NDArray[np.uint32]) -> Float64:
+    """Return the shading normals (n, 3, 3) at the corners of a mesh's triangles."""
     if not mesh.has_vertex_normals():
-        return normals_and_areas(corners)[0]
+        return np.repeat(normals_and_areas(corners)[0][:, None], 3, axis=1)
     parameters = mi.traverse(mesh)
     at_vertices = np.asarray(parameters["vertex_normals"], dtype=np.float64).reshape(-1, 3)
-    at_corners = at_vertices[np.asarray(parameters["faces"]).reshape(-1, 3)[primitives]]
-    normals = np.einsum("nk,nkx->nx", middles(weights), at_corners)
-    return normals / np.maximum(np.linalg.norm(normals, axis=1), 1e-300)[:, None]
+    return at_vertices[np.asarray(parameters["faces"]).reshape(-1, 3)[primitives]]
+
+
+def _distances(cells: Cells, distance: WallDistance, wall_index: int | None) -> Float64:
+    centres = middles(cells.corners)
+    distances = np.empty(len(centres))
+    on_wall = cells.shapes == (-1 if wall_index is None else wall_index)
+    distances[on_wall] = np.maximum(distance.out_of_plane(centres[on_wall]), NEAREST)
+    hidden = np.flatnonzero(~on_wall)
+    distances[hidden] = distance(centres[hidden])
+    close = hidden[distances[hidden] < NEAREST]
+    distances[close] = distance.of_planes(centres[close], normals_and_areas(cells.corners[close])[0])
+    return distances
 
 
 def normals_and_areas(triangles: Float64) -> tuple[Float64, Float64]:

@@ -22,6 +22,7 @@ from nlosrender.engine.sampling import DEFAULT_TARGET, Budget, Progress
 from nlosrender.engine.virtual_lights.further_bounces import FurtherBounces, rounds_needed
 from nlosrender.engine.virtual_lights.lights import GatherSettings
 from nlosrender.engine.virtual_lights.occlusion import nothing_occludes
+from nlosrender.engine.virtual_lights.reciprocity import is_reciprocal
 from nlosrender.engine.virtual_lights.tessellator import Tessellator, wall_sees_itself
 from nlosrender.engine.virtual_lights.third_bounce import (
     FIRST_COARSENESS,
@@ -68,7 +69,9 @@ class VirtualLightEngine:
             is_diffuse=all(is_lambertian(shape.bsdf()) for shape in shapes),
             needs_visibility=not nothing_occludes(built),
         )
-        self.third = ThirdBounce(self.paths, self.tessellator, self.settings, lanes)
+        all_lambertian = self.settings.is_diffuse and is_lambertian(built.wall_shape.bsdf())
+        reciprocal = is_reciprocal(built, capture, is_lambertian=all_lambertian)
+        self.third = ThirdBounce(self.paths, self.tessellator, self.settings, lanes, reciprocal)
         self.further: FurtherBounces | None = None  # else the path engine
         if self.has_further_bounces and self.settings.is_diffuse:
             self.further = FurtherBounces(self.paths, self.tessellator, self.settings.needs_visibility)

@@ -24,23 +24,32 @@ def gather_third_bounce(
     transport: Transport,
     lights: Lights,
     histogram: BlockHistogram,
-    slice_of_lane: mi.UInt32,
+    lane: mi.UInt32,
+    part: mi.UInt32,
 ) -> None:
-    """Deposit the third bounce: lane by lane over the patches of its slice.
+    """Deposit the third bounce: lane by lane over the patches of its part.
 
     Several lanes may share the patches of one sensor point, each into rows of its own.
+
+    Parameters
+    ----------
+    settings, transport, lights
+        What is gathered, and by whom.
+    histogram, lane
+        Where to, and the row of each lane of ``transport``.
+    part
+        The part of ``lights`` that each lane gathers.
     """
     built, sensors = transport.built, transport.sensors
     sensor, wall_bsdf = sensors.interaction, built.wall_bsdf
     context = mi.BSDFContext()
-    lane = dr.arange(mi.UInt32, dr.width(sensors.delay_bins))
     n_lasers, count = transport.n_lasers, lights.count
     own_laser = transport.lasers.gather(transport.first_laser)
 
-    end = dr.gather(mi.UInt32, lights.first, slice_of_lane + 1)
+    end = dr.gather(mi.UInt32, lights.first, part + 1)
 
     # ---- State ---------------------------------------------------------------------------------------------------
-    patch = dr.gather(mi.UInt32, lights.first, slice_of_lane)
+    patch = dr.gather(mi.UInt32, lights.first, part)
 
     while dr.hint(
         patch < end,

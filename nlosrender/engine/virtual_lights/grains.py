@@ -61,7 +61,7 @@ class Grains:
         scales = np.floor(np.log2(allowed)).astype(np.int64)
         upright = np.abs(normals).argmax(axis=1)
         along = normals[rows, upright]
-        light = (areas[:, None, None] * normals[:, :, None] * cells.shading[:, None, :]).reshape(-1, 9)
+        light = (areas[:, None, None] * normals[:, :, None] * cells.shading_normals[:, None, :]).reshape(-1, 9)
         return cls(
             cells.shapes,
             scales,

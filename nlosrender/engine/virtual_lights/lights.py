@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import drjit as dr
@@ -35,9 +36,37 @@ class GatherSettings:
 
 
 @dataclass(frozen=True, eq=False)
+class Parts:
+    """Parts of the patches, each gathered by lanes of its own: slices of those of a region, or of all.
+
+    A patch's number within its region decides its slice, so what one laser sends does not depend on the batch's other
+    lasers, whose patches may be others.
+    """
+
+    regions: NDArray[np.int64]  # (n,) region of each patch, ascending
+    numbers: NDArray[np.int64]  # (n,) of each patch within its region
+    slices: int  # lanes that share the patches of a sensor point
+
+    @classmethod
+    def of(cls, counts: Sequence[int], slices: int) -> Parts:
+        """Return the parts of ``counts`` patches per region, region after region."""
+        regions = np.repeat(np.arange(len(counts)), counts)
+        return cls(regions, np.concatenate([np.arange(count) for count in counts]), slices)
+
+    def sorted(self, patch: NDArray[np.integer]) -> tuple[NDArray[np.integer], NDArray[np.integer]]:
+        """Sort patches by part, within it by number; return them and where each part begins, and the last one ends."""
+        part = (self.regions * self.slices + self.numbers % self.slices)[patch]
+        order = np.lexsort((patch, part))
+        n_parts = (int(self.regions[-1]) + 1) * self.slices
+        return patch[order], np.searchsorted(part[order], np.arange(n_parts + 1))
+
+
+@dataclass(frozen=True, eq=False)
 class DevicePatches:
     """Patches on the device, engine units; one lane per patch."""
 
+    parts: Parts
+    number: mi.UInt32  # within its region: what decides the points its light is asked for
     remainder: mi.Vector3f  # of the centre, what float32 rounds off: close to the wall it is more than the distance
     is_near: bool  # some patch is so near to a laser or sensor point that the remainder counts
     corners: list[mi.Vector3f]  # three, from the centre
@@ -67,16 +96,20 @@ class Lights:
     delays: mi.Float  # four an index: from the laser point to each corner [bins]
     has_clusters: bool
     count: mi.UInt32  # of lit patches, opaque
-    first: mi.UInt32  # of slice k: its patches are first[k] to first[k + 1]
+    first: mi.UInt32  # of part k: its patches are first[k] to first[k + 1]
 
 
-def upload_patches(built: BuiltScene, patches: Patches, hull: HiddenHull, seed: int, is_near: bool) -> DevicePatches:
+def upload_patches(
+    built: BuiltScene, patches: Patches, parts: Parts, hull: HiddenHull, seed: int, is_near: bool
+) -> DevicePatches:
     """Bring patches to the device, neighbours together, and evaluate their reflectance and shading frames.
 
     Parameters
     ----------
     built, patches
-        The scene and what it was cut into.
+        The scene and what it was cut into, region after region.
+    parts
+        Region of each patch, and its number there.
     hull
         Tells which patches the whole wall sees.
     seed
@@ -85,7 +118,7 @@ def upload_patches(built: BuiltScene, patches: Patches, hull: HiddenHull, seed: 
     is_near
         Whether some patch is so near to a laser or sensor point that float32 positions do not do.
     """
-    patches = patches.at(np.argsort(z_order(patches.centres), kind="stable"))
+    patches = patches.at(np.lexsort((z_order(patches.centres), parts.regions)))
     interaction = surface_at(
         built, patches.centres, patches.normals, patches.shapes, patches.primitives, patches.barycentric
     )
@@ -101,7 +134,7 @@ def upload_patches(built: BuiltScene, patches: Patches, hull: HiddenHull, seed: 
     # a cluster's members have normals of their own: it is lit and seen by their mean
     frame, own = interaction.sh_frame, mi.Frame3f(mi.Normal3f(interaction.n))
     interaction.sh_frame = dr.select(members.w > 0, own, frame)
-    number, steps = dr.arange(mi.UInt32, len(patches)), recurrence_steps(2)
+    number, steps = on_device(mi.UInt32, parts.numbers), recurrence_steps(2)
     start_u, start_v = mi.sample_tea_32(mi.UInt32(seed), mi.UInt32(0))
     u, v = (
         mi.Float((start + number * step) >> 8) * 2.0**-24 for start, step in zip((start_u, start_v), steps, strict=True)
@@ -111,7 +144,19 @@ def upload_patches(built: BuiltScene, patches: Patches, hull: HiddenHull, seed: 
     dr.eval(interaction, reflectance, remainder, corners, areas, lift, members, shown, is_open)
     has_clusters = bool(patches.is_cluster.any())
     return DevicePatches(
-        remainder, is_near, corners, lift, members, has_clusters, areas, interaction, reflectance, shown, is_open
+        parts,
+        number,
+        remainder,
+        is_near,
+        corners,
+        lift,
+        members,
+        has_clusters,
+        areas,
+        interaction,
+        reflectance,
+        shown,
+        is_open,
     )
 
 
@@ -157,9 +202,7 @@ def normal_reflectance(interaction: mi.SurfaceInteraction3f) -> mi.Spectrum:
     return interaction.bsdf().eval(mi.BSDFContext(), interaction, up) * dr.pi
 
 
-def light_patches(
-    settings: GatherSettings, transport: Transport, patches: DevicePatches, n_lasers: int, slices: int
-) -> Lights:
+def light_patches(settings: GatherSettings, transport: Transport, patches: DevicePatches, n_lasers: int) -> Lights:
     """Return the patches that some laser of the batch lights; confocal captures keep all and light them as they go.
 
     Parameters
@@ -170,9 +213,6 @@ def light_patches(
         All patches of a resolution.
     n_lasers
         Lasers of the batch.
-    slices
-        Lanes that share the patches of a sensor point. A patch's number decides its slice, so what one laser sends
-        does not depend on the batch's other lasers, whose patches may be others.
     """
     count = dr.width(patches.areas)
     lit = dr.arange(mi.UInt32, count)
@@ -182,7 +222,7 @@ def light_patches(
         lit = dr.compress(brightest > 0)
         if not dr.width(lit):
             lit = mi.UInt32(0)  # all is dark: one dark patch, since arrays of no length cannot be read
-    lit, first = _by_slice(lit, slices)
+    lit, first = (on_device(mi.UInt32, values) for values in patches.parts.sorted(np.array(lit.numpy())))
     if not settings.is_confocal:
         index = dr.arange(mi.UInt32, dr.width(lit) * n_lasers)
         n_lit = dr.opaque(mi.UInt32, dr.width(lit))  # as a constant it would be part of the kernel
@@ -223,14 +263,6 @@ def light_patches(
     )
 
 
-def _by_slice(numbers: mi.UInt32, slices: int) -> tuple[mi.UInt32, mi.UInt32]:
-    """Sort patches by slice, within it by number; return them and where each slice begins."""
-    patch = np.array(numbers.numpy())
-    order = np.lexsort((patch, patch % slices))
-    first = np.searchsorted((patch % slices)[order], np.arange(slices + 1))
-    return on_device(mi.UInt32, patch[order]), on_device(mi.UInt32, first)
-
-
 def _illuminate(
     settings: GatherSettings, transport: Transport, patches: DevicePatches, n_lasers: int
 ) -> tuple[mi.Spectrum, mi.Float]:
@@ -267,9 +299,9 @@ def _illuminate(
     seen = mi.Float(1)
     if settings.needs_visibility:
         seen = mi.Float(0)
-        steps = recurrence_steps(2)
+        first = dr.gather(mi.UInt32, patches.number, patch) * LASER_RAYS
         for k in range(LASER_RAYS):
-            u, v = _fraction(patch * LASER_RAYS + k, steps[0]), _fraction(patch * LASER_RAYS + k, steps[1])
+            u, v = (_fraction(first + k, step) for step in recurrence_steps(2))
             in_patch = dr.select(member.w > 0, member.xyz, point_inside(corners, u, v) + lift)
             seen += dr.select(is_visible(built, lit, to_patch + in_patch, active), 1.0 / LASER_RAYS, 0)
     arriving = dr.select(active, arriving * seen, 0)

@@ -19,7 +19,14 @@ from nlosrender.engine.space_filling import z_order
 from nlosrender.engine.transport import Transport
 from nlosrender.engine.virtual_lights.block_histogram import BlockHistogram
 from nlosrender.engine.virtual_lights.gather import gather_third_bounce
-from nlosrender.engine.virtual_lights.lights import ROWS, GatherSettings, Lights, light_patches, upload_patches
+from nlosrender.engine.virtual_lights.lights import (
+    ROWS,
+    GatherSettings,
+    Lights,
+    Parts,
+    light_patches,
+    upload_patches,
+)
 from nlosrender.engine.virtual_lights.occlusion import HiddenHull
 from nlosrender.engine.virtual_lights.patches import Patches
 from nlosrender.engine.virtual_lights.tessellator import MAX_PATCHES, Tessellator
@@ -58,6 +65,17 @@ class LitPatches:
     is_open: NDArray[np.bool_]  # (n,) whether nothing can stop these rays
 
 
+@dataclass(frozen=True, eq=False)
+class _Lanes:
+    """One lane per sensor point and replica, neighbours together."""
+
+    transport: Transport  # what they read
+    index: mi.UInt32
+    replica: mi.UInt32
+    order: NDArray[np.int64]  # (sensors,) the sensor point of each lane of a replica, numbered as in the batch
+    regions: NDArray[np.int64]  # (lanes,)
+
+
 class ThirdBounce:
     """Gathers the third bounce.
 
@@ -71,41 +89,63 @@ class ThirdBounce:
         What the gather's kernel does.
     lanes
         Lanes that keep the backend busy.
+    is_reciprocal
+        Whether exchanging laser and sensor point changes nothing, see ``reciprocity.is_reciprocal``: then only half
+        of the pairs of a batch with the same laser and sensor points are gathered.
     """
 
-    def __init__(self, paths: PathEngine, tessellator: Tessellator, settings: GatherSettings, lanes: int):
+    def __init__(
+        self,
+        paths: PathEngine,
+        tessellator: Tessellator,
+        settings: GatherSettings,
+        lanes: int,
+        is_reciprocal: bool = False,
+    ):
         self.paths, self.tessellator, self.settings, self.lanes = paths, tessellator, settings, lanes
+        self.is_reciprocal = is_reciprocal
         self.hull = HiddenHull(paths.built)
 
     def gather(self, batch: Batch | Pilot, coarseness: float) -> Gathered:
-        """Gather a batch at one resolution."""
+        """Gather a batch at one resolution: what all its sensor points share, then what regions have of their own."""
         shape = self.shape(batch)
+        lanes = self._lanes(batch, shape)
+        histogram = BlockHistogram(shape, lanes.order)
         patches = self.tessellator.patches(coarseness)
-        if not len(patches):  # nothing faces the wall
-            return Gathered(
-                np.zeros((shape.channels, shape.slots, shape.lasers, shape.sensors, shape.row)), 1, coarseness, 0.0
-            )
-        transport, slice_of_lane, order = self._transport(batch, shape)
-        histogram = BlockHistogram(shape, order)
-        lights = self._lights(transport, shape, patches)
-        gather_third_bounce(self.settings, transport, lights, histogram, slice_of_lane)
-        merged = float(patches.areas[patches.is_cluster].sum() / patches.areas.sum())
-        return Gathered(histogram.on_host(), len(patches), coarseness, merged)
+        if len(patches):
+            lights = self._lights(lanes.transport, shape, patches, Parts.of([len(patches)], shape.replicas))
+            gather_third_bounce(self.settings, lanes.transport, lights, histogram, lanes.index, lanes.replica)
+        for labels, near in self.tessellator.regional_patches(coarseness, np.unique(lanes.regions).tolist()):
+            parts = Parts.of([len(one) for one in near], shape.replicas)
+            if not len(parts.numbers):  # nothing is close to the wall there
+                continue
+            chosen = np.flatnonzero(np.isin(lanes.regions, labels))
+            part = np.searchsorted(labels, lanes.regions[chosen]) * shape.replicas + chosen // shape.sensors
+            index = on_device(mi.UInt32, chosen)
+            some = lanes.transport.of_lanes(index)
+            lights = self._lights(some, shape, Patches.joined(near), parts)
+            gather_third_bounce(self.settings, some, lights, histogram, index, on_device(mi.UInt32, part))
+        # of the shared ones: how a capture is cut must not show in the error it states
+        merged = float(patches.areas[patches.is_cluster].sum() / max(patches.areas.sum(), 1e-300))
+        count = len(patches) if self.tessellator.regions is None else self.tessellator.count(coarseness)
+        values = histogram.on_host(is_symmetric=self._is_symmetric(batch))
+        return Gathered(values, max(count, 1), coarseness, merged)  # 1: nothing may face the wall
 
     def lit_patches(self, batch: Batch | Pilot, coarseness: float) -> LitPatches:
-        """Return the patches that the gather of a batch goes through, in its order."""
+        """Return the patches that the gather of a batch goes through, in its order; those all sensor points share."""
         shape = self.shape(batch)
-        transport, _, _ = self._transport(batch, shape)
-        lights = self._lights(transport, shape, self.tessellator.patches(coarseness))
+        transport = self._lanes(batch, shape).transport
+        patches = self.tessellator.patches(coarseness)
+        lights = self._lights(transport, shape, patches, Parts.of([len(patches)], shape.replicas))
         rows = np.array(lights.packed, np.float64).reshape(-1, ROWS, 4)
         centre, shown = rows[:, ROWS - 2], rows[:, ROWS - 1]
         normals = np.array(lights.interaction.n, np.float64).T
         return LitPatches(centre[:, :3] + shown[:, :3], normals, shown[:, 3] > 0)
 
-    def _lights(self, transport: Transport, shape: HistogramShape, patches: Patches) -> Lights:
+    def _lights(self, transport: Transport, shape: HistogramShape, patches: Patches, parts: Parts) -> Lights:
         is_near = self.tessellator.nearest < NEAR
-        on_device = upload_patches(self.paths.built, patches, self.hull, self.paths.options.seed, is_near)
-        return light_patches(self.settings, transport, on_device, shape.lasers, shape.replicas)
+        on_device = upload_patches(self.paths.built, patches, parts, self.hull, self.paths.options.seed, is_near)
+        return light_patches(self.settings, transport, on_device, shape.lasers)
 
     def pair(self, batch: Batch | Pilot, fineness: float) -> tuple[Gathered, Gathered]:
         """Gather a batch at ``fineness`` and at the coarser resolution it is compared with."""
@@ -166,17 +206,24 @@ class ThirdBounce:
         points = self.paths.capture.n_sensors if isinstance(batch, Batch) else batch.sensors.size
         return replace(self.paths.shape(batch, 1), replicas=max(1, min(math.ceil(self.lanes / points), most)))
 
-    def _transport(self, batch: Batch | Pilot, shape: HistogramShape) -> tuple[Transport, mi.UInt32, NDArray[np.int64]]:
-        """Return what the lanes read, each lane's slice, and the order of the sensor points: neighbours together."""
+    def _is_symmetric(self, batch: Batch | Pilot) -> bool:
+        """Return whether H of a batch is the same with lasers and sensor points exchanged."""
+        return self.is_reciprocal and np.array_equal(self.paths.sensor_indices(batch), self.paths.laser_indices(batch))
+
+    def _lanes(self, batch: Batch | Pilot, shape: HistogramShape) -> _Lanes:
         transport = self.paths.transport(batch, replace(shape, replicas=1))
-        points = self.paths.capture.sensor_grid.positions.reshape(-1, 3)[self.paths.sensor_indices(batch)]
-        order = np.argsort(z_order(points), kind="stable")
+        indices = self.paths.sensor_indices(batch)
+        order = np.argsort(z_order(self.paths.capture.sensor_grid.positions.reshape(-1, 3)[indices]), kind="stable")
         lane = dr.arange(mi.UInt32, shape.lanes)
-        sensor = dr.gather(mi.UInt32, on_device(mi.UInt32, order), lane % shape.sensors)
-        sensors, first_laser = transport.sensors.gather(sensor), dr.gather(mi.UInt32, transport.first_laser, sensor)
-        slice_of_lane = lane // shape.sensors
-        dr.eval(sensors.interaction, sensors.delay_bins, sensors.delay_fraction, first_laser, slice_of_lane)
-        return replace(transport, sensors=sensors, first_laser=first_laser), slice_of_lane, order
+        transport = transport.of_lanes(dr.gather(mi.UInt32, on_device(mi.UInt32, order), lane % shape.sensors))
+        replica = lane // shape.sensors
+        dr.eval(lane, replica)
+        if self._is_symmetric(batch):  # sensor point j has lasers up to j
+            transport = replace(transport, n_lasers=on_device(mi.UInt32, np.tile(order + 1, shape.replicas)))
+        regions = np.zeros(shape.lanes, np.int64)
+        if self.tessellator.regions is not None:
+            regions = np.tile(self.tessellator.regions.labels[indices][order], shape.replicas)
+        return _Lanes(transport, lane, replica, order, regions)
 
 
 def _last_at_most(tried: list[tuple[Gathered, float]], n_patches: float) -> int:

@@ -1,0 +1,31 @@
+"""Whether light takes as much energy from a laser point to a sensor point as the other way."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from nlosrender.capture.grids import Capture
+from nlosrender.scene.build import BuiltScene
+
+
+def is_reciprocal(built: BuiltScene, capture: Capture, *, is_lambertian: bool) -> bool:
+    """Return whether H(l, s) = H(s, l) in an exhaustive capture, so that half of it says all.
+
+    The grids have to be the same, and so have the legs; a Lambertian surface looks the same from both sides as long as
+    its shading normals are its own: interpolated ones are used towards the lasers only.
+
+    Parameters
+    ----------
+    built, capture
+        The scene and its points.
+    is_lambertian
+        Whether wall and hidden surfaces are.
+    """
+    if capture.scan_type != "exhaustive" or not is_lambertian:
+        return False
+    if not np.array_equal(capture.laser_grid.positions, capture.sensor_grid.positions):
+        return False
+    if not np.array_equal(capture.laser_legs, capture.sensor_legs):
+        return False
+    shapes = built.hidden_shapes if built.wall.is_planar else built.scene.shapes()
+    return not any(shape.is_mesh() and shape.has_vertex_normals() for shape in shapes)

@@ -1,0 +1,147 @@
+"""Regions of the sensor grid: patches of their own close to the wall change what a capture costs, not what it says."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from rendering import configured, flat_wall
+
+from nlosrender import pipeline
+from nlosrender.capture.plan import Batch, Tile
+from nlosrender.engine.backend import start_backend
+
+ROOM = {"type": "room", "size": [2.0, 1.6, 1.2], "bsdf": {"type": "diffuse", "reflectance": 0.5}}
+PLATE = {"type": "rectangle", "width": 0.8, "height": 0.6, "center": [0, 0, 1.0], "normal": [0, 0, -1]}
+TOUCHING = PLATE | {"center": [0.2, 0.1, 0.3], "normal": [1, 0, 0]}  # its edge lies on the wall
+SENSORS = (26, 22)
+
+
+def engine_of(*hidden: dict, scan: str = "single", sensors: tuple[int, int] = SENSORS, **more):
+    """Return the virtual-light engine of a scene."""
+    config = configured(flat_wall(*hidden, scan=scan, sensors=sensors, engine="virtual_lights", spp=None, **more))
+    backend = start_backend("llvm")
+    built = pipeline.load_scene(config)
+    capture, time_axis = pipeline.describe_capture(config, built.wall, built)
+    return pipeline.prepare(config, backend, built, capture, time_axis)[1]
+
+
+@pytest.fixture
+def eager(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Make regions of few sensor points, at no price: a test has no time for grids where they pay."""
+    start_backend("llvm")
+    from nlosrender.engine.virtual_lights import regions
+
+    monkeypatch.setattr(regions, "LEAST_POINTS", 16)
+    monkeypatch.setattr(regions, "POINTS_PER_PATCH", 1)
+
+
+@pytest.fixture
+def undivided(monkeypatch: pytest.MonkeyPatch):
+    """Return a function that makes an engine as ``engine_of``, without regions."""
+    start_backend("llvm")
+    from nlosrender.engine.virtual_lights import tessellator
+
+    def make(*hidden: dict, **more):
+        with monkeypatch.context() as patch:
+            patch.setattr(tessellator, "regions_of", lambda *arguments: None)
+            engine = engine_of(*hidden, **more)
+        assert engine.tessellator.regions is None
+        return engine
+
+    return make
+
+
+def whole(engine) -> Batch:
+    """Return a batch of all sensor points of an engine's capture."""
+    grid = engine.capture.sensor_grid
+    tile = Tile(0, grid.ny, 0, grid.nx)
+    return Batch(tile, tile if engine.capture.scan_type == "confocal" else Tile(0, 1, 0, 1))
+
+
+@pytest.mark.usefixtures("eager")
+@pytest.mark.parametrize("scan", ["single", "confocal"])
+@pytest.mark.parametrize("hidden", [(ROOM,), (ROOM, TOUCHING)], ids=["room", "room and plate"])
+def test_regions_agree_with_one_set_of_patches(undivided, hidden: tuple[dict, ...], scan: str) -> None:
+    """Both err by what they state; together by no more than the root of the sum of the squares, times two.
+
+    Two is what a stated error is held to. Light is not lost: the energies, whose errors of patches here and there
+    cancel, agree within a tenth of that.
+    """
+    from nlosrender.engine.virtual_lights.third_bounce import estimated_error
+
+    divided, one = engine_of(*hidden, scan=scan), undivided(*hidden, scan=scan)
+    assert divided.tessellator.regions is not None
+    assert divided.tessellator.count(0.5) < 0.5 * one.tessellator.count(0.5)
+    pairs = [engine.third.pair(whole(engine), 0.5) for engine in (divided, one)]
+    stated = np.hypot(*(estimated_error(coarse, fine) for coarse, fine in pairs))
+    values, reference = (fine.values[..., :-1] for _, fine in pairs)
+    assert stated < 0.1
+    assert np.linalg.norm(values - reference) < 2 * stated * np.linalg.norm(reference)
+    assert values.sum() == pytest.approx(reference.sum(), rel=0.2 * stated)
+
+
+@pytest.mark.usefixtures("eager")
+def test_every_region_covers_every_surface_once() -> None:
+    """Shared patches and those of a region add up to the areas of all surfaces, whatever the resolution."""
+    engine = engine_of(ROOM)
+    area = (2 * 2.0 * 1.2 + 2 * 1.6 * 1.2 + 2.0 * 1.6) / engine.built.unit**2
+    count = len(engine.tessellator.regions.near)
+    for coarseness in (1.0, 0.4):
+        shared = engine.tessellator.patches(coarseness)
+        found = [
+            shared.areas.sum() + patches.areas.sum()
+            for _, near in engine.tessellator.regional_patches(coarseness, range(count))
+            for patches in near
+        ]
+        assert len(found) == count > 1
+        assert found == pytest.approx([area] * len(found), rel=1e-6)
+
+
+@pytest.mark.usefixtures("eager")
+def test_cells_are_no_longer_than_their_distance_from_the_region() -> None:
+    """What a region sees is cut as finely as its own sensor points need, and no finer than its neighbour needs."""
+    engine = engine_of(ROOM)
+    grid, unit = engine.capture.sensor_grid, engine.built.unit
+    regions = engine.tessellator.regions
+    points = grid.positions.reshape(-1, 3) / unit
+    laser = engine.capture.laser_grid.positions.reshape(-1, 3) / unit
+    for label, near in enumerate(regions.near):
+        own = np.concatenate([points[regions.labels == label], laser])
+        for cells in (near.cells, regions.shared.cells):
+            centres = cells.corners.mean(axis=1)
+            distances = np.linalg.norm(centres[:, None] - own, axis=2).min(axis=1)
+            assert (cells.sizes <= np.maximum(distances, 1e-3) * (1 + 1e-6)).all()
+
+
+@pytest.mark.usefixtures("eager")
+def test_a_batch_says_what_the_whole_capture_says() -> None:
+    """Regions belong to the capture: a part of its sensor points gathers the same bits alone."""
+    engine = engine_of(ROOM)
+    part = Batch(Tile(3, 17, 5, 22), Tile(0, 1, 0, 1))
+    all_values = engine.third.gather(whole(engine), 0.6).values
+    columns = engine.capture.sensor_grid.nx
+    chosen = part.sensors.flat_indices(columns)
+    np.testing.assert_array_equal(engine.third.gather(part, 0.6).values, all_values[..., chosen, :])
+    assert all_values.any()
+
+
+@pytest.mark.usefixtures("eager")
+@pytest.mark.parametrize(
+    ("hidden", "scan", "sensors"),
+    [
+        pytest.param((PLATE,), "single", SENSORS, id="far from the wall"),
+        pytest.param((ROOM,), "exhaustive", SENSORS, id="laser points all over the wall"),
+        pytest.param((ROOM,), "single", (7, 8), id="few sensor points"),
+    ],
+)
+def test_one_set_of_patches_where_regions_save_nothing(
+    hidden: tuple[dict, ...], scan: str, sensors: tuple[int, int]
+) -> None:
+    """Regions cost patches: there are none where a set for all does as well."""
+    assert engine_of(*hidden, scan=scan, sensors=sensors).tessellator.regions is None
+
+
+def test_regions_have_a_price() -> None:
+    """Cutting and lighting patches for every region costs more than it saves where few sensor points gather them."""
+    assert engine_of(ROOM, sensors=(18, 16)).tessellator.regions is None
+    assert engine_of(ROOM, sensors=(64, 64)).tessellator.regions is not None
