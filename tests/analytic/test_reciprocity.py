@@ -82,6 +82,28 @@ def test_all_pairs_where_the_halves_may_differ(tmp_path: Path, hidden: dict, mor
     assert not engine.third.is_reciprocal
 
 
+@pytest.mark.parametrize("hidden", [(PLATE,), (PLATE, BEFORE)], ids=["plate", "one before the other"])
+def test_how_a_capture_is_cut_does_not_show(hidden: tuple[dict, ...]) -> None:
+    """Batches of some lasers, or some sensor points, have the same bits as the whole capture, in either half."""
+    from nlosrender.capture.plan import Batch, Tile
+
+    engine, whole = engine_of(*hidden)
+    values = engine.third.gather(whole, 0.3).values
+    for sensors, lasers in ((Tile(0, 3, 0, 5), Tile(1, 2, 2, 4)), (Tile(0, 2, 0, 3), Tile(1, 3, 1, 5))):
+        part = engine.third.gather(Batch(sensors, lasers), 0.3).values
+        expected = values[:, :, lasers.flat_indices(5)][:, :, :, sensors.flat_indices(5)]
+        assert expected.any()
+        np.testing.assert_array_equal(part, expected)
+
+
+def test_large_captures_gather_all_pairs(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Captures of many batches would gain nothing: each has few of the other halves of its pairs."""
+    start_backend("llvm")
+    monkeypatch.setattr("nlosrender.engine.virtual_lights.reciprocity.MOST_SUMS", 15 * 15 * 300 - 1)
+    engine, _ = engine_of(PLATE)
+    assert not engine.third.is_reciprocal
+
+
 def test_legs_that_are_the_same_may_count() -> None:
     """A laser beside the sensor has the same legs to the same points."""
     place = {"laser_position": [0.2, 0, 1], "sensor_position": [0.2, 0, 1]}

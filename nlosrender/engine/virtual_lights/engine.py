@@ -70,7 +70,7 @@ class VirtualLightEngine:
             needs_visibility=not nothing_occludes(built),
         )
         all_lambertian = self.settings.is_diffuse and is_lambertian(built.wall_shape.bsdf())
-        reciprocal = is_reciprocal(built, capture, is_lambertian=all_lambertian)
+        reciprocal = is_reciprocal(built, capture, time_axis.n_bins, is_lambertian=all_lambertian)
         self.third = ThirdBounce(self.paths, self.tessellator, self.settings, lanes, reciprocal)
         self.further: FurtherBounces | None = None  # else the path engine
         if self.has_further_bounces and self.settings.is_diffuse:

@@ -90,8 +90,8 @@ class ThirdBounce:
     lanes
         Lanes that keep the backend busy.
     is_reciprocal
-        Whether exchanging laser and sensor point changes nothing, see ``reciprocity.is_reciprocal``: then only half
-        of the pairs of a batch with the same laser and sensor points are gathered.
+        Whether exchanging laser and sensor point changes nothing, see ``reciprocity.is_reciprocal``: then no two
+        points are gathered from twice in one batch.
     """
 
     def __init__(
@@ -107,9 +107,39 @@ class ThirdBounce:
         self.hull = HiddenHull(paths.built)
 
     def gather(self, batch: Batch | Pilot, coarseness: float) -> Gathered:
-        """Gather a batch at one resolution: what all its sensor points share, then what regions have of their own."""
+        """Gather a batch at one resolution."""
+        if self.is_reciprocal and isinstance(batch, Batch):
+            values = self._by_reciprocity(batch, coarseness)
+        else:
+            values = self._sums(batch, coarseness).on_host()
+        patches = self.tessellator.patches(coarseness)
+        # of the shared ones: how a capture is cut must not show in the error it states
+        merged = float(patches.areas[patches.is_cluster].sum() / max(patches.areas.sum(), 1e-300))
+        count = len(patches) if self.tessellator.regions is None else self.tessellator.count(coarseness)
+        return Gathered(values, max(count, 1), coarseness, merged)  # 1: nothing may face the wall
+
+    def _by_reciprocity(self, batch: Batch, coarseness: float) -> NDArray[np.float64]:
+        """Gather from every two points once: the one with the higher index stands for the sensor point.
+
+        Whatever the batch, so that how a capture is cut does not show. A batch of other lasers than sensor points is
+        gathered in two parts, the second with their roles exchanged.
+        """
+        sensors, lasers = self.paths.sensor_indices(batch), self.paths.laser_indices(batch)
+        sums = self._sums(batch, coarseness, np.searchsorted(lasers, sensors, side="right"))
+        if np.array_equal(sensors, lasers):
+            return sums.on_host(is_symmetric=True)
+        values = sums.on_host()
+        exchanged = Batch(sensors=batch.lasers, lasers=batch.sensors)
+        values += self._sums(exchanged, coarseness, np.searchsorted(sensors, lasers)).on_host().swapaxes(2, 3)
+        return values
+
+    def _sums(self, batch: Batch | Pilot, coarseness: float, lasers: NDArray[np.int64] | None = None) -> BlockHistogram:
+        """Gather what all sensor points share, then what regions have of their own.
+
+        ``lasers`` (sensors,) tells of how many lasers each sensor point gathers the light, the first ones; None: all.
+        """
         shape = self.shape(batch)
-        lanes = self._lanes(batch, shape)
+        lanes = self._lanes(batch, shape, lasers)
         histogram = BlockHistogram(shape, lanes.order)
         patches = self.tessellator.patches(coarseness)
         if len(patches):
@@ -125,11 +155,7 @@ class ThirdBounce:
             some = lanes.transport.of_lanes(index)
             lights = self._lights(some, shape, Patches.joined(near), parts)
             gather_third_bounce(self.settings, some, lights, histogram, index, on_device(mi.UInt32, part))
-        # of the shared ones: how a capture is cut must not show in the error it states
-        merged = float(patches.areas[patches.is_cluster].sum() / max(patches.areas.sum(), 1e-300))
-        count = len(patches) if self.tessellator.regions is None else self.tessellator.count(coarseness)
-        values = histogram.on_host(is_symmetric=self._is_symmetric(batch))
-        return Gathered(values, max(count, 1), coarseness, merged)  # 1: nothing may face the wall
+        return histogram
 
     def lit_patches(self, batch: Batch | Pilot, coarseness: float) -> LitPatches:
         """Return the patches that the gather of a batch goes through, in its order; those all sensor points share."""
@@ -206,11 +232,7 @@ class ThirdBounce:
         points = self.paths.capture.n_sensors if isinstance(batch, Batch) else batch.sensors.size
         return replace(self.paths.shape(batch, 1), replicas=max(1, min(math.ceil(self.lanes / points), most)))
 
-    def _is_symmetric(self, batch: Batch | Pilot) -> bool:
-        """Return whether H of a batch is the same with lasers and sensor points exchanged."""
-        return self.is_reciprocal and np.array_equal(self.paths.sensor_indices(batch), self.paths.laser_indices(batch))
-
-    def _lanes(self, batch: Batch | Pilot, shape: HistogramShape) -> _Lanes:
+    def _lanes(self, batch: Batch | Pilot, shape: HistogramShape, lasers: NDArray[np.int64] | None = None) -> _Lanes:
         transport = self.paths.transport(batch, replace(shape, replicas=1))
         indices = self.paths.sensor_indices(batch)
         order = np.argsort(z_order(self.paths.capture.sensor_grid.positions.reshape(-1, 3)[indices]), kind="stable")
@@ -218,8 +240,8 @@ class ThirdBounce:
         transport = transport.of_lanes(dr.gather(mi.UInt32, on_device(mi.UInt32, order), lane % shape.sensors))
         replica = lane // shape.sensors
         dr.eval(lane, replica)
-        if self._is_symmetric(batch):  # sensor point j has lasers up to j
-            transport = replace(transport, n_lasers=on_device(mi.UInt32, np.tile(order + 1, shape.replicas)))
+        if lasers is not None:
+            transport = replace(transport, n_lasers=on_device(mi.UInt32, np.tile(lasers[order], shape.replicas)))
         regions = np.zeros(shape.lanes, np.int64)
         if self.tessellator.regions is not None:
             regions = np.tile(self.tessellator.regions.labels[indices][order], shape.replicas)
