@@ -175,6 +175,8 @@ def quartered(cells: Cells, distance: WallDistance, wall_index: int | None, leas
         distances = _distances(cells, distance, wall_index)
         large = cells.sizes > np.maximum(distances, least)
         done.append(replace(cells, distances=distances).at(~large))
+        if not large.any():
+            break
         corners = _quartered(cells.corners[large])
         cells = Cells(
             corners,

@@ -74,6 +74,11 @@ class GradedCells:
         hidden, wall = (count.at(coarseness) for count in self._counts)
         return hidden, wall
 
+    def share_if_far(self, distance: float) -> float:
+        """Return how many of the patches were left, about, if no cell were nearer than ``distance`` to a point."""
+        larger = self.grading.allowed_size(np.maximum(self.cells.distances, distance))
+        return float((self.areas / larger**2).sum() / max((self.areas / self.allowed**2).sum(), 1e-300))
+
     @cached_property
     def _counts(self) -> tuple[_CellCount, _CellCount]:
         boxes = self.merger.boxes

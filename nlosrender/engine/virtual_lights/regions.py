@@ -57,17 +57,18 @@ def regions_of(capture: Capture, unit: float, triangles: Cells, whole: GradedCel
     """
     if capture.n_lasers > 1 and capture.scan_type != "confocal":
         return None  # what is near to a laser point has to be fine for all
-    count = sum(whole.counts(1.0))
-    best, least = None, WORTH * count * (capture.n_sensors + POINTS_PER_PATCH)
-    for blocks in BLOCKS:
-        if capture.n_sensors < blocks**2 * LEAST_POINTS:
-            break
-        reach = max(capture.sensor_grid.size) / blocks / unit
-        # Beyond its own size a region sees about what its neighbours see: there cells of all points do.
-        is_near = whole.cells.distances < reach
-        if sum(whole.at(is_near).counts(1.0)) < (1 - WORTH) * count:
-            break
-        regions = _cut(capture, unit, triangles, reach, blocks, whole.grading)
+    # Beyond its own size a region sees about what its neighbours see: there cells of all points do.
+    reaches = {blocks: max(capture.sensor_grid.size) / blocks / unit for blocks in BLOCKS}
+    tried = [
+        blocks
+        for blocks, reach in reaches.items()
+        if capture.n_sensors >= blocks**2 * LEAST_POINTS and whole.share_if_far(reach / 2) < WORTH
+    ]
+    if not tried:
+        return None
+    best, least = None, WORTH * sum(whole.counts(1.0)) * (capture.n_sensors + POINTS_PER_PATCH)
+    for blocks in tried:
+        regions = _cut(capture, unit, triangles, reaches[blocks], blocks, whole.grading)
         cost = sum(regions.counts(1.0)) * capture.n_sensors + regions.total(1.0) * POINTS_PER_PATCH
         if cost < least:
             best, least = regions, cost
