@@ -81,13 +81,13 @@ def render_capture(
     ------
     ConfigError
         Something only the renderer could find wrong: a mesh that cannot be read, a BSDF that Mitsuba rejects, a part
-        that the capture does not have.
+        that the capture does not have, a capture that does not fit the memory.
     BackendError
         There is no usable LLVM or GPU, here or on a worker.
     FileError
         The output cannot be written, or there is an unfinished render of something else.
     RenderError
-        The capture does not fit the memory limit, or the result is not finite.
+        The memory limit is below what the program itself takes, or the result is not finite.
     IncompleteRender, InterruptedRender
         The render stopped half-way; the same call goes on from there.
     """
@@ -95,8 +95,7 @@ def render_capture(
     warnings.say(config_warnings(config))
     with stopwatch.stage("scene"):
         check_writable(config.output.path)
-        with uninterrupted():  # an import that Ctrl-C cuts off ends in errors of its own
-            backend = started_backend(config)
+        backend = started_backend(config)
     resolved, output = config_to_dict(config), config.output
     sharing = ALONE if cluster is None else cluster.sharing
     replicas = replicas_for(backend.lanes, config.capture.sensor_grid.n_points)
@@ -159,7 +158,8 @@ def started_backend(config: Config) -> Backend:
         There is no usable LLVM or GPU.
     """
     render = config.render
-    return start_backend(render.backend, colored=config.is_colored, polarized=render.polarized)
+    with uninterrupted():  # an import that Ctrl-C cuts off ends in errors of its own, or a crash
+        return start_backend(render.backend, colored=config.is_colored, polarized=render.polarized)
 
 
 def set_up_engine(

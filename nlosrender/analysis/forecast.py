@@ -30,7 +30,7 @@ class Forecast:
     scan_type: str
     sensor_grid: tuple[int, int]  # columns, rows
     laser_grid: tuple[int, int]  # columns, rows; confocal: the sensor grid
-    n_triangles: int  # of the hidden geometry
+    n_triangles: int  # of the hidden geometry, or of all that a camera sees
     n_bins: int
     bin_width_opl: float  # m
     window_opl: tuple[float, float]  # m
@@ -126,4 +126,11 @@ def forecast_file(
     if lit_shares is not None:
         filled = tuple(most if lit is None else min(most, lit) for most, lit in zip(filled, lit_shares, strict=True))
     compression, variance = config.output.compression, config.output.variance
-    return forecast_size(header.sizes, header.confocal, filled, compression=compression, variance=variance)
+    return forecast_size(
+        header.sizes,
+        header.confocal,
+        filled,
+        compression=compression,
+        variance=variance,
+        line_of_sight=config.capture.is_line_of_sight,
+    )

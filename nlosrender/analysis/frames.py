@@ -13,9 +13,10 @@ from nlosrender.analysis.laser_view import lit_window
 from nlosrender.analysis.pictures import SUFFIXES, save_animation, save_exr, save_png, stokes_panels, tone_mapped
 from nlosrender.capture.bounces import LINE_OF_SIGHT
 from nlosrender.errors import FileError, OptionError
+from nlosrender.files.filled_folder import filled_folder
 from nlosrender.files.layout import STOKES
 from nlosrender.files.reader import StoredCapture, open_capture
-from nlosrender.files.replacement import explained_write
+from nlosrender.files.replacement import check_writable, explained_write, partial_path, publish
 
 Float32 = NDArray[np.float32]
 
@@ -60,8 +61,13 @@ class FrameOptions:
             raise OptionError(f"--exposure: got {self.exposure:g}, need -30 to 30 stops")
 
 
-def write_frames(path: str | Path, folder: str | Path, options: FrameOptions) -> list[Path]:
-    """Write the pictures of a line-of-sight capture into a folder, which is made where there is none.
+def is_animation(output: str | Path) -> bool:
+    """Return whether an output is the name of an animation, not of a folder."""
+    return Path(output).suffix.lower() == SUFFIXES["gif"]
+
+
+def write_frames(path: str | Path, output: str | Path, options: FrameOptions) -> list[Path]:
+    """Write the pictures of a line-of-sight capture; all of them appear, or none.
 
     Pictures hold radiance [W m^-2 sr^-1] summed over their bins; .exr as float32 without any scaling, .png and .gif
     scaled together, so that frames can be compared. Rows run downwards, as in every picture.
@@ -70,8 +76,9 @@ def write_frames(path: str | Path, folder: str | Path, options: FrameOptions) ->
     ----------
     path
         Capture file.
-    folder
-        Where pictures go: frame-00000.exr and so on, steady.exr, steady.png; an animation is frames.gif.
+    output
+        Folder where pictures go: frame-00000.exr and so on, in place of those of an earlier run, steady.exr,
+        steady.png; an animation is frames.gif. Or a name that ends in .gif, for an animation alone.
     options
         Which.
 
@@ -87,7 +94,8 @@ def write_frames(path: str | Path, folder: str | Path, options: FrameOptions) ->
     OptionError
         The options do not suit the capture.
     """
-    folder = Path(folder)
+    output = Path(output)
+    _check_output(output, path, options)
     with open_capture(path) as capture:
         if capture.header.scan_type != LINE_OF_SIGHT:
             raise FileError(
@@ -97,13 +105,51 @@ def write_frames(path: str | Path, folder: str | Path, options: FrameOptions) ->
         stokes = capture.header.attributes.get("channels") == STOKES
         ranges = _frame_ranges(capture, options)
         frames, steady = _pictures(capture, ranges)
-    with explained_write(folder):
-        folder.mkdir(parents=True, exist_ok=True)
+    if is_animation(output):
+        _write_animation(_shown(frames, stokes, options.exposure), output, options.frames_per_second)
+        return [output]
+    with filled_folder(output) as folder:
         written = _write_all(frames, folder, options, stokes)
         written += [folder / "steady.exr", folder / "steady.png"]
         save_exr(steady, written[-2], stokes)
         save_png(_shown(steady[None], stokes, options.exposure, BRIGHTEST_STEADY)[0], written[-1])
-    return written
+    names = [file.name for file in written]
+    _remove_earlier(output, SUFFIXES[options.kind], set(names))
+    return [output / name for name in names]
+
+
+def _check_output(output: Path, source: str | Path, options: FrameOptions) -> None:
+    """Refuse an output that does not suit the format, before anything is read."""
+    if is_animation(output):
+        if options.kind != "gif":
+            raise OptionError(
+                f"--output: got {str(output)!r}, an animation, with --format {options.kind}; need a folder"
+            )
+        check_writable(output, source=source)
+    elif output.suffix.lower() in (*SUFFIXES.values(), ".mp4") and not output.is_dir():
+        raise OptionError(
+            f"--output: got {str(output)!r}, the name of one picture, but there are many; need a folder, or a name "
+            "that ends in .gif for an animation"
+        )
+
+
+def _write_animation(shown: NDArray[np.uint8], output: Path, frames_per_second: float) -> None:
+    target = check_writable(output)
+    partial = partial_path(target)
+    with explained_write(output):
+        try:
+            save_animation(shown, partial, frames_per_second)
+            publish(partial, target)
+        finally:
+            partial.unlink(missing_ok=True)
+
+
+def _remove_earlier(folder: Path, suffix: str, written: set[str]) -> None:
+    """Remove the frames of an earlier run, of which there were more: they would be taken for this one's."""
+    with explained_write(folder):
+        for file in folder.glob(f"frame-?????{suffix}"):
+            if file.name not in written and file.stem.removeprefix("frame-").isdecimal():
+                file.unlink()
 
 
 def _frame_ranges(capture: StoredCapture, options: FrameOptions) -> list[slice]:

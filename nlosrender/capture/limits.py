@@ -5,7 +5,7 @@ from __future__ import annotations
 from nlosrender.capture.plan import BYTES_OF_STATISTICS, BYTES_PER_SUM
 from nlosrender.capture.time_axis import TimeAxis
 from nlosrender.config.capture import CaptureConfig
-from nlosrender.errors import ConfigError, Problem, RenderError
+from nlosrender.errors import ConfigError, Problem
 
 POINT_BYTES = 640  # per grid point: positions, normals, coordinates, distances to the corners of a box, copies
 MAX_SAMPLES = 2**40  # 4 TiB of float32 per bounce
@@ -14,7 +14,7 @@ INT32_MAX = 2**31 - 1  # the file holds the number of bins as a 32-bit integer
 
 
 def refuse_impossible_grids(capture_config: CaptureConfig, memory_limit: int) -> None:
-    """Refuse grids whose points alone do not fit the memory.
+    """Refuse grids, or a camera's pixels, whose positions alone do not fit the memory.
 
     Parameters
     ----------
@@ -25,16 +25,18 @@ def refuse_impossible_grids(capture_config: CaptureConfig, memory_limit: int) ->
 
     Raises
     ------
-    RenderError
+    ConfigError
         They do not fit.
     """
-    grids = {"sensor_grid": capture_config.sensor_grid, "laser_grid": capture_config.laser_grid}
+    points, sensors = _words(capture_config)
+    grids = {sensors: capture_config.sensor_grid, "capture.laser_grid": capture_config.laser_grid}
     for key, grid in grids.items():
         if grid is not None and grid.n_points * POINT_BYTES > memory_limit:
-            raise RenderError(
-                f"capture.{key}: {grid.nx} x {grid.ny} points take {grid.n_points * POINT_BYTES / 1e9:.3g} GB for "
-                f"their positions alone, but there are {memory_limit / 1e9:.3g} GB. Use fewer points."
+            message = (
+                f"{grid.nx} x {grid.ny} {points} take {grid.n_points * POINT_BYTES / 1e9:.3g} GB for their positions "
+                f"alone, but there are {memory_limit / 1e9:.3g} GB. Use fewer {points}."
             )
+            raise ConfigError(Problem("", key, message))
 
 
 def refuse_wide_kernel(kernel_opl: float, time_axis: TimeAxis) -> None:
@@ -78,20 +80,27 @@ def refuse_impossible_samples(
 
     Raises
     ------
-    RenderError
+    ConfigError
         The capture is too large; the message says what to change.
     """
+    points, sensors = _words(capture_config)
     pairs = capture_config.sensor_grid.n_points * capture_config.n_lasers
     if n_bins > INT32_MAX:
-        raise RenderError(f"time_axis.n_bins: got {n_bins}, need at most {INT32_MAX}. Use wider bins or a later start.")
+        message = f"got {n_bins}, need at most {INT32_MAX}. Use wider bins or a later start."
+        raise ConfigError(Problem("", "time_axis.n_bins", message))
     if pairs * n_bins > MAX_SAMPLES:
-        raise RenderError(
-            f"{pairs:_} pairs of laser and sensor points with {n_bins:_} bins each are more than 2**40 samples. "
-            "Use fewer points or bins."
-        )
+        counted = points if capture_config.is_line_of_sight else "pairs of laser and sensor points"
+        message = f"{pairs:_} {counted} with {n_bins:_} bins each are more than 2**40 samples. "
+        raise ConfigError(Problem("", sensors, f"{message}Use fewer {points} or bins."))
     smallest = pairs * rows_per_pair * (n_bins + 1) * (2 * BYTES_PER_SUM + BYTES_OF_STATISTICS)
     if smallest > MAX_BATCHES * memory_limit:
-        raise RenderError(
+        message = (
             f"the capture takes {smallest / 1e12:.3g} TB in all, more than {MAX_BATCHES:_} batches of the "
-            f"{memory_limit / 1e6:.0f} MB that render.memory_limit leaves. Raise it, or use fewer points or bins."
+            f"{memory_limit / 1e6:.0f} MB that render.memory_limit leaves. Raise it, or use fewer {points} or bins."
         )
+        raise ConfigError(Problem("", sensors, message))
+
+
+def _words(capture_config: CaptureConfig) -> tuple[str, str]:
+    """Return what sensor points are called, and the key that says how many there are."""
+    return ("pixels", "capture.camera") if capture_config.is_line_of_sight else ("points", "capture.sensor_grid")

@@ -10,10 +10,11 @@ import math
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
+from nlosrender.capture.bounces import LINE_OF_SIGHT
 from nlosrender.capture.grids import Capture
 from nlosrender.capture.part import WHOLE, Part, Selection, Tiling
 from nlosrender.capture.tile import Tile, joined, runs
-from nlosrender.errors import RenderError
+from nlosrender.errors import ConfigError, Problem
 
 BYTES_PER_SUM = 8  # a float64 sum per replica and bin
 MOST_SUMS = 2**32 - 1  # of a batch: Dr.Jit indexes with 32 bits
@@ -101,9 +102,7 @@ def plan_capture(
     Raises
     ------
     ConfigError
-        There is no such part.
-    RenderError
-        Not even one sensor point with one laser fits.
+        There is no such part, or not even one sensor point with one laser fits.
     """
     replicas = replicas_for(lanes, capture.n_sensors)
     row = rows_per_pair * (n_bins + 1)
@@ -116,10 +115,12 @@ def plan_capture(
         pairs = min(pairs, (memory_limit - cell * row * BYTES_OF_ASSEMBLY) // pair)
     if pairs < 1:
         needed = pair + (cell * row * BYTES_OF_ASSEMBLY if cell > 1 else 0)
-        raise RenderError(
-            f"one sensor point with one laser needs {needed / 1e6:.0f} MB but render.memory_limit leaves "
-            f"{memory_limit / 1e6:.0f} MB. Raise it, or use fewer bins ({n_bins}) or bounces."
+        one = "one pixel" if capture.scan_type == LINE_OF_SIGHT else "one sensor point with one laser"
+        message = (
+            f"{one} needs {needed / 1e6:.0f} MB but {memory_limit / 1e6:.0f} MB are left for it. Raise it, or use "
+            f"fewer bins ({n_bins}) or bounces."
         )
+        raise ConfigError(Problem("", "render.memory_limit", message))
     confocal = capture.scan_type == "confocal"
     enough = unit_samples // row
     everything = tiling.everything(capture.n_lasers if capture.scan_type == "exhaustive" else 1)

@@ -6,7 +6,8 @@ Command modules import what they need inside the command: ``--help`` must not wa
 from __future__ import annotations
 
 import sys
-from typing import Annotated
+from contextlib import suppress
+from typing import Annotated, NoReturn
 
 import typer
 
@@ -25,7 +26,8 @@ from nlosrender.cli import (
     reconstruct_command,
     render_command,
 )
-from nlosrender.errors import EXIT_INTERRUPTED, NlosError
+from nlosrender.cli.interrupt_watch import InterruptWatch
+from nlosrender.errors import EXIT_FAILURE, EXIT_INTERRUPTED, NlosError
 
 app = typer.Typer(
     name="nlosrender",
@@ -67,10 +69,17 @@ def _global_options(
 def main() -> None:
     """Run the command line; turn every explained error into a message on stderr and its exit code."""
     try:
-        app()
+        with InterruptWatch():
+            app()
     except NlosError as error:
-        typer.echo(f"error: {error}" if "\n" not in str(error) else f"errors:\n{error}", err=True)
-        sys.exit(error.exit_code)
+        _end(f"error: {error}" if "\n" not in str(error) else f"errors:\n{error}", error.exit_code)
     except KeyboardInterrupt:
-        typer.echo("interrupted", err=True)
-        sys.exit(EXIT_INTERRUPTED)
+        _end("interrupted", EXIT_INTERRUPTED)
+    except OSError as error:  # commands explain those of their files: what is left is standard output, mostly
+        _end(f"error: {error}. Check the disk, and where the output goes.", EXIT_FAILURE)
+
+
+def _end(message: str, exit_code: int) -> NoReturn:
+    with suppress(OSError):  # nobody listens any more: the exit code still tells
+        typer.echo(message, err=True)
+    sys.exit(exit_code)

@@ -24,7 +24,9 @@ def bench(
     ] = None,
     part: Annotated[
         list[str] | None,
-        typer.Option(metavar="PART", help="curves, scaling, rates or process; may be repeated.", show_default="all"),
+        typer.Option(
+            metavar="PART", help="curves, scaling, rates, skips or process; may be repeated.", show_default="all"
+        ),
     ] = None,
     seconds: Annotated[float, typer.Option(min=1.0, help="Time for all of it, compilation on top.")] = 300.0,
     mesh: Annotated[
@@ -46,6 +48,8 @@ def bench(
     from nlosrender.bench.benchmark import PARTS, run_benchmark
     from nlosrender.bench.report import table, write_json, write_plot
     from nlosrender.bench.scenes import built_in_scenes
+    from nlosrender.engine.backend import start_backend
+    from nlosrender.files.interruption import uninterrupted
 
     if mesh is not None and not mesh.is_file():
         raise typer.BadParameter(f"{mesh}: there is no such file", param_hint="--mesh")
@@ -54,12 +58,30 @@ def bench(
     names = scene or [name for name in known if mesh is None or name != "letters"]
     scenes = [known[_one_of(name, known, "--scene")] for name in names]
     parts = [_one_of(name, PARTS, "--part") for name in part or PARTS]
+    json_path, png_path = _outputs(output)
+    with uninterrupted():  # an import that Ctrl-C cuts off can end in a crash
+        start_backend()
     found = run_benchmark(scenes, seconds, parts, peer, lambda what: typer.echo(what, err=True))
     report = found.report()
-    write_json(output.with_name(output.name + ".json"), report)
+    write_json(json_path, report)
     if report["scenes"]:
-        write_plot(output.with_name(output.name + ".png"), report)
+        write_plot(png_path, report)
     typer.echo(json.dumps(report, allow_nan=False) if as_json else table(report))
+
+
+def _outputs(output: Path) -> tuple[Path, Path]:
+    """Return the names of report and plot, once it is sure that they can be written: before the work, not after it."""
+    from nlosrender.errors import FileError
+    from nlosrender.files.replacement import check_writable, explained_write
+
+    if output.name in ("", ".."):
+        raise FileError(f"{output}: is a folder. Name files in it, such as {output / 'bench'}")
+    with explained_write(output.parent):
+        output.parent.mkdir(parents=True, exist_ok=True)
+    report, plot = output.with_name(output.name + ".json"), output.with_name(output.name + ".png")
+    check_writable(report)
+    check_writable(plot)
+    return report, plot
 
 
 def _one_of(name: str, known: Iterable[str], option: str) -> str:

@@ -136,7 +136,10 @@ def check(
             typer.echo(f"extra       {name}: not in the reference")
         typer.echo(f"{len(found.files) - len(failed)} of {len(found.files)} captures agree with {reference}")
     if failed:
-        listed = "\n".join(f"{file.name}: {file.message}" for file in failed)
+        # what cannot be read is named by its own message
+        listed = "\n".join(
+            f"{'' if file.status == 'unreadable' else f'{file.name}: '}{file.message}" for file in failed
+        )
         raise (FileError if found.with_status("unreadable") else ComparisonError)(listed)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -119,15 +120,30 @@ def _print_verdict(problems: list[Problem], warnings: list[str]) -> None:
 
 
 def _summary(config: Config) -> str:
-    """Return the capture in a few words: scan, sizes, bins, hidden items."""
+    """Return the capture in a few words: scan, sizes, bins, what is in the scene."""
     capture, n_bins = config.capture, config.time_axis.n_bins
     points = "pixels" if capture.is_line_of_sight else "sensors"
     parts = [capture.scan_type, f"{capture.sensor_grid.nx} x {capture.sensor_grid.ny} {points}"]
     if capture.laser_grid is not None:
         parts.append(f"{capture.laser_grid.nx} x {capture.laser_grid.ny} lasers")
     parts.append(f"{n_bins} bins of {config.time_axis.bin_width_opl:g} m")
-    n_hidden = len(config.scene.hidden_geometry)
-    parts.append(f"{n_hidden} hidden item{'' if n_hidden == 1 else 's'}")
-    if config.scene.emitters:
-        parts.append(f"{len(config.scene.emitters)} emitter{'' if len(config.scene.emitters) == 1 else 's'}")
-    return ", ".join(parts)
+    return ", ".join([*parts, *_contents(config)])
+
+
+def _contents(config: Config) -> Iterator[str]:
+    """Yield what a scene holds: its own items, and those of a Mitsuba scene."""
+    from nlosrender.config.mitsuba_xml import read_mitsuba_xml
+
+    scene, is_view = config.scene, config.capture.is_line_of_sight
+    if scene.mitsuba is not None:
+        root, _ = read_mitsuba_xml(scene.mitsuba)
+        shapes, emitters = len(root.findall("shape")), sum(1 for _ in root.iter("emitter"))
+        yield f"{scene.mitsuba.name} with {_counted(shapes, 'shape')} and {_counted(emitters, 'emitter')}"
+    if scene.hidden_geometry or scene.mitsuba is None:
+        yield _counted(len(scene.hidden_geometry), "item" if is_view else "hidden item")
+    if scene.emitters:
+        yield _counted(len(scene.emitters), "emitter")
+
+
+def _counted(number: int, name: str) -> str:
+    return f"{number} {name}{'' if number == 1 else 's'}"

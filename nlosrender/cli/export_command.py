@@ -12,7 +12,10 @@ from nlosrender.cli.file_commands import CaptureFile
 
 def register(app: typer.Typer) -> None:
     """Add ``export`` to ``app``."""
-    app.command()(export)
+    app.command(
+        epilog="Example: `nlosrender export z.hdf5 --format fk --bounces 3` creates z-fk.mat with `meas` and "
+        "`tofgrid`, the third bounce of a confocal capture for f-k migration."
+    )(export)
 
 
 def export(
@@ -30,19 +33,17 @@ def export(
     bounces: Annotated[str, typer.Option(metavar="3|all", help="Light to export; bounces are summed.")] = "all",
     as_json: Annotated[bool, typer.Option("--json", help="Print the report as one JSON object.")] = False,
 ) -> None:
-    """Write a capture in the format of another program; what that cannot hold is refused or reported.
-
-    Example: `nlosrender export scan.hdf5 --format fk --bounces 3` creates scan-fk.mat with `meas` and `tofgrid`, the
-    third bounce of a confocal capture for f-k migration.
-    """
+    """Write a capture in the format of another program; what that cannot hold is refused or reported."""
     import json
 
+    from nlosrender.cli.output_names import beside
     from nlosrender.errors import OptionError
-    from nlosrender.files.exports import SUFFIXES, export_capture
+    from nlosrender.files.exports import export_capture, suffix_of
 
     if bounces not in ("3", "all"):
         raise OptionError(f"--bounces: got {bounces!r}, need 3 or all")
-    target = output or file.with_name(f"{file.stem}-{file_format}{SUFFIXES.get(file_format, '')}")
+    ending = f"-{file_format}{suffix_of(file_format)}"
+    target = output or beside(file, ending)
     report = export_capture(file, target, file_format, bounces)
     if as_json:
         typer.echo(json.dumps({"written": str(report.path), "losses": report.losses}))

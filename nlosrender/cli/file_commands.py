@@ -14,8 +14,16 @@ CaptureFile = Annotated[Path, typer.Argument(metavar="FILE", help="Capture in Z-
 
 def register(app: typer.Typer) -> None:
     """Add this module's commands to ``app``."""
-    app.command("info")(info)
-    app.command("plot")(plot)
+    app.command(
+        "info",
+        epilog="Example: `nlosrender info z.hdf5 --check` prints the grids, the time axis, the bounces and "
+        "where the file comes from, then reads all samples to see that third-party loaders will accept it. It creates "
+        "nothing.",
+    )(info)
+    app.command(
+        "plot",
+        epilog="Example: `nlosrender plot z.hdf5 --pixel 6,8` creates z.png and prints its path.",
+    )(plot)
 
 
 def info(
@@ -25,11 +33,7 @@ def info(
         bool, typer.Option("--check", help="Also check the layout and every sample; exit code 3 if anything is wrong.")
     ] = False,
 ) -> None:
-    """Show what a capture file holds, from its metadata alone.
-
-    Example: `nlosrender info two-planes.hdf5 --check` prints the grids, the time axis, the bounces and where the
-    file comes from, then reads all samples to see that third-party loaders will accept it. It creates nothing.
-    """
+    """Show what a capture file holds, from its metadata alone."""
     import json
 
     from nlosrender.analysis.summary import summarise
@@ -72,15 +76,13 @@ def plot(
         ),
     ] = None,
 ) -> None:
-    """Draw a capture: the relay wall over time, one histogram, the light of each bounce, one row over time.
-
-    Example: `nlosrender plot two-planes.hdf5 --pixel 6,8` creates two-planes.png and prints its path.
-    """
+    """Draw a capture: the relay wall over time, one histogram, the light of each bounce, one row over time."""
     laser_at, pixel_at = _index(laser, "--laser"), _index(pixel, "--pixel")
 
     from nlosrender.analysis.plots import plot_capture
+    from nlosrender.cli.output_names import beside
 
-    picture = output or file.with_suffix(".png")
+    picture = output or beside(file, ".png")
     typer.echo(str(plot_capture(file, picture, laser=laser_at, pixel=pixel_at)))
 
 

@@ -10,15 +10,29 @@ import typer
 
 def register(app: typer.Typer) -> None:
     """Add ``frames`` to ``app``."""
-    app.command("frames")(frames)
+    app.command(
+        "frames",
+        epilog="Example: `nlosrender frames cornell-box.hdf5 -o box --format gif` creates box/frames.gif, "
+        "box/steady.exr and box/steady.png and prints the folder; with `-o box.gif` it creates that file alone.",
+    )(frames)
 
 
 def frames(
     file: Annotated[Path, typer.Argument(metavar="FILE", help="Capture of scan type line_of_sight.")],
     output: Annotated[
-        Path | None, typer.Option("-o", "--output", metavar="DIR", help="Folder to fill.", show_default="FILE-frames")
+        Path | None,
+        typer.Option(
+            "-o",
+            "--output",
+            metavar="DIR|OUT.gif",
+            help="Folder to fill, or the animation alone.",
+            show_default="FILE-frames",
+        ),
     ] = None,
-    kind: Annotated[str, typer.Option("--format", metavar="exr|png|gif", help="What to write.")] = "exr",
+    kind: Annotated[
+        str | None,
+        typer.Option("--format", metavar="exr|png|gif", help="What to write.", show_default="exr, or gif by -o"),
+    ] = None,
     every: Annotated[
         int | None, typer.Option(metavar="BINS", help="Bins per picture.", show_default="about 120 pictures")
     ] = None,
@@ -33,11 +47,13 @@ def frames(
 ) -> None:
     """Write what a camera saw as pictures: one per range of bins, and the steady picture.
 
-    Example: `nlosrender frames cornell-box.hdf5 -o box --format gif` creates box/frames.gif, box/steady.exr and
-    box/steady.png and prints the folder.
+    Frames that an earlier run left in the folder are replaced.
     """
-    from nlosrender.analysis.frames import FrameOptions, write_frames
+    from nlosrender.analysis.frames import FrameOptions, is_animation, write_frames
+    from nlosrender.cli.output_names import beside
 
-    folder = output or file.with_name(f"{file.stem}-frames")
-    written = write_frames(file, folder, FrameOptions(kind, every, start, end, frames_per_second, exposure))
-    typer.echo(f"wrote {len(written)} pictures into {folder}")
+    kind = kind or ("gif" if output is not None and is_animation(output) else "exr")
+    options = FrameOptions(kind, every, start, end, frames_per_second, exposure)
+    target = output or beside(file, "-frames")
+    written = write_frames(file, target, options)
+    typer.echo(f"wrote {target}" if written == [target] else f"wrote {len(written)} pictures into {target}")

@@ -9,26 +9,28 @@ import typer
 
 def register(app: typer.Typer) -> None:
     """Add ``doctor`` to ``app``."""
-    app.command()(doctor)
+    app.command(
+        epilog="Example: nlosrender doctor   (creates nothing; prints one line per LLVM library found and the one that "
+        "is used)"
+    )(doctor)
 
 
 def doctor(as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False) -> None:
     """Show which LLVM, GPU and package versions were found, what a render would use, and what to install.
 
     Exits with 6 when nothing on this machine can render.
-
-    Example: nlosrender doctor
-    prints one line per LLVM library found and the one that is used.
     """
     from nlosrender.engine import llvm
     from nlosrender.engine.backend import cuda_available, start_backend
     from nlosrender.errors import BackendError
+    from nlosrender.files.interruption import uninterrupted
     from nlosrender.files.provenance import package_versions
 
     libraries = llvm.find_libraries()
     has_gpu = cuda_available()
     try:
-        backend, trouble = start_backend(), None
+        with uninterrupted():  # an import that Ctrl-C cuts off can end in a crash
+            backend, trouble = start_backend(), None
     except BackendError as error:
         backend, trouble = None, error
     if as_json:

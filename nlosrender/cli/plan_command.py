@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from nlosrender.capture.bounces import LINE_OF_SIGHT
+
 if TYPE_CHECKING:
     from nlosrender.analysis.forecast import Forecast
 
@@ -22,7 +24,7 @@ def register(app: typer.Typer) -> None:
 
 
 def plan(
-    config: Annotated[Path, typer.Argument(help="The YAML file that describes the capture.")],
+    config: Annotated[Path, typer.Argument(metavar="CONFIG", help="The YAML file that describes the capture.")],
     overrides: Annotated[
         list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Override one key; may be repeated.")
     ] = None,
@@ -61,7 +63,8 @@ def _lines(forecast: Forecast) -> Iterator[str]:
     yield f"engine   {forecast.engine}: {forecast.reason} ({forecast.variant})"
     for item in forecast.skipped:
         yield f"skipped  {item.what}: {item.why}"
-    yield f"scan     {_scan(forecast)}, {forecast.n_triangles} hidden triangles"
+    hidden = "" if forecast.scan_type == LINE_OF_SIGHT else "hidden "
+    yield f"scan     {_scan(forecast)}, {forecast.n_triangles} {hidden}triangles"
     start, end = forecast.window_opl
     yield f"time     {forecast.n_bins} bins of {forecast.bin_width_opl:g} m, from {start:.6g} to {end:.6g} m"
     plural = "" if forecast.batches == 1 else "es"
@@ -78,7 +81,8 @@ def _lines(forecast: Forecast) -> Iterator[str]:
 
 
 def _scan(forecast: Forecast) -> str:
-    sensors = "{} x {} sensor points".format(*forecast.sensor_grid)
+    points = "pixels" if forecast.scan_type == LINE_OF_SIGHT else "sensor points"
+    sensors = "{} x {} ".format(*forecast.sensor_grid) + points
     if forecast.scan_type != "exhaustive":
         return f"{forecast.scan_type}, {sensors}"
     return "exhaustive, {}, {} x {} laser points".format(sensors, *forecast.laser_grid)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -12,11 +13,12 @@ Warn = Callable[[str], None]
 
 @contextmanager
 def progress_bar(label: str, hidden: bool) -> Iterator[tuple[Progress, Warn]]:
-    """Show a bar (only on a terminal) while the block runs; ``hidden`` silences it and the warnings."""
+    """Show a bar while the block runs, on a terminal that can redraw a line; ``hidden`` silences warnings, too."""
     from tqdm import tqdm
 
+    no_bar = True if hidden or os.environ.get("TERM") == "dumb" else None  # None: shown on a terminal alone
     layout = "{l_bar}{bar}| {elapsed}<{remaining}"
-    with tqdm(total=1.0, disable=True if hidden else None, desc=label, bar_format=layout, leave=False) as bar:
+    with tqdm(total=1.0, disable=no_bar, desc=label, bar_format=layout, leave=False) as bar:
 
         def progress(share: float) -> None:
             bar.update(max(0.0, min(share, 1.0) - bar.n))

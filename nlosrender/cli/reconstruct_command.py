@@ -19,7 +19,11 @@ LENGTHS = "W,H,D"
 
 def register(app: typer.Typer) -> None:
     """Add ``reconstruct`` to ``app``."""
-    app.command()(reconstruct)
+    app.command(
+        epilog="Example: `nlosrender reconstruct z-letter.hdf5 -o z.hdf5 --png --score` creates z.hdf5, a volume of "
+        "128 voxels along its longest edge, and z.png, a picture of it, and prints how well it matches the true "
+        "silhouette."
+    )(reconstruct)
 
 
 def reconstruct(
@@ -63,19 +67,22 @@ def reconstruct(
     as_json: Annotated[bool, typer.Option("--json", help="Print the report as one JSON object.")] = False,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress bar, no report.")] = False,
 ) -> None:
-    """Reconstruct the hidden scene of a capture with phasor fields or filtered backprojection.
-
-    Example: `nlosrender reconstruct z-letter.hdf5 -o z.hdf5 --png --score` creates z.hdf5, a volume of 128 voxels
-    along its longest edge, and z.png, a picture of it, and prints how well it matches the true silhouette.
-    """
+    """Reconstruct the hidden scene of a capture with phasor fields or filtered backprojection."""
     from nlosrender.analysis.reconstruction.reconstruct import ReconstructionSettings, reconstruct_capture
     from nlosrender.analysis.reconstruction.volume_file import write_volume
+    from nlosrender.cli.output_names import beside
+    from nlosrender.errors import OptionError
     from nlosrender.files.replacement import check_writable
 
     center, size = _lengths(volume_center, "--volume-center"), _lengths(volume_size, "--volume-size")
     settings = ReconstructionSettings(method, wavelength, cycles, center, size, voxels, voxel_size, bounces)
-    volume_path = output or file.with_name(f"{file.stem}-{method}.hdf5")
-    check_writable(volume_path)  # before the work, not after it
+    volume_path = output or beside(file, f"-{method}.hdf5")
+    check_writable(volume_path, source=file)  # before the work, not after it
+    picture_path = volume_path.with_suffix(".png")
+    if png and picture_path == volume_path:
+        raise OptionError(f"--output: got {str(volume_path)!r}, the name --png gives the picture. Name it .hdf5")
+    if png:
+        check_writable(picture_path)
     with progress_bar("reconstruct", hidden=quiet) as (progress, warn):
         found = reconstruct_capture(file, settings, progress, warn)
     silhouette, scored = None, None
@@ -89,7 +96,7 @@ def reconstruct(
     if png:
         from nlosrender.analysis.reconstruction.picture import draw_reconstruction
 
-        written.append(draw_reconstruction(found, volume_path.with_suffix(".png"), silhouette, scored))
+        written.append(draw_reconstruction(found, picture_path, silhouette, scored))
     if as_json:
         _print_json(found, scored, written)
     elif not quiet:

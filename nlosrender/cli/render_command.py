@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from nlosrender.capture.bounces import LINE_OF_SIGHT
+
 if TYPE_CHECKING:
     from nlosrender.capture.part import Selection
     from nlosrender.rendering.dask_cluster import Cluster
@@ -25,11 +27,14 @@ class Executor(StrEnum):
 
 def register(app: typer.Typer) -> None:
     """Add ``render`` to ``app``."""
-    app.command()(render)
+    app.command(
+        epilog="Example: nlosrender render configs/z-letter.yaml -o out/z-letter.hdf5   (creates out/z-letter.hdf5, a "
+        "capture of a hidden letter Z)"
+    )(render)
 
 
 def render(
-    config: Annotated[Path, typer.Argument(help="The YAML file that describes the capture.")],
+    config: Annotated[Path, typer.Argument(metavar="CONFIG", help="The YAML file that describes the capture.")],
     output: Annotated[
         Path | None, typer.Option("--output", "-o", help="File to write, instead of output.path.")
     ] = None,
@@ -68,9 +73,6 @@ def render(
 
     What is finished survives Ctrl-C and kill: the same command goes on from there. A configuration with a sweep makes
     a folder of captures and an index.json; --shard then deals whole captures.
-
-    Example: nlosrender render configs/z-letter.yaml -o out/z-letter.hdf5
-    creates out/z-letter.hdf5, a capture of a hidden letter Z.
     """
     selection = _selection(shard, lasers)
     if executor is Executor.LOCAL and (scheduler is not None or workers is not None):
@@ -127,10 +129,15 @@ def _selection(shard: str | None, lasers: str | None) -> Selection:
 
     if shard is not None and lasers is not None:
         raise typer.BadParameter("takes no --shard beside it", param_hint="--lasers")
-    return Selection(
-        shard=_two_numbers(shard, "/", "--shard", "I/N with 1 <= I <= N, such as 2/8"),
-        lasers=_two_numbers(lasers, ":", "--lasers", "A:B with A < B, such as 0:8"),
+    need_shard, need_lasers = "I/N with 1 <= I <= N, such as 2/8", "A:B with A < B, such as 0:8"
+    selection = Selection(
+        shard=_two_numbers(shard, "/", "--shard", need_shard), lasers=_two_numbers(lasers, ":", "--lasers", need_lasers)
     )
+    if selection.shard is not None and not 1 <= selection.shard[0] <= selection.shard[1]:
+        raise typer.BadParameter(f"got {shard!r}, need {need_shard}", param_hint="--shard")
+    if selection.lasers is not None and selection.lasers[0] >= selection.lasers[1]:
+        raise typer.BadParameter(f"got {lasers!r}, need {need_lasers}", param_hint="--lasers")
+    return selection
 
 
 def _two_numbers(text: str | None, separator: str, option: str, need: str) -> tuple[int, int] | None:
@@ -165,9 +172,11 @@ def _print_report(report: RenderReport) -> None:
     if report.resumed_units:
         typer.echo(f"  resumed         {report.resumed_units} of {report.units} units were finished by an earlier run")
     typer.echo(f"  engine          {report.engine}: {report.reason}")
-    paths = f", {report.samples} paths per sensor point" if report.samples else ""
+    is_view = report.engine == LINE_OF_SIGHT  # that engine renders nothing else
+    paths = f", {report.samples} paths per {'pixel' if is_view else 'sensor point'}" if report.samples else ""
     typer.echo(f"  error estimate  {report.error_estimate:.2%} (relative L2){paths}")
     energies = ", ".join(f"{name}: {energy:.4g}" for name, energy in report.energy.items())
-    typer.echo(f"  energy          bounce {energies}; outside the time window: {report.out_of_window:.4g}")
+    counted = "interactions" if is_view else "bounce"
+    typer.echo(f"  energy          {counted} {energies}; outside the time window: {report.out_of_window:.4g}")
     stages = ", ".join(f"{stage} {spent:.2f}" for stage, spent in seconds.items() if stage != "total")
     typer.echo(f"  seconds         {seconds['total']:.2f} ({stages})")

@@ -70,12 +70,14 @@ class Config(Section):
         pairs = self.capture.sensor_grid.n_points * self.capture.n_lasers
         n_bins = 1 if self.time_axis.n_bins == "auto" else self.time_axis.n_bins
         if pairs * n_bins > MAX_BINS:
-            path: KeyPath = ("time_axis", "n_bins") if pairs <= MAX_BINS else ("capture", "sensor_grid")
+            grid = ("capture", "camera" if self.capture.is_line_of_sight else "sensor_grid")
+            path: KeyPath = ("time_axis", "n_bins") if pairs <= MAX_BINS else grid
+            counted = "pixels" if self.capture.is_line_of_sight else "pairs of laser and sensor points"
             message = (
-                f"got {pairs:_} pairs of laser and sensor points with {n_bins:_} bins each, need at most 2**40 bins "
-                "in all. Use fewer points or bins."
+                f"got {pairs:_} {counted} with {n_bins:_} bins each, need at most 2**40 bins in all. Use fewer "
+                f"{counted.split()[-1]} or bins."
             )
-            yield Fault(path, message, needs=(("time_axis", "n_bins"), ("capture", "sensor_grid"), _LASER_GRID))
+            yield Fault(path, message, needs=(("time_axis", "n_bins"), grid, _LASER_GRID))
 
     def _points_off_the_wall(self, relay_wall: RelayWallConfig) -> Iterator[Fault]:
         extent, wall = relay_wall.extent, relay_wall.type

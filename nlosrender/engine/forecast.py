@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 
 import drjit as dr
 
-from nlosrender.capture.bounces import FIRST_BOUNCE, THIRD_BOUNCE, BounceAxis
+from nlosrender.capture.bounces import FIRST_BOUNCE, LINE_OF_SIGHT, THIRD_BOUNCE, BounceAxis
 from nlosrender.capture.grids import Capture
 from nlosrender.capture.plan import Batch, Plan, Tile
 from nlosrender.engine.engines import Engine, SamplingEngine
@@ -78,7 +78,8 @@ def estimate_render_time(engine: Engine, plan: Plan, budget: Budget, lanes: int)
         lit_shares = _lit_shares(rays, engine.options.bounces)
         parts.append("error ~ 1 / sqrt(paths)" if budget.spp is None else "time ~ paths")
         seconds = math.inf if traced is None else seconds + traced
-    basis = f"pilot of {pilot.sensors.size} of {engine.capture.n_sensors} sensor points, {' and '.join(parts)}"
+    points = "pixels" if engine.capture.scan_type == LINE_OF_SIGHT else "sensor points"
+    basis = f"pilot of {pilot.sensors.size} of {engine.capture.n_sensors} {points}, {' and '.join(parts)}"
     if limit is not None and seconds >= limit:
         return TimeEstimate(limit, f"render.time_limit_s; {basis}", lit_shares)
     if math.isinf(seconds):

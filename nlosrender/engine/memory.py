@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
+from nlosrender.capture.bounces import LINE_OF_SIGHT
 from nlosrender.capture.grids import Capture
 from nlosrender.capture.plan import BYTES_PER_SUM, MOST_SUMS, Batch, Plan
 from nlosrender.engine.backend import batch_memory, physical_memory
@@ -12,7 +13,7 @@ from nlosrender.engine.skipped import traces_paths
 from nlosrender.engine.virtual_lights.block_histogram import BlockHistogram
 from nlosrender.engine.virtual_lights.engine import VirtualLightEngine
 from nlosrender.engine.virtual_lights.third_bounce import FIRST_COARSENESS, REFINEMENT
-from nlosrender.errors import RenderError
+from nlosrender.errors import ConfigError, Problem, RenderError
 
 PATCH_BYTES = 400  # float64 on the host, while they are cut and joined, and float32 on the device
 
@@ -52,8 +53,10 @@ def memory_warnings(engine: Engine, plan: Plan, memory_limit: int | None, lanes:
 
     Raises
     ------
+    ConfigError
+        A batch or the gather's patches do not fit the memory.
     RenderError
-        As ``batch_bytes``, or a batch or the gather's patches do not fit the memory.
+        As ``batch_bytes``.
     """
     taken, physical = batch_bytes(engine, plan), physical_memory()
     if isinstance(engine, VirtualLightEngine):
@@ -61,10 +64,7 @@ def memory_warnings(engine: Engine, plan: Plan, memory_limit: int | None, lanes:
     if memory_limit is not None and memory_limit > physical:
         yield f"render.memory_limit: {_size(memory_limit)} is more than the machine's {_size(physical)}."
     if taken > physical:
-        raise RenderError(
-            f"a batch takes {_size(taken)}, more than the machine's {_size(physical)}: the gather needs rows for every "
-            "processor. Use fewer bins or lasers, or render.engine: path."
-        )
+        raise ConfigError(Problem("", *_too_large(engine, taken, physical)))
     if taken > batch_memory(memory_limit):
         yield (
             f"render.memory_limit: a batch takes {_size(taken)}, more than is left for it: the gather needs rows for "
@@ -73,19 +73,33 @@ def memory_warnings(engine: Engine, plan: Plan, memory_limit: int | None, lanes:
     largest = max(batch.sensors.size for batch in plan.batches)
     if len(plan.batches) > 1 and traces_paths(engine) and largest * plan.replicas < lanes:
         yield (
-            f"render.memory_limit leaves batches of {largest} sensor points, too few to keep the machine busy; "
+            f"render.memory_limit leaves batches of {largest} {_points(engine)}, too few to keep the machine busy; "
             "a higher limit is faster."
         )
+
+
+def _too_large(engine: Engine, taken: int, physical: int) -> tuple[str, str]:
+    """Return the key to change and the message for a batch that does not fit the machine."""
+    found = f"a batch takes {_size(taken)}, more than the machine's {_size(physical)}"
+    if isinstance(engine, VirtualLightEngine):
+        advice = "the gather needs rows for every processor. Use fewer bins or lasers, or render.engine: path."
+        return "render.engine", f"{found}: {advice}"
+    return "render.memory_limit", f"{found}. Lower it, or use fewer bins or {_points(engine)}."
+
+
+def _points(engine: Engine) -> str:
+    return "pixels" if engine.capture.scan_type == LINE_OF_SIGHT else "sensor points"
 
 
 def _refuse_patches(engine: VirtualLightEngine, memory_limit: int) -> None:
     needed = engine.tessellator.count(FIRST_COARSENESS) * REFINEMENT
     if needed * PATCH_BYTES > memory_limit:
-        raise RenderError(
-            f"time_axis.bin_width_opl: bins of {engine.time_axis.bin_width_opl:.3g} m need {needed:.1e} patches of the "
-            f"hidden geometry, {_size(needed * PATCH_BYTES)}, but render.memory_limit leaves {_size(memory_limit)}. "
-            "Use wider bins, or render.engine: path."
+        message = (
+            f"bins of {engine.time_axis.bin_width_opl:.3g} m need {needed:.1e} patches of the hidden geometry, "
+            f"{_size(needed * PATCH_BYTES)}, but render.memory_limit leaves {_size(memory_limit)}. Use wider bins, or "
+            "render.engine: path."
         )
+        raise ConfigError(Problem("", "time_axis.bin_width_opl", message))
 
 
 def n_pairs(capture: Capture, batch: Batch) -> int:

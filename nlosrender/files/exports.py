@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from nlosrender.capture.bounces import FIRST_BOUNCE
-from nlosrender.errors import FileError
+from nlosrender.errors import OptionError
 from nlosrender.files.exports_mat import write_fk, write_lct, write_phasor_mat
 from nlosrender.files.exports_tal import write_tal
 from nlosrender.files.layout import STOKES
@@ -57,13 +57,12 @@ def export_capture(path: str | Path, output: str | Path, file_format: str, bounc
     Raises
     ------
     FileError
-        The format is unknown, it cannot hold this capture, or a file cannot be read or written.
+        The format cannot hold this capture, or a file cannot be read or written.
+    OptionError
+        There is no such format.
     """
-    if file_format not in WRITERS:
-        raise FileError(f"--format: got {file_format!r}, need one of {', '.join(FORMATS)}")
-    target = check_writable(output)
-    if target == Path(path).resolve():
-        raise FileError(f"{output}: is the capture itself. Name another output.")
+    suffix_of(file_format)  # refuses a format that there is not
+    target = check_writable(output, source=path)
     partial = partial_path(target)
     with open_capture(path) as capture:
         scan, indices = read_scan(capture), chosen_bounces(capture.header, bounces)
@@ -75,6 +74,19 @@ def export_capture(path: str | Path, output: str | Path, file_format: str, bounc
             finally:
                 partial.unlink(missing_ok=True)
     return ExportReport(Path(output), tuple(losses))
+
+
+def suffix_of(file_format: str) -> str:
+    """Return how the name of a file in a format ends.
+
+    Raises
+    ------
+    OptionError
+        There is no such format.
+    """
+    if file_format not in WRITERS:
+        raise OptionError(f"--format: got {file_format!r}, need one of {', '.join(FORMATS)}")
+    return SUFFIXES[file_format]
 
 
 def _general_losses(capture: StoredCapture, indices: tuple[int, ...]) -> list[str]:

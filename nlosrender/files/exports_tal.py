@@ -9,6 +9,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 
+from nlosrender.files.interruption import uninterrupted
 from nlosrender.files.layout import Float64
 from nlosrender.files.reader import StoredCapture
 from nlosrender.files.scan import Scan, light_bands
@@ -55,8 +56,10 @@ def write_tal(path: Path, capture: StoredCapture, scan: Scan, bounces: tuple[int
         samples = file.create_dataset("H", shape, "<f4", chunks=chunk, compression="gzip", compression_opts=1)
         for y, x in np.ndindex(*lasers):
             for part, light in light_bands(capture, (y, x), bounces):
-                where = (slice(None), *((x, y) if pairs else ()), slice(None), part)
-                samples[where] = light.transpose(2, 1, 0)
+                for column in range(columns):
+                    where = (slice(None), *((x, y) if pairs else ()), column, part)
+                    with uninterrupted():
+                        samples[where] = light[:, column].T
         _write_enum(file, "H_format", HFormat.T_Lx_Ly_Sx_Sy if pairs else HFormat.T_Sx_Sy)
         for name, position, points, stored in (
             ("sensor", scan.sensor_position, scan.sensors, capture.positions.sensor_normals),

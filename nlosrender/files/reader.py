@@ -159,7 +159,7 @@ def open_hdf5(path: Path) -> Iterator[h5py.File]:
         There is no such file, it cannot be read, or it is not an HDF5 file or cut short.
     """
     with explained_read(path):
-        _check_regular(path)
+        check_regular(path)
         if not h5py.is_hdf5(path):
             with path.open("rb") as stream:
                 start = stream.read(16)
@@ -202,11 +202,19 @@ def _advice(error: Exception) -> str:
     return "The file may be damaged: copy it again, or render it again."
 
 
-def _check_regular(path: Path) -> None:
-    try:
-        mode = path.stat().st_mode
-    except FileNotFoundError as error:
-        raise FileError(f"{path}: there is no such file") from error
+def check_regular(path: Path) -> None:
+    """Make sure that there is a file to read; a name for an output can be made of its name then.
+
+    Raises
+    ------
+    FileError
+        There is none, or it is a folder or a pipe.
+    """
+    with explained_read(path):
+        try:
+            mode = path.stat().st_mode
+        except (FileNotFoundError, NotADirectoryError) as error:
+            raise FileError(f"{path}: there is no such file") from error
     if stat.S_ISDIR(mode):
         raise FileError(f"{path}: is a folder. Name the capture file in it.")
     if not stat.S_ISREG(mode):  # a pipe would wait for its other end forever

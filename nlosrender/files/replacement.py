@@ -12,7 +12,7 @@ from pathlib import Path
 from nlosrender.errors import FileError
 
 
-def check_writable(path: str | Path, *, overwrite: bool = True) -> Path:
+def check_writable(path: str | Path, *, overwrite: bool = True, source: str | Path | None = None) -> Path:
     """Make sure a capture can be written to ``path``, before anything long is started.
 
     Parameters
@@ -21,6 +21,8 @@ def check_writable(path: str | Path, *, overwrite: bool = True) -> Path:
         File to be written; a symbolic link stands for the file it points to.
     overwrite
         Whether an existing file may be replaced.
+    source
+        The capture that is read for it, which must not be replaced.
 
     Returns
     -------
@@ -31,7 +33,7 @@ def check_writable(path: str | Path, *, overwrite: bool = True) -> Path:
     ------
     FileError
         The folder is missing, is not a folder or cannot be written to, or the path is taken by something that is
-        not a file, or by a file when ``overwrite`` is off.
+        not a file, by ``source``, or by a file when ``overwrite`` is off.
     """
     try:
         target = Path(os.path.realpath(path))
@@ -39,6 +41,8 @@ def check_writable(path: str | Path, *, overwrite: bool = True) -> Path:
             raise FileError(f"{path}: is a folder. Name a file in it, such as {target / 'capture.hdf5'}")
         if target.exists() and not target.is_file():
             raise FileError(f"{path}: is not a regular file and cannot be replaced by a capture. Name another output.")
+        if source is not None and target == Path(os.path.realpath(source)):
+            raise FileError(f"{path}: is the capture itself. Name another output.")
         if target.exists() and not overwrite:
             raise FileError(f"{path}: exists already. Name another output, or allow it to be overwritten.")
         if not target.parent.is_dir():

@@ -33,7 +33,13 @@ class FileSize:
 
 
 def forecast_size(
-    sizes: Mapping[str, int], confocal: bool, filled: Sequence[float], *, compression: str, variance: bool
+    sizes: Mapping[str, int],
+    confocal: bool,
+    filled: Sequence[float],
+    *,
+    compression: str,
+    variance: bool,
+    line_of_sight: bool = False,
 ) -> FileSize:
     """Return the size of a file that is not yet written.
 
@@ -50,6 +56,8 @@ def forecast_size(
         ``gzip`` or ``none``.
     variance
         Whether the variance is stored beside the samples.
+    line_of_sight
+        Whether a camera sees the light: no bounce is known better than from the pilot.
     """
     copies = 2 if variance else 1
     samples = copies * SAMPLE_BYTES
@@ -65,10 +73,10 @@ def forecast_size(
         return FileSize(logical, stored + small, stored / UNPACKED_SPEED, assumption)
     light = samples * rows * sizes["bin"] * sum(written)
     zeros = samples * rows * sizes["bin"] * len(written) - light
-    assumption = (
-        "third bounce in every bin it can reach, further bounces in as many as in the pilot; "
-        "light does not compress, zeros do"
-    )
+    reached = "third bounce in every bin it can reach, further bounces in as many as in the pilot"
+    if line_of_sight:
+        reached = "light in as many bins as in the pilot"
+    assumption = f"{reached}; light does not compress, zeros do"
     seconds = light / PACKING_LIGHT + zeros / PACKING_ZEROS
     return FileSize(logical, int(light * PACKED_LIGHT + zeros * PACKED_ZEROS) + small, seconds, assumption)
 

@@ -39,6 +39,28 @@ def test_new_writes_a_config_that_validates(starter: Path) -> None:
     )
 
 
+def test_what_a_camera_sees_is_not_hidden(tmp_path: Path) -> None:
+    """Shapes and emitters of a Mitsuba scene are counted; items of the config are items."""
+    (tmp_path / "lamps.xml").write_text(
+        '<scene version="3.0.0"><bsdf type="diffuse" id="grey"/><emitter type="point"/>'
+        '<shape type="rectangle"><ref id="grey"/></shape><shape type="sphere"/>'
+        '<shape type="rectangle"><emitter type="area"/></shape></scene>'
+    )
+    camera = (
+        "capture: {scan_type: line_of_sight, camera: {position: [0, 0, 4], look_at: [0, 0, 0], width: 5, height: 3}}"
+    )
+    item, lamp = "{type: sphere, center: [0, 0, 0], radius: 1}", "{type: point, position: [0, 2, 0], intensity: 1}"
+    for scene, expected in (
+        ("{mitsuba: lamps.xml}", "lamps.xml with 3 shapes and 2 emitters"),
+        (f"{{mitsuba: lamps.xml, hidden_geometry: [{item}]}}", "lamps.xml with 3 shapes and 2 emitters, 1 item"),
+        (f"{{hidden_geometry: [{item}], emitters: [{lamp}]}}", "1 item, 1 emitter"),
+        (f"{{emitters: [{lamp}]}}", "0 items, 1 emitter"),
+    ):
+        (tmp_path / "view.yaml").write_text(f"scene: {scene}\n{camera}\n")
+        result = runner.invoke(app, ["validate", str(tmp_path / "view.yaml")])
+        assert f"5 x 3 pixels, auto bins of 0.003 m, {expected})" in result.stdout, result.exception
+
+
 def test_new_without_a_path_prints_the_same_text(tmp_path: Path) -> None:
     """Standard output is the default and has another name."""
     printed = runner.invoke(app, ["new"]).stdout

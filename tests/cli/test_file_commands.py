@@ -163,11 +163,11 @@ def test_points_outside(capture: Path) -> None:
     assert "sensor_y 4 is outside the capture, which has 0 to 3" in str(result.exception)
 
 
-@pytest.mark.parametrize(("command", "creates"), [("info", "creates nothing"), ("plot", "creates two-planes.png")])
+@pytest.mark.parametrize(("command", "creates"), [("info", "creates nothing"), ("plot", "creates z.png")])
 def test_help_ends_with_an_example(command: str, creates: str) -> None:
     """Help shows one real command and what it creates."""
     text = " ".join(CliRunner().invoke(app, [command, "--help"]).stdout.split())
-    assert f"Example: `nlosrender {command} two-planes.hdf5" in text
+    assert f"Example: `nlosrender {command} z.hdf5" in text
     assert creates in text
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import h5py
@@ -11,7 +12,7 @@ from typer.testing import CliRunner
 
 from nlosrender.cli.app import app
 from nlosrender.cli.plan_command import readable_size
-from nlosrender.errors import ConfigError, RenderError
+from nlosrender.errors import EXIT_BAD_INPUT, ConfigError
 
 SCENE = """
 scene:
@@ -24,6 +25,16 @@ capture:
   LASERS
 time_axis: {bin_width_opl: 0.05, n_bins: auto}
 render: {max_bounces: 4, spp: 64}
+"""
+VIEW = """
+scene:
+  hidden_geometry: [{type: rectangle, width: 0.5, height: 0.4, center: [0, 0, 0.9], normal: [0, 0, -1]}]
+  emitters: [{type: point, position: [0, 0.3, 0], intensity: 1.0}]
+capture:
+  scan_type: line_of_sight
+  camera: {position: [0, 0, -1], look_at: [0, 0, 1], width: 5, height: 3}
+time_axis: {bin_width_opl: 0.05, n_bins: 200}
+render: {max_bounces: 3, spp: 16}
 """
 LASERS = {"single": "laser_point: [0.2, 0.1]", "confocal": "", "exhaustive": "laser_grid: {nx: 2, ny: 5}"}
 KEYS = {
@@ -136,10 +147,49 @@ def test_warnings_are_in_the_report_of_a_render_even_when_it_is_quiet():
 
 
 def test_impossible_sizes_end_in_an_error():
-    """Nothing is allocated for a grid that no machine holds."""
-    with pytest.raises(RenderError, match=r"capture\.sensor_grid: 1000000 x 1000000 points") as caught:
+    """Nothing is allocated for a grid that no machine holds; the configuration is to blame, and the place is told."""
+    with pytest.raises(ConfigError, match=r"^--set .*: capture\.sensor_grid: 1000000 x 1000000 points take") as caught:
         run("plan", write_config(), "--set", "capture.sensor_grid={nx: 1000000, ny: 1000000}")
-    assert caught.value.exit_code == 1
+    assert caught.value.exit_code == EXIT_BAD_INPUT
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        (
+            ["capture.camera.width=9999999", "time_axis.n_bins=auto", "render.memory_limit=8GB"],
+            r"camera: 9999999 x 3 pixels take 19.2 GB",
+        ),
+        (["capture.camera.width=2000000", "capture.camera.height=1000000"], r"camera: got 2_000_000_000_000 pixels"),
+        (["time_axis.n_bins=500000000", "render.memory_limit=1GB"], r"memory_limit: one pixel needs .* Raise it"),
+        (["time_axis.n_bins=2000000000", "capture.camera.width=1000"], r"n_bins: got 3_000 pixels with 2_000_000_000"),
+    ],
+)
+@pytest.mark.parametrize("command", ["plan", "render"])
+def test_pictures_too_large_are_the_cameras_fault(command, changes, message):
+    """A camera has pixels and no sensor grid; the key that the user wrote is named, with its place."""
+    Path("view.yaml").write_text(VIEW)
+    options = [part for change in changes for part in ("--set", change)]
+    with pytest.raises(ConfigError, match=rf"^(view\.yaml:\d+:\d+|--set [^ ]+): [a-z_]+\.{message}") as caught:
+        run(command, "view.yaml", *options)
+    assert caught.value.exit_code == EXIT_BAD_INPUT
+    assert "sensor" not in str(caught.value)
+
+
+def test_the_plan_of_a_view_is_in_a_cameras_words():
+    """Pixels and triangles: nothing is hidden, no point is a sensor's, and no bounce is the third."""
+    Path("view.yaml").write_text(VIEW)
+    result = run("plan", "view.yaml")
+    assert "line_of_sight, 5 x 3 pixels, 2 triangles" in result.stdout
+    assert "of 15 pixels, " in result.stdout
+    assert "(light in as many bins as in the pilot; light does not compress" in result.stdout
+    assert not re.search("hidden|sensor|third|bounce(?!s is)", result.stdout)
+    done = run("render", "view.yaml")
+    assert re.search(r"\d paths per pixel$", done.stdout, re.MULTILINE)
+    assert "energy          interactions 0: " in done.stdout
+    done = run("render", write_config())
+    assert re.search(r"\d paths per sensor point$", done.stdout, re.MULTILINE)
+    assert "energy          bounce 2: " in done.stdout
 
 
 def test_what_only_mitsuba_rejects_has_its_place():

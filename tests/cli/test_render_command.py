@@ -116,7 +116,7 @@ def test_a_capture_that_cannot_fit_is_refused(tmp_path):
         "render", write_config(tmp_path), "--set", "time_axis.n_bins=1000000000", "--set", "render.memory_limit=1GB",
         cwd=tmp_path,
     )  # fmt: skip
-    assert done.returncode == 1, done.stderr
+    assert done.returncode == 3, done.stderr
     assert "memory_limit" in done.stderr
 
 

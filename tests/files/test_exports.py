@@ -13,7 +13,7 @@ from scipy.io import loadmat
 from typer.testing import CliRunner
 
 from nlosrender.cli.app import app
-from nlosrender.errors import FileError
+from nlosrender.errors import FileError, OptionError
 from nlosrender.files.exports import FORMATS, export_capture
 from nlosrender.units import SPEED_OF_LIGHT
 
@@ -121,7 +121,7 @@ def test_what_a_format_cannot_hold_is_refused(tmp_path: Path) -> None:
     curved = write_points(tmp_path / "bent.hdf5", points_header("confocal", bent, planar_wall=False), [POINT])
     with pytest.raises(FileError, match=r"curved relay wall.*tal"):
         export_capture(curved, tmp_path / "out.mat", "lct")
-    with pytest.raises(FileError, match="need one of tal, fk, lct, phasor_mat"):
+    with pytest.raises(OptionError, match="need one of tal, fk, lct, phasor_mat"):
         export_capture(paths["single"], tmp_path / "out.mat", "mat")
     with pytest.raises(FileError, match="is the capture itself"):
         export_capture(paths["single"], paths["single"], "tal")

@@ -15,7 +15,7 @@ from nlosrender.capture.limits import refuse_impossible_grids, refuse_impossible
 from nlosrender.capture.part import Part, Tiling
 from nlosrender.capture.plan import Batch, Plan, Tile, Unit
 from nlosrender.engine.backend import start_backend
-from nlosrender.errors import RenderError
+from nlosrender.errors import ConfigError
 from nlosrender.files.size import FileSize, disk_warnings, forecast_size
 
 BOX = (np.array([-0.4, -0.7, 0.5]), np.array([0.9, 0.2, 1.6]))
@@ -127,7 +127,7 @@ def test_impossible_sizes_are_refused_before_anything_is_allocated(overrides, ma
     config = configured(flat_wall(PLATE, scan="exhaustive", bins=(0.0, 0.001, "auto")), overrides)
     tracemalloc.start()
     try:
-        with pytest.raises(RenderError, match=match):
+        with pytest.raises(ConfigError, match=match):
             pipeline.forecast_capture(config)
         assert tracemalloc.get_traced_memory()[1] < 400e6  # 600 x 600 points have 230 MB of their own
     finally:
@@ -139,7 +139,7 @@ def test_possible_sizes_are_not_refused():
     config = configured(flat_wall(PLATE, scan="exhaustive", sensors=(50, 30)))
     refuse_impossible_grids(config.capture, memory_limit=2_000_000)
     refuse_impossible_samples(config.capture, rows_per_pair=2, n_bins=300, memory_limit=1_000_000)
-    with pytest.raises(RenderError, match=r"sensor_grid: 50 x 30"):
+    with pytest.raises(ConfigError, match=r"sensor_grid: 50 x 30"):
         refuse_impossible_grids(config.capture, memory_limit=500_000)
 
 
@@ -285,6 +285,24 @@ def test_a_memory_limit_is_checked_against_machine_and_lanes():
     cut = plan_of((Batch(Tile(0, 1, 0, 2), Tile(0, 8, 0, 9)),) * 750, plan.replicas, 10**6)
     (warning,) = memory_warnings(engine, cut, 10**9, backend.lanes)
     assert "batches of 2 sensor points, too few" in warning
+
+
+@pytest.mark.parametrize(
+    ("engine", "message"),
+    [
+        ("path", r"^render\.memory_limit: a batch takes .* Lower it, or use fewer bins or sensor points\.$"),
+        ("virtual_lights", r"^render\.engine: a batch takes .* fewer bins or lasers, or render\.engine: path\.$"),
+    ],
+)
+def test_a_batch_larger_than_the_machine_is_the_configurations_fault(monkeypatch, engine, message):
+    """The key that helps is named: only the gather needs rows for every processor."""
+    from nlosrender.engine import memory
+
+    backend, plan, used = prepared(configured(flat_wall(PLATE, engine=engine, spp=None)))
+    monkeypatch.setattr(memory, "physical_memory", lambda: 1000)
+    monkeypatch.setattr(memory, "batch_memory", lambda limit: 10**12)
+    with pytest.raises(ConfigError, match=message):
+        list(memory.memory_warnings(used, plan, None, backend.lanes))
 
 
 def test_the_gather_takes_what_is_said():

@@ -18,7 +18,7 @@ from nlosrender.capture.plan import (
     tiles,
 )
 from nlosrender.capture.tile import Tile, joined, runs
-from nlosrender.errors import RenderError
+from nlosrender.errors import ConfigError
 from nlosrender.scene.pose import Pose
 from nlosrender.scene.relay_wall import RectangleWall
 
@@ -73,7 +73,7 @@ def test_replicas_depend_on_the_capture_not_on_the_memory():
 
 def test_a_pair_that_does_not_fit_is_an_error_that_says_what_to_do():
     """Nothing is allocated for a histogram that cannot fit."""
-    with pytest.raises(RenderError, match=r"memory_limit.*Raise it"):
+    with pytest.raises(ConfigError, match=r"memory_limit.*Raise it"):
         plan_capture(capture("single"), rows_per_pair=6, n_bins=10**9, lanes=8, memory_limit=10**9)
 
 
@@ -186,5 +186,5 @@ def test_neighbours_are_joined_along_rows_first():
 
 def test_a_storage_tile_that_does_not_fit_is_an_error_that_says_what_to_do():
     """What is put together from batches has to fit beside them."""
-    with pytest.raises(RenderError, match=r"memory_limit.*Raise it"):
+    with pytest.raises(ConfigError, match=r"memory_limit.*Raise it"):
         planned("exhaustive", 0.5)

@@ -1,0 +1,49 @@
+"""Folders of many files that appear together: written into a folder inside, then moved out of it."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+from nlosrender.errors import FileError
+from nlosrender.files.interruption import uninterrupted
+from nlosrender.files.replacement import explained_write
+
+
+@contextmanager
+def filled_folder(folder: str | Path) -> Iterator[Path]:
+    """Give the block an empty folder; what it leaves there moves to ``folder``, over files of the same names.
+
+    A block that fails or is interrupted leaves no file behind, nor a folder that was not there before.
+
+    Parameters
+    ----------
+    folder
+        Where the files go; made where there is none.
+
+    Raises
+    ------
+    FileError
+        It is a file or cannot be written to, or an OSError left the block.
+    """
+    with explained_write(folder):
+        target = Path(os.path.realpath(folder))
+        if target.exists() and not target.is_dir():
+            raise FileError(f"{folder}: is a file. Name a folder, which may be a new one.")
+        is_new = not target.exists()
+        target.mkdir(parents=True, exist_ok=True)
+        unfinished = target / f".{os.getpid()}.partial"  # inside: beside it may be another disk
+        try:
+            unfinished.mkdir(exist_ok=True)
+            yield unfinished
+            with uninterrupted():
+                for file in sorted(unfinished.iterdir()):
+                    os.replace(file, target / file.name)
+        finally:
+            shutil.rmtree(unfinished, ignore_errors=True)
+            if is_new:
+                with suppress(OSError):  # not empty: all went well
+                    target.rmdir()
