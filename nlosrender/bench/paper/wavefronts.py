@@ -75,9 +75,12 @@ def arrivals(study: Study, name: str, *overrides: str) -> tuple[Float64, Float64
     points = np.concatenate([_points_on(mesh) for mesh in meshes])
     to_laser = np.linalg.norm(points - capture.laser_grid.positions.reshape(-1, 3)[0], axis=-1)
     sensors = capture.sensor_grid.positions
-    ways = [np.linalg.norm(points - sensor, axis=-1) + to_laser for sensor in sensors.reshape(-1, 3)]
-    first, last = (np.array([end(way) for way in ways]) for end in (np.min, np.max))
-    return first.reshape(sensors.shape[:2]), last.reshape(sensors.shape[:2])
+    ends = np.empty((2, sensors.shape[0] * sensors.shape[1]))
+    for number, sensor in enumerate(sensors.reshape(-1, 3)):  # one by one: all ways at once may be 10 GB
+        ways = np.linalg.norm(points - sensor, axis=-1) + to_laser
+        ends[:, number] = ways.min(), ways.max()
+    first, last = ends.reshape(2, *sensors.shape[:2])
+    return first, last
 
 
 def _points_on(mesh: TriangleMesh) -> Float64:
