@@ -24,6 +24,7 @@ def z_letter(study: Study) -> PaperFigure:
     rendered = study.render("z-letter", "z-letter", f"capture.sensor_grid={grid}")
     light, edges = rendered.light()[0, 0], rendered.bin_edges()
     first, last = arrivals(study, "z-letter", f"capture.sensor_grid={grid}")
+    row = light.shape[0] // 2
     lit = light > 0
     found_first = lit.argmax(axis=-1)
     found_last = lit.shape[-1] - 1 - lit[..., ::-1].argmax(axis=-1)
@@ -41,7 +42,7 @@ def z_letter(study: Study) -> PaperFigure:
         f"{rendered.seconds:.2f} s. The first and the last light of {first.size} sensor points are at most {worst} "
         f"bin(s) of {1000 * width:g} mm from the shortest and the longest way over the letter; the first in exactly "
         f"its bin at {exact:.1%} of the points.",
-        pictures=(_picture(study, "z-letter", rendered, "figure-4-z-letter", first, last),),
+        pictures=(_picture(study, "z-letter", rendered, "figure-4-z-letter", first[row], last[row]),),
         checks=(Check("first and last light within one bin of the geometry's at every sensor point", worst <= 1),),
         configurations=("z-letter",),
     )
@@ -51,22 +52,24 @@ def captured_letters(study: Study) -> PaperFigure:
     """Figure 1: what a capture of hidden letters looks like."""
     grid = f"capture.sensor_grid={study.pick('{nx: 64, ny: 64}', '{nx: 256, ny: 256}')}"
     rendered = study.render("letters-near", "letters-virtual-lights", grid)
-    first, last = arrivals(study, "letters-near", grid)
+    ny, nx = rendered.light().shape[2:4]
+    middle = ny // 2
+    first, last = arrivals(study, "letters-near", grid, rows=slice(middle, middle + 1))
     return PaperFigure(
         name="Figure 1",
         title="captured data of hidden letters",
         reported="A laser and a sensor look at a relay wall; the light of the hidden letters crosses it as wavefronts.",
         measured=f"{rendered.report.engine}, error estimate {rendered.report.error_estimate:.2%}, "
-        f"{rendered.seconds:.2f} s for {first.size} sensor points of {len(rendered.bin_edges()) - 1} bins.",
-        pictures=(_picture(study, "letters-near", rendered, "figure-1-letters", first, last),),
+        f"{rendered.seconds:.2f} s for {ny * nx} sensor points of {len(rendered.bin_edges()) - 1} bins.",
+        pictures=(_picture(study, "letters-near", rendered, "figure-1-letters", first[0], last[0]),),
         configurations=("letters-near",),
     )
 
 
-def arrivals(study: Study, name: str, *overrides: str) -> tuple[Float64, Float64]:
+def arrivals(study: Study, name: str, *overrides: str, rows: slice = slice(None)) -> tuple[Float64, Float64]:
     """Return the shortest and the longest way laser point -> hidden surface -> sensor point, (y, x) each [m].
 
-    Occlusion is not looked at: of a thick letter the sides count as well.
+    Of the sensor points in ``rows``. Occlusion is not looked at: of a thick letter the sides count as well.
     """
     config = study.config(name, *overrides)
     wall, surfaces = pipeline.place_scene(config)
@@ -74,7 +77,7 @@ def arrivals(study: Study, name: str, *overrides: str) -> tuple[Float64, Float64
     meshes = [surface.shape for surface in surfaces if isinstance(surface.shape, TriangleMesh)]
     points = np.concatenate([_points_on(mesh) for mesh in meshes])
     to_laser = np.linalg.norm(points - capture.laser_grid.positions.reshape(-1, 3)[0], axis=-1)
-    sensors = capture.sensor_grid.positions
+    sensors = capture.sensor_grid.positions[rows]
     ends = np.empty((2, sensors.shape[0] * sensors.shape[1]))
     for number, sensor in enumerate(sensors.reshape(-1, 3)):  # one by one: all ways at once may be 10 GB
         ways = np.linalg.norm(points - sensor, axis=-1) + to_laser
@@ -111,8 +114,8 @@ def _picture(study: Study, configuration: str, rendered: Rendered, name: str, fi
         show_wall(part, frame, half_width, f"wall at {edges[moment]:.2f} m")
     show_row(axes[0, -1], light[row], edges, half_width, "middle row over time")
     x = (np.arange(light.shape[1]) + 0.5) / light.shape[1] * 2 * half_width - half_width
-    axes[0, -1].plot(first[row], x, color=MARK, lw=1, label="first")
-    axes[0, -1].plot(last[row], x, color=MARK, lw=1, ls=":", label="last")
+    axes[0, -1].plot(first, x, color=MARK, lw=1, label="first")
+    axes[0, -1].plot(last, x, color=MARK, lw=1, ls=":", label="last")
     caption = "The wall at four moments, and its middle row over time; lines: the shortest (solid) and longest (dotted)\
  way over the hidden geometry."
     return Picture(save(figure, study.picture(name)), caption)
