@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -12,13 +13,16 @@ from nlosrender.bench.runs import Float64, LoadedScene, Timer, load
 from nlosrender.bench.scenes import WALL_SIZE, BenchScene, closed_room, many_lasers
 
 if TYPE_CHECKING:
-    from nlosrender.capture.plan import Plan
-    from nlosrender.engine.path_engine import PathEngine
+    from nlosrender.capture.plan import Batch, Plan
+    from nlosrender.engine.engines import Engine
+    from nlosrender.engine.path_engine import Budget, PathEngine
     from nlosrender.engine.virtual_lights.engine import VirtualLightEngine
 
 ROUNDS = 3
 GATHER_TARGET = 0.01
 PATHS = 1024  # per sensor point
+SHORT_WINDOW_BINS = 100  # of 3 cm: less than two ways to the far side of the room and back
+ROOM_TARGET = 0.03
 ROOM_POINTS = 64  # sensor points along each side: enough for regions
 LASERS = 12  # along each side, and as many sensor points
 FINENESS = 0.3
@@ -54,7 +58,10 @@ def measure_skips(scenes: Sequence[BenchScene]) -> list[Saving]:
     for scene in scenes:
         savings += _of_gather(load(scene))
         savings += _of_paths(load(scene))
-    savings += _of_paths(load(closed_room(16)))
+    room = closed_room(16)
+    savings += _of_paths(load(room))
+    short = {**room.sections["time_axis"], "n_bins": SHORT_WINDOW_BINS}
+    savings += _of_late_light(load(replace(room, sections={**room.sections, "time_axis": short})))
     savings += _of_regions(load(closed_room(ROOM_POINTS)))
     savings += _of_reciprocity(load(many_lasers(LASERS, LASERS, WALL_SIZE)))
     return savings
@@ -169,6 +176,30 @@ def _of_paths(loaded: LoadedScene) -> Iterator[Saving]:
         kept = "hidden geometry" if engine.hidden_fraction else "BSDF"
         mixed = engine_with(hidden_fraction=MIXTURE)
         yield _saving(f"MIS where {kept} sampling suffices", loaded, render(engine), render(mixed))
+
+
+def _of_late_light(loaded: LoadedScene) -> Iterator[Saving]:
+    """Yield what is left out that comes after the window: of as many paths, and of walks to the same error."""
+    from nlosrender import pipeline
+    from nlosrender.engine.path_engine import Budget, PathEngine
+    from nlosrender.engine.virtual_lights.engine import VirtualLightEngine
+
+    built, capture, time_axis = loaded.built, loaded.capture, loaded.time_axis
+    for name in ("path", "virtual_lights"):
+        config = loaded.scene.config(engine=name, split_bounces=False)
+        plan, engine = pipeline.prepare(config, loaded.backend, built, capture, time_axis)
+        options = replace(engine.options, late_roulette=False)
+        if isinstance(engine, VirtualLightEngine):
+            patient: Engine = VirtualLightEngine(built, capture, time_axis, options, engine.lanes)
+            budget = Budget(target_error=ROOM_TARGET)
+        else:
+            patient, budget = PathEngine(built, capture, time_axis, options), Budget(spp=PATHS)
+
+        def render(one: Engine, budget: Budget = budget, batches: Sequence[Batch] = plan.batches) -> Float64:
+            return np.concatenate([one.render(batch, one.settle(budget)).mean for batch in batches], axis=3)
+
+        what = {"path": "most paths", "virtual_lights": "most walks"}[name] + " that end after the window"
+        yield _saving(what, loaded, partial(render, engine), partial(render, patient))
 
 
 def _saving(what: str, loaded: LoadedScene, skipping: Callable[[], Float64], doing: Callable[[], Float64]) -> Saving:

@@ -33,8 +33,8 @@ def earliest_arrival(capture: Capture, wall: RelayWall, hidden_bounds: Bounds | 
         return float(np.min(opl)) - 2 * capture.laser_spot_radius
     if hidden_bounds is None:
         return math.inf
-    to_laser = laser_legs + _distance_to_box(_points(capture.laser_grid), hidden_bounds)
-    to_sensor = sensor_legs + _distance_to_box(_points(capture.sensor_grid), hidden_bounds)
+    to_laser = laser_legs + distance_to_box(_points(capture.laser_grid), hidden_bounds)
+    to_sensor = sensor_legs + distance_to_box(_points(capture.sensor_grid), hidden_bounds)
     opl = to_laser + to_sensor if capture.scan_type == "confocal" else to_laser.min() + to_sensor.min()
     return float(np.min(opl)) - 2 * capture.laser_spot_radius
 
@@ -120,7 +120,7 @@ def _third_bounce_spans(capture: Capture, hidden_bounds: Bounds) -> tuple[Float6
     for grid, legs in ((capture.laser_grid, capture.laser_legs), (capture.sensor_grid, capture.sensor_legs)):
         index = sampled_indices(grid)
         points, leg = _points(grid)[index], legs.reshape(-1)[index]
-        nearest.append(leg + _distance_to_box(points, hidden_bounds))
+        nearest.append(leg + distance_to_box(points, hidden_bounds))
         farthest.append(leg + np.linalg.norm(corners[:, None] - points[None], axis=-1))
     if capture.scan_type == "confocal":
         return nearest[0] + nearest[1], (farthest[0] + farthest[1]).max(axis=0)
@@ -138,5 +138,6 @@ def _points(grid: PointGrid) -> Float64:
     return grid.positions.reshape(-1, 3)
 
 
-def _distance_to_box(points: Float64, box: Bounds) -> Float64:
+def distance_to_box(points: Float64, box: Bounds) -> Float64:
+    """Return the distance of points (n, 3) to a box, (n,), 0 inside; all in one unit."""
     return np.linalg.norm(np.maximum(np.maximum(box[0] - points, points - box[1]), 0), axis=-1)

@@ -14,6 +14,7 @@ from nlosrender.capture.grids import Capture
 from nlosrender.capture.plan import MOST_SUMS, Batch
 from nlosrender.capture.time_axis import TimeAxis
 from nlosrender.engine.connections import offset_origin
+from nlosrender.engine.deadline import Horizon, light_leaves_window
 from nlosrender.engine.device_arrays import laser_points, sensor_points
 from nlosrender.engine.histogram import DeviceHistogram, Histogram, HistogramShape
 from nlosrender.engine.path_integrator import load_path_integrator
@@ -50,6 +51,7 @@ class PathOptions:
     channels: int = 1
     seed: int = 0
     replicas: int = 2
+    late_roulette: bool = True  # few paths go on that can only bring light after the time window
     temporal_kernel_bins: float = 0.0  # full width of the kernel in time [bins]; 0: a plain histogram
     hidden_fraction: float | None = None  # share of hidden geometry sampling on the wall; None: chosen from the scene
 
@@ -99,6 +101,9 @@ class PathEngine:
         # Throughput is per (engine unit)^2: H falls with the square of a scene's size.
         self.scale = capture.laser_energy / built.unit**2
         self.kernel = TemporalKernel(options.temporal_kernel_bins) if options.temporal_kernel_bins > 0 else None
+        # None: nothing can arrive after the window, and no path is ended for it
+        thins_out = options.late_roulette and light_leaves_window(built, capture, time_axis, options.bounces)
+        self.horizon = Horizon.of(built, capture, time_axis) if thins_out else None
         self.compile_seconds = 0.0
 
     def render(
@@ -214,7 +219,8 @@ class PathEngine:
 
     def transport(self, batch: Batch | Pilot, shape: HistogramShape) -> Transport:
         """Return what the lanes of a batch read."""
-        sensors = sensor_points(self.built, self.capture, self.time_axis, self.sensor_indices(batch))
+        index, horizon = self.sensor_indices(batch), self.horizon
+        sensors = sensor_points(self.built, self.capture, self.time_axis, index)
         lasers = laser_points(self.built, self.capture, self.time_axis, self.laser_indices(batch))
         lane = dr.arange(mi.UInt32, shape.lanes)
         sensor = lane % shape.sensors
@@ -222,6 +228,9 @@ class PathEngine:
         first_laser = mi.UInt32(sensor) if confocal else dr.zeros(mi.UInt32, shape.lanes)
         per_lane = sensors.gather(sensor)
         dr.eval(per_lane.interaction, per_lane.delay_bins, per_lane.delay_fraction, first_laser)
+        deadline = None
+        if horizon is not None:
+            deadline = horizon.deadline_of_sensors(self.built, self.capture, self.time_axis, index, shape.lanes)
         return Transport(
             built=self.built,
             sampler=self.sampler,
@@ -231,6 +240,7 @@ class PathEngine:
             lasers_per_lane=shape.lasers,
             n_lasers=dr.opaque(mi.UInt32, shape.lasers),
             bins_per_unit=dr.opaque(mi.Float, self.built.unit / self.time_axis.bin_width_opl),
+            deadline=deadline,
         )
 
     def second_bounce(self, batch: Batch) -> np.ndarray:

@@ -17,6 +17,7 @@ import mitsuba as mi
 
 from nlosrender.capture.bounces import FIRST_BOUNCE, BounceAxis
 from nlosrender.engine.connections import connect_to_lasers, deposit_spot, leg_to_tangent_plane, offset_origin
+from nlosrender.engine.deadline import thinned_out
 from nlosrender.engine.direct_paths import are_direct, trace_direct_paths
 from nlosrender.engine.histogram import DeviceHistogram
 from nlosrender.engine.low_discrepancy import recurrence_steps
@@ -48,6 +49,7 @@ def trace_paths(
     steps = recurrence_steps(2) if 0 < q < 1 else (*recurrence_steps(1), 1)  # the second chooses the technique
     stride = strata.stride
     max_bounces, last_vertex = settings.bounces.max_bounces, settings.last_vertex
+    deadline = transport.deadline if settings.thins_out else None
 
     # ---- State -------------------------------------------------------------------------------------------------
     generator = mi.PCG32(randomness.generator)
@@ -69,9 +71,12 @@ def trace_paths(
     target_shape = mi.ShapePtr(built.wall_shape)
     target_primitive = mi.UInt32(0)
     has_target = mi.Bool(False)
+    is_thinned = mi.Bool(False)  # the path can only bring light after the window, and has survived that roulette
 
     # what a launch reads is no state of the loop
-    while dr.hint(alive | (started < n_samples), exclude=[settings, transport, histogram, built, sampler, sensors]):
+    while dr.hint(
+        alive | (started < n_samples), exclude=[settings, transport, histogram, built, sampler, sensors, deadline]
+    ):
         # ---- Intersect -----------------------------------------------------------------------------------------
         si = scene.ray_intersect(ray, mi.RayFlags.All, coherent=False, active=alive)
         hit = alive & si.is_valid()
@@ -116,6 +121,9 @@ def trace_paths(
         bounce += 1
         hit &= dr.any(mi.unpolarized_spectrum(throughput) != 0)
 
+        # ---- Thin out what comes after the window, once a path ---------------------------------------------------
+        hit, is_thinned, throughput = thinned_out(deadline, generator, hit, is_thinned, opl, si.p, on_wall, throughput)
+
         # ---- Connect to the lasers and deposit ---------------------------------------------------------------------
         if dr.hint(settings.laser_sampling, mode="scalar"):
             in_reach = mi.Bool(hit)
@@ -142,6 +150,7 @@ def trace_paths(
             opl = dr.select(start, 0, opl)
             bounce = dr.select(start, mi.UInt32(FIRST_BOUNCE), bounce)
             medium = dr.select(start, 1, medium)
+            is_thinned &= ~start
         else:
             vertex = sensors.interaction
             throughput = _at_sensor(sensors.interaction)

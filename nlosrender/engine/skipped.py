@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from nlosrender.capture.bounces import THIRD_BOUNCE
+from nlosrender.engine.deadline import LATE_SURVIVAL
 from nlosrender.engine.engines import Engine
 from nlosrender.engine.line_of_sight.engine import LineOfSightEngine
 from nlosrender.engine.path_engine import PathEngine
@@ -49,6 +50,13 @@ def skipped_work(engine: Engine, *, scene_is_colored: bool) -> tuple[Skipped, ..
         if dark:
             why = "they face away from the whole wall or lie behind it: no ray is sent to them"
             skipped.append(Skipped(f"{dark} of {built.n_triangles} triangles", why))
+    if isinstance(engine, VirtualLightEngine) and engine.third.is_reciprocal:
+        why = "laser and sensor points are the same and everything is Lambertian: H(l, s) = H(s, l)"
+        skipped.append(Skipped("half of the pairs of laser and sensor points", why))
+    if _thins_out(engine, paths):
+        many = round(1 / LATE_SURVIVAL)
+        why = f"one in {many} goes on, with {many} times the weight: the light outside the window is not biased"
+        skipped.append(Skipped("most paths on which light can only arrive after the time window", why))
     skipped += _colour(options.channels, scene_is_colored)
     return (*skipped, *(_techniques(paths) if traces_paths(engine) else ()))
 
@@ -67,6 +75,15 @@ def _of_view(engine: LineOfSightEngine, scene_is_colored: bool) -> Iterator[Skip
 def _colour(channels: int, scene_is_colored: bool) -> Iterator[Skipped]:
     if channels == 1:
         yield Skipped("colour", "render.color is grey" if scene_is_colored else "everything in the scene is grey")
+
+
+def _thins_out(engine: VirtualLightEngine | PathEngine, paths: PathEngine) -> bool:
+    """Return whether paths or walks go on after light can arrive in the window, as far as the bounces tell."""
+    if paths.horizon is None:
+        return False
+    if isinstance(engine, VirtualLightEngine) and engine.further is not None:
+        return True
+    return traces_paths(engine) and paths.settings.thins_out
 
 
 def _techniques(paths: PathEngine) -> Iterator[Skipped]:

@@ -8,6 +8,7 @@ import drjit as dr
 import mitsuba as mi
 
 from nlosrender.capture.bounces import FIRST_BOUNCE, BounceAxis
+from nlosrender.engine.deadline import Deadline
 from nlosrender.engine.device_arrays import WallPoints
 from nlosrender.engine.surface_sampler import SurfaceSampler
 from nlosrender.scene.build import BuiltScene
@@ -40,6 +41,11 @@ class PathSettings:
         return highest + 1 if highest is not None and self.finds_spot else highest
 
     @property
+    def thins_out(self) -> bool:
+        """Whether few paths go on that can only bring light after the time window."""
+        return self.goes_on and self.russian_roulette
+
+    @property
     def finds_spot(self) -> bool:
         """Whether rays may find the laser's spot by chance."""
         return self.spot_radius > 0
@@ -57,6 +63,7 @@ class Transport:
     lasers_per_lane: int
     n_lasers: mi.UInt32  # opaque copy of ``lasers_per_lane``: its value is not part of the kernel
     bins_per_unit: mi.Float  # engine unit / bin width, opaque
+    deadline: Deadline | None  # None: all light arrives before the end of the window
 
     def of_lanes(self, index: mi.UInt32) -> Transport:
         """Return what the lanes at ``index`` read."""

@@ -176,6 +176,11 @@ TUBE = {"type": "cylinder", "center": [0, 0, 0], "axis": [0, 1, 0], "radius": 1.
         ("bounces above 4", ((PLATE,), {"max_bounces": 4}), ((PLATE,), {"max_bounces": None})),
         ("visibility rays", ((PLATE,), {}), ((PLATE, BALL), {})),
         ("visibility rays", ((PLATE,), {"engine": "path"}), ((PLATE, BALL), {"engine": "path"})),
+        (
+            "half of the pairs of laser and sensor points",
+            ((PLATE,), {"scan": "exhaustive", "capture": {"laser_grid": {"nx": 5, "ny": 3}}}),
+            ((PLATE,), {"scan": "exhaustive", "capture": {"laser_grid": {"nx": 5, "ny": 4}}}),
+        ),
         ("2 of 12 triangles", ((BOX_ITEM,), {}), ((PLATE,), {})),
         ("colour", ((PLATE,), {}), (({**PLATE, "bsdf": RED},), {})),
         ("colour", (({**PLATE, "bsdf": RED},), {"color": "grey"}), ((PLATE,), {"color": "rgb"})),

@@ -56,7 +56,7 @@ class FurtherBounces:
         self.paths, self.needs_visibility = paths, needs_visibility
         self.built, self.options = paths.built, paths.options
         built, capture, time_axis = paths.built, paths.capture, paths.time_axis
-        self.sampler = SiteSampler(tessellator)
+        self.sampler = SiteSampler(tessellator, paths.horizon)
         tried = spread(capture.laser_grid, TRIED_PER_AXIS)
         points = laser_points(built, capture, time_axis, np.array(tried.indices, dtype=np.uint32))
         self.tried = TriedLasers(points, tried.size, tried.size == capture.n_lasers)
@@ -73,7 +73,8 @@ class FurtherBounces:
         """Return the numbers of a round of ``replicas`` independent sets of sites."""
         sites = max(self.sites_per_round // replicas, 16)
         max_bounces = self.options.bounces.max_bounces
-        return WalkPlan(replicas, sites, self.walks, self.impulses_per_site, max_bounces, self.is_confocal)
+        confocal, horizon = self.is_confocal, self.paths.horizon
+        return WalkPlan(replicas, sites, self.walks, self.impulses_per_site, max_bounces, confocal, horizon)
 
     @property
     def impulses_per_round(self) -> int:

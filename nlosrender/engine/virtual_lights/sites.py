@@ -12,12 +12,16 @@ from dataclasses import dataclass, fields
 import numpy as np
 from numpy.typing import NDArray
 
+from nlosrender.engine.deadline import LATE_SURVIVAL, Horizon
 from nlosrender.engine.low_discrepancy import recurrence_steps
 from nlosrender.engine.space_filling import z_order
 from nlosrender.engine.virtual_lights.cells import longest_edges, normals_and_areas
 from nlosrender.engine.virtual_lights.round_shapes import onto_round_shapes
 from nlosrender.engine.virtual_lights.tessellator import Tessellator
 from nlosrender.scene.pose import Float64
+
+# Barycentric coordinates of a cell's centre, and of the points between it and the corners.
+POINTS_OF_CELL = np.concatenate([np.full((1, 3), 1 / 3), np.full((3, 3), 1 / 6) + np.eye(3) / 2])
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,9 +53,11 @@ class SiteSampler:
     ----------
     tessellator
         Holds the cells of meshes and round shapes.
+    horizon
+        Of cells beyond it few sites are drawn; None: none is.
     """
 
-    def __init__(self, tessellator: Tessellator):
+    def __init__(self, tessellator: Tessellator, horizon: Horizon | None = None):
         cells, on_round = tessellator.cells, tessellator.round_cells()
         self._corners = np.concatenate([cells.corners, *(patches.corners for _, patches in on_round)])
         self._weights = np.concatenate([cells.weights, *(np.zeros((len(patches), 3, 3)) for _, patches in on_round)])
@@ -60,18 +66,26 @@ class SiteSampler:
         rows = [np.repeat(shape.row[None], len(patches), axis=0) for shape, patches in on_round]
         self._round_rows = np.concatenate([np.zeros((len(cells.corners), 7)), *rows])
         self._normals, self._areas = normals_and_areas(self._corners)
-        distances = tessellator.distance(self._corners.mean(axis=1))
+        centres = self._corners.mean(axis=1)
+        distances = tessellator.distance(centres)
         sizes = longest_edges(self._corners)
         # a cell is no longer than its distance; its own size stands for the distance where it touches a point
         distances = np.maximum(distances, sizes / 2)
         self._reach = distances * (distances + tessellator.reach)
-        order = np.lexsort((z_order(self._corners.mean(axis=1)), self._shapes))  # shape by shape, neighbours together
+        order = np.lexsort((z_order(centres), self._shapes))  # shape by shape, neighbours together
         importance = (self._areas / self._reach)[order]
+        if horizon is not None:
+            importance *= 1 - (1 - LATE_SURVIVAL) * self._late_shares(horizon)[order]
         self._order = order
         self.is_empty = not importance.sum() > 0
         if not self.is_empty:
             self._probability = importance / importance.sum()
             self._cumulative = np.cumsum(self._probability)
+
+    def _late_shares(self, horizon: Horizon) -> Float64:
+        """Return the share of each cell that lies beyond ``horizon``, told by a few of its points: any will do."""
+        points = (np.einsum("k,nkx->nx", weights, self._corners) for weights in POINTS_OF_CELL)
+        return np.mean([horizon.is_beyond(point) for point in points], axis=0)
 
     def sample(self, count: int, generator: np.random.Generator) -> Sites:
         """Draw ``count`` sites: one in each of as many equal parts of the cells' measure.

@@ -4,7 +4,8 @@ Sensor points see light that leaves sites; where that light came from is found b
 the sensor points, until a vertex is connected to the lasers (Royo et al. 2022, section 4, read backwards; the sites
 are the virtual point lights of Keller 1997). Every sensor point looks at every site, so a walk is cheap beside the
 gather of what it brings: many are made, and few impulses are kept, with a probability in proportion to the light they
-bring, so that all carry the same (resampled importance sampling, Talbot et al. 2005).
+bring, so that all carry the same (resampled importance sampling, Talbot et al. 2005). What can only arrive after the
+time window counts for little there, and few walks go on to it.
 """
 
 from __future__ import annotations
@@ -18,7 +19,8 @@ from numpy.typing import NDArray
 
 from nlosrender.capture.bounces import FIRST_BOUNCE
 from nlosrender.engine.connections import connection_segment, offset_origin
-from nlosrender.engine.device_arrays import WallPoints
+from nlosrender.engine.deadline import LATE_SURVIVAL, Deadline, Horizon, thinned_out
+from nlosrender.engine.device_arrays import WallPoints, on_device
 from nlosrender.engine.transport import HIGHEST_SURVIVAL, LaneRandomness, Transport
 from nlosrender.engine.virtual_lights.lights import normal_reflectance, surface_at
 from nlosrender.engine.virtual_lights.sites import Sites
@@ -76,6 +78,7 @@ def trace_walks(
     reflectance: mi.Spectrum,
     tried: TriedLasers,
     max_bounces: int | None,
+    deadline: Deadline | None,
     randomness: LaneRandomness,
 ) -> WalkEnds:
     """Walk on from sites until roulette, an escape or ``max_bounces`` ends it.
@@ -90,6 +93,8 @@ def trace_walks(
         Lasers by which vertices are judged.
     max_bounces
         Highest bounce; None for no limit.
+    deadline
+        After which light comes too late, per walk; None: none does.
     randomness
         One generator per walk.
     """
@@ -108,13 +113,19 @@ def trace_walks(
     position, normal, shading = mi.Point3f(0), mi.Normal3f(0), mi.Normal3f(0)
     carried, chosen_opl, chosen_bounce = mi.Spectrum(0), mi.Float(0), mi.UInt32(0)
     expected, total = mi.Float(0), mi.Float(0)
+    is_thinned = mi.Bool(False)  # the walk can only find light that comes too late, and has survived that roulette
 
-    while dr.hint(alive, exclude=[built, scene, tried, sites]):
+    while dr.hint(alive, exclude=[built, scene, tried, sites, deadline]):
         # ---- Intersect -------------------------------------------------------------------------------------------
         si = scene.ray_intersect(ray, mi.RayFlags.All, coherent=False, active=alive)
         alive = alive & si.is_valid()
         opl += dr.norm(si.p - origin)
         bounce += 1
+
+        # ---- Thin out what comes after the window, once a walk -------------------------------------------------------
+        alive, is_thinned, throughput = thinned_out(
+            deadline, generator, alive, is_thinned, opl, si.p, si.shape == wall, throughput
+        )
 
         # ---- What the lasers would bring, were nothing between; a plane is dark to its own laser points -------------
         bsdf = si.bsdf()
@@ -131,6 +142,8 @@ def trace_walks(
         if dr.hint(not tried.are_all, mode="scalar"):
             away = dr.squared_norm(si.p - tried.points.gather(mi.UInt32(0)).interaction.p)
             lit += UNTRIED_SHARE * dr.mean(leaving) / away
+        if dr.hint(deadline is not None, mode="scalar"):
+            lit = dr.select(is_thinned, lit * LATE_SURVIVAL, lit)
         lit = dr.select(hidden, lit, 0)
         total += lit
         pick = (lit > 0) & (generator.next_float32(alive) * total < lit)
@@ -175,6 +188,7 @@ class WalkPlan:
     impulses: int  # kept per site, on average
     max_bounces: int | None
     is_confocal: bool
+    horizon: Horizon | None  # beyond which light comes too late; None: none does
 
 
 def walk_back(plan: WalkPlan, transport: Transport, sites: Sites, tried: TriedLasers, seed: int) -> Impulses:
@@ -198,12 +212,16 @@ def walk_back(plan: WalkPlan, transport: Transport, sites: Sites, tried: TriedLa
     reflectance = normal_reflectance(surface)
     dr.eval(surface, reflectance)
     owner = dr.arange(mi.UInt32, len(sites) * plan.walks) // plan.walks
+    deadline = None
+    if plan.horizon is not None:
+        deadline = plan.horizon.deadline_from(np.repeat(sites.positions, plan.walks, axis=0))
     ends = trace_walks(
         built,
         dr.gather(mi.SurfaceInteraction3f, surface, owner),
         dr.gather(mi.Spectrum, reflectance, owner),
         tried,
         plan.max_bounces,
+        deadline,
         LaneRandomness.seeded(seed, dr.arange(mi.UInt32, dr.width(owner))),
     )
     dr.eval(ends)
@@ -221,9 +239,11 @@ def walk_back(plan: WalkPlan, transport: Transport, sites: Sites, tried: TriedLa
     if not n_kept:
         return no_impulses()
     index = dr.arange(mi.UInt32, n_kept * n_lasers)
-    entry = index // n_kept * len(walk) + dr.gather(mi.UInt32, kept, index % n_kept)
+    # opaque: no two rounds keep as many, and each number would be a kernel to compile
+    per_laser, found = dr.opaque(mi.UInt32, n_kept), dr.opaque(mi.UInt32, len(walk))
+    entry = index // per_laser * found + dr.gather(mi.UInt32, kept, index % per_laser)
     chosen = walk[np.asarray(kept.numpy())]
-    end = mi.UInt32(chosen.astype(np.uint32))
+    end = on_device(mi.UInt32, chosen)
     impulses = Impulses(
         n_kept,
         chosen // plan.walks,
@@ -275,9 +295,9 @@ def _unconnected(
     transport: Transport, ends: WalkEnds, walk: NDArray[np.int64], scale: Float64
 ) -> tuple[mi.Spectrum, mi.Float, mi.Bool]:
     """Return what chosen ends pass on of the light that will meet them there, its delay, and which pass on any."""
-    end = mi.UInt32(walk.astype(np.uint32))
+    end = on_device(mi.UInt32, walk)
     values = dr.gather(mi.Spectrum, ends.carried, end) / dr.gather(mi.Float, ends.expected, end)
-    values *= mi.Float(scale.astype(np.float32))
+    values *= on_device(mi.Float, scale)
     delays = dr.gather(mi.Float, ends.opl, end) * transport.bins_per_unit
     dr.eval(values, delays)
     return values, delays, dr.any(values > 0)
@@ -289,9 +309,10 @@ def _connect(
     """Connect chosen ends to every laser; return values and delays (laser * n + walk), and which bring any light."""
     built, n = transport.built, len(walk)
     index = dr.arange(mi.UInt32, n * transport.lasers_per_lane)
-    at = index % n
-    end = dr.gather(mi.UInt32, mi.UInt32(walk.astype(np.uint32)), at)
-    lasers = transport.lasers.gather(index // n)
+    per_laser = dr.opaque(mi.UInt32, n)
+    at = index % per_laser
+    end = dr.gather(mi.UInt32, on_device(mi.UInt32, walk), at)
+    lasers = transport.lasers.gather(index // per_laser)
     position = dr.gather(mi.Point3f, ends.position, end)
     si = dr.zeros(mi.SurfaceInteraction3f, dr.width(index))
     si.p, si.n = position, dr.gather(mi.Normal3f, ends.normal, end)
@@ -299,13 +320,13 @@ def _connect(
     distance = dr.norm(to_laser)
     value = dr.gather(mi.Spectrum, ends.carried, end) / dr.gather(mi.Float, ends.expected, end)
     value *= arriving(built, lasers, position, dr.gather(mi.Normal3f, ends.shading, end))
-    value *= dr.gather(mi.Float, mi.Float(scale.astype(np.float32)), at)
+    value *= dr.gather(mi.Float, on_device(mi.Float, scale), at)
     active = dr.any(value > 0)
     segment = connection_segment(built, si, to_laser / distance, lasers.interaction)
     active &= ~built.scene.ray_test(segment, coherent=False, active=active)
     value = dr.select(active, value, 0)
     delays = (dr.gather(mi.Float, ends.opl, end) + distance) * transport.bins_per_unit
     lit = dr.zeros(mi.UInt32, n)
-    dr.scatter_reduce(dr.ReduceOp.Max, lit, mi.UInt32(1), at, active)
+    dr.scatter(lit, mi.UInt32(1), at, active)  # of several lasers, all write the same; a reduction would know ``n``
     dr.eval(value, delays, lit)
     return value, delays, lit > 0
