@@ -68,6 +68,7 @@ class VirtualLightEngine:
             is_confocal=capture.scan_type == "confocal",
             is_diffuse=all(is_lambertian(shape.bsdf()) for shape in shapes),
             needs_visibility=not nothing_occludes(built),
+            has_one_laser=capture.n_lasers == 1,
         )
         all_lambertian = self.settings.is_diffuse and is_lambertian(built.wall_shape.bsdf())
         reciprocal = is_reciprocal(built, capture, time_axis.n_bins, is_lambertian=all_lambertian)

@@ -16,7 +16,8 @@ from nlosrender.engine.histogram import DeviceHistogram, HistogramShape
 from nlosrender.engine.path_engine import PathEngine
 from nlosrender.engine.pilot import Pilot, spread
 from nlosrender.engine.transport import Transport
-from nlosrender.engine.virtual_lights.lights import is_visible, to_points
+from nlosrender.engine.virtual_lights.device_patches import to_points
+from nlosrender.engine.virtual_lights.lights import is_visible
 from nlosrender.engine.virtual_lights.sites import Sites, SiteSampler
 from nlosrender.engine.virtual_lights.tessellator import Tessellator
 from nlosrender.engine.virtual_lights.walks import Impulses, TriedLasers, WalkPlan, arriving, walk_back

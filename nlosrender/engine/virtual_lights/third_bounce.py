@@ -18,15 +18,9 @@ from nlosrender.engine.pilot import Pilot
 from nlosrender.engine.space_filling import z_order
 from nlosrender.engine.transport import Transport
 from nlosrender.engine.virtual_lights.block_histogram import BlockHistogram
+from nlosrender.engine.virtual_lights.device_patches import Parts, upload_patches
 from nlosrender.engine.virtual_lights.gather import gather_third_bounce
-from nlosrender.engine.virtual_lights.lights import (
-    ROWS,
-    GatherSettings,
-    Lights,
-    Parts,
-    light_patches,
-    upload_patches,
-)
+from nlosrender.engine.virtual_lights.lights import ROWS, GatherSettings, Lights, light_patches
 from nlosrender.engine.virtual_lights.occlusion import HiddenHull
 from nlosrender.engine.virtual_lights.patches import Patches
 from nlosrender.engine.virtual_lights.tessellator import MAX_PATCHES, Tessellator

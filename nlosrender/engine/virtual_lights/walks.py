@@ -22,7 +22,7 @@ from nlosrender.engine.connections import connection_segment, offset_origin
 from nlosrender.engine.deadline import LATE_SURVIVAL, Deadline, Horizon, thinned_out
 from nlosrender.engine.device_arrays import WallPoints, on_device
 from nlosrender.engine.transport import HIGHEST_SURVIVAL, LaneRandomness, Transport
-from nlosrender.engine.virtual_lights.lights import normal_reflectance, surface_at
+from nlosrender.engine.virtual_lights.device_patches import normal_reflectance, surface_at
 from nlosrender.engine.virtual_lights.sites import Sites
 from nlosrender.scene.build import BuiltScene
 from nlosrender.scene.pose import Float64

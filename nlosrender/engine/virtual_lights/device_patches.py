@@ -1,0 +1,186 @@
+"""Patches on the device: where they are, what they reflect, and the points that stand for them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+
+from nlosrender.engine.device_arrays import columns, on_device
+from nlosrender.engine.low_discrepancy import recurrence_steps
+from nlosrender.engine.space_filling import z_order
+from nlosrender.engine.virtual_lights.occlusion import HiddenHull
+from nlosrender.engine.virtual_lights.patches import Patches
+from nlosrender.scene.build import BuiltScene
+from nlosrender.scene.pose import Float64
+
+
+@dataclass(frozen=True, eq=False)
+class Parts:
+    """Parts of the patches, each gathered by lanes of its own: slices of those of a region, or of all.
+
+    A patch's number within its region decides its slice, so what one laser sends does not depend on the batch's other
+    lasers, whose patches may be others.
+    """
+
+    regions: NDArray[np.int64]  # (n,) region of each patch, ascending
+    numbers: NDArray[np.int64]  # (n,) of each patch within its region
+    slices: int  # lanes that share the patches of a sensor point
+
+    @classmethod
+    def of(cls, counts: Sequence[int], slices: int) -> Parts:
+        """Return the parts of ``counts`` patches per region, region after region."""
+        regions = np.repeat(np.arange(len(counts)), counts)
+        return cls(regions, np.concatenate([np.arange(count) for count in counts]), slices)
+
+    def sorted(self, patch: NDArray[np.integer]) -> tuple[NDArray[np.integer], NDArray[np.integer]]:
+        """Sort patches by part, within it by number; return them and where each part begins, and the last one ends."""
+        part = (self.regions * self.slices + self.numbers % self.slices)[patch]
+        order = np.lexsort((patch, part))
+        n_parts = (int(self.regions[-1]) + 1) * self.slices
+        return patch[order], np.searchsorted(part[order], np.arange(n_parts + 1))
+
+
+@dataclass(frozen=True, eq=False)
+class DevicePatches:
+    """Patches on the device, engine units; one lane per patch."""
+
+    parts: Parts
+    number: mi.UInt32  # within its region: with the start, what decides the points its light is asked for
+    start: mi.Vector2u  # of the low-discrepancy sequence of these points
+    remainder: mi.Vector3f  # of the centre, what float32 rounds off: close to the wall it is more than the distance
+    is_near: bool  # some patch is so near to a laser or sensor point that the remainder counts
+    corners: list[mi.Vector3f]  # three, from the centre
+    lift: mi.Vector3f  # from the plane of the corners to the surface
+    members: mi.Vector4f  # from the centre to where shadow rays of clusters end, and 1 for a cluster, else 0
+    has_clusters: bool
+    areas: mi.Vector3f  # geometric normal times area
+    interaction: mi.SurfaceInteraction3f  # at the centres
+    reflectance: mi.Spectrum  # of Lambertian patches
+    shown: mi.Vector3f  # from the centre's float32 position to where rays from sensor points end
+    is_open: mi.Float  # 1 where nothing can stop them
+
+
+def upload_patches(
+    built: BuiltScene, patches: Patches, parts: Parts, hull: HiddenHull, seed: int, is_near: bool
+) -> DevicePatches:
+    """Bring patches to the device, neighbours together, and evaluate their reflectance and shading frames.
+
+    Parameters
+    ----------
+    built, patches
+        The scene and what it was cut into, region after region.
+    parts
+        Region of each patch, and its number there.
+    hull
+        Tells which patches the whole wall sees.
+    seed
+        Of the points that stand for their patches where visibility is asked for. A point at random makes a partly
+        hidden patch count by its visible share, on average; one for all sensor points keeps their rays together.
+    is_near
+        Whether some patch is so near to a laser or sensor point that float32 positions do not do.
+    """
+    patches = patches.at(np.lexsort((z_order(patches.centres), parts.regions)))
+    interaction = surface_at(
+        built, patches.centres, patches.normals, patches.shapes, patches.primitives, patches.barycentric
+    )
+    reflectance = normal_reflectance(interaction)
+    centre = np.array(interaction.p, np.float64).T
+    from_rounded = patches.centres - centre
+    remainder = mi.Vector3f(to_points(from_rounded))
+    corners = [mi.Vector3f(to_points(patches.corners[:, k] - patches.centres)) for k in range(3)]
+    areas = mi.Vector3f(to_points(patches.normals * patches.areas[:, None]))
+    lift = mi.Vector3f(to_points(patches.normals * patches.lifts[:, None]))
+    is_cluster = on_device(mi.Float, patches.is_cluster)
+    members = mi.Vector4f(*to_points(patches.members - patches.centres), is_cluster)
+    # a cluster's members have normals of their own: it is lit and seen by their mean
+    frame, own = interaction.sh_frame, mi.Frame3f(mi.Normal3f(interaction.n))
+    interaction.sh_frame = dr.select(members.w > 0, own, frame)
+    number, start = on_device(mi.UInt32, parts.numbers), mi.Vector2u(*mi.sample_tea_32(mi.UInt32(seed), mi.UInt32(0)))
+    dr.make_opaque(start)
+    u, v = spread_numbers(start, number)
+    shown = remainder + dr.select(members.w > 0, members.xyz, point_inside(corners, u, v) + lift)
+    is_open = on_device(mi.Float, hull.is_below(patches) & ~patches.is_cluster)
+    dr.eval(interaction, reflectance, remainder, corners, areas, lift, members, shown, is_open)
+    has_clusters = bool(patches.is_cluster.any())
+    return DevicePatches(
+        parts,
+        number,
+        start,
+        remainder,
+        is_near,
+        corners,
+        lift,
+        members,
+        has_clusters,
+        areas,
+        interaction,
+        reflectance,
+        shown,
+        is_open,
+    )
+
+
+def surface_at(
+    built: BuiltScene,
+    positions: Float64,
+    normals: Float64,
+    shapes: NDArray[np.uint32],
+    primitives: NDArray[np.uint32],
+    barycentric: Float64,
+) -> mi.SurfaceInteraction3f:
+    """Return the surface at known points, as a ray from one unit above would find it; no ray is traced.
+
+    Parameters
+    ----------
+    built
+        The scene.
+    positions, normals
+        (n, 3) points [engine units] and geometric normals.
+    shapes, primitives
+        (n,) index into the scene's shapes; triangle of a mesh.
+    barycentric
+        (n, 2) coordinates within the triangle.
+    """
+    point, normal = to_points(positions), mi.Vector3f(to_points(normals))
+    hit = dr.zeros(mi.PreliminaryIntersection3f, len(positions))
+    hit.t = dr.full(mi.Float, 1.0, len(positions))
+    hit.prim_uv = mi.Point2f(*columns(barycentric))
+    hit.prim_index = on_device(mi.UInt32, primitives)
+    shape = dr.gather(mi.ShapePtr, built.scene.shapes_dr(), on_device(mi.UInt32, shapes))
+    interaction = shape.compute_surface_interaction(mi.Ray3f(point + normal, -normal), hit, mi.RayFlags.All)
+    interaction.initialize_sh_frame()
+    interaction.shape = shape
+    interaction.p = point
+    interaction.n = mi.Normal3f(normal)
+    interaction.wi = mi.Vector3f(0, 0, 1)
+    return interaction
+
+
+def normal_reflectance(interaction: mi.SurfaceInteraction3f) -> mi.Spectrum:
+    """Return pi times the BSDF along the normal: the reflectance of a Lambertian surface."""
+    up = mi.Vector3f(0, 0, 1)
+    return interaction.bsdf().eval(mi.BSDFContext(), interaction, up) * dr.pi
+
+
+def point_inside(corners: list[mi.Vector3f], u: mi.Float, v: mi.Float) -> mi.Vector3f:
+    """Return the point of a triangle that two uniform numbers choose, uniform by area."""
+    root = dr.sqrt(u)
+    a, b, c = corners
+    return a + (b - a) * (root * (1 - v)) + (c - a) * (root * v)
+
+
+def spread_numbers(start: mi.Vector2u, index: mi.UInt32) -> tuple[mi.Float, mi.Float]:
+    """Return two low-discrepancy numbers in [0, 1) per index."""
+    steps = recurrence_steps(2)
+    u, v = (mi.Float((start[k] + index * mi.UInt32(steps[k])) >> 8) * 2.0**-24 for k in range(2))
+    return u, v
+
+
+def to_points(values: Float64) -> mi.Point3f:
+    """Bring vectors (n, 3) to the device."""
+    return mi.Point3f(*columns(values))
