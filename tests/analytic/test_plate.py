@@ -143,7 +143,7 @@ def test_an_occluder_removes_what_visibility_says(hidden_geometry_sampling: bool
     assert_agrees(result.total, result.total_variance, with_occluder, replicas=REPLICAS, floor=QUADRATURE)
 
 
-@pytest.mark.parametrize("laser_sampling", [True, False])
+@pytest.mark.parametrize("laser_sampling", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_a_laser_spot_is_the_average_over_its_disc(laser_sampling: bool) -> None:
     """H of a spot of 8 cm radius is the mean of H over laser points spread evenly over the disc."""
     radius = 0.08
@@ -179,7 +179,7 @@ def test_a_plate_close_to_the_wall_is_that_of_quadrature() -> None:
     assert np.sqrt(result.variance.sum()) < 3e-3 * reference.sum()
 
 
-@pytest.mark.parametrize("laser_sampling", [True, False])
+@pytest.mark.parametrize("laser_sampling", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_what_a_spot_loses_over_the_wall_s_edge_is_lost(laser_sampling: bool) -> None:
     """A spot half on the wall lights it with half its energy, whichever way it is found."""
     plate = PLATE | {"center": [0.7, 0.0, 0.5], "normal": [0.0, 0.0, -1.0]}

@@ -98,7 +98,7 @@ QUADRATURE = {"single": 2e-3, "confocal": 2e-3, "exhaustive": 5e-3}  # exhaustiv
 CELLS = {"single": 700, "confocal": 700, "exhaustive": 350}
 
 
-@pytest.mark.parametrize("scan", ["single", "confocal", "exhaustive"])
+@pytest.mark.parametrize("scan", ["single", pytest.param("confocal", marks=pytest.mark.slow), "exhaustive"])
 def test_a_plate_meets_the_target_error_and_says_so(scan: str) -> None:
     """H per bin of a tilted plate, for every scan type, at 1 %."""
     truth = reference(
@@ -109,7 +109,7 @@ def test_a_plate_meets_the_target_error_and_says_so(scan: str) -> None:
     assert not engine.settings.needs_visibility
 
 
-@pytest.mark.parametrize("scan", ["single", "confocal"])
+@pytest.mark.parametrize("scan", ["single", pytest.param("confocal", marks=pytest.mark.slow)])
 def test_a_sphere_is_round(scan: str) -> None:
     """H per bin of a sphere: its patches have the true area and the true normals."""
     truth = reference(Setup(sphere_cells(BALL["center"], 0.3, n=CELLS[scan]), EDGES, rho=0.7), scan)
@@ -118,7 +118,7 @@ def test_a_sphere_is_round(scan: str) -> None:
     assert_honest(result, estimate, truth, target=0.01, floor=2 * QUADRATURE[scan])
 
 
-@pytest.mark.parametrize("scan", ["single", "confocal", "exhaustive"])
+@pytest.mark.parametrize("scan", ["single", pytest.param("confocal", marks=pytest.mark.slow), "exhaustive"])
 def test_shadow_edges_converge(scan: str) -> None:
     """A black screen hides parts of the plate from laser and sensor points; partly hidden patches count in part."""
     cells = rectangle_cells(0.8, 0.6, PLATE["center"], PLATE["normal"], n=CELLS[scan])

@@ -63,7 +63,7 @@ CASES = [
     ("path", "exhaustive", OPEN, {"lasers": (2, 3), "capture": LEGS}),
     ("path", "single", (ROOM,), {"laser_sampling": False, "capture": {"laser_spot_radius": 0.2}}),
     ("virtual_lights", "single", (ROOM,), {}),
-    ("virtual_lights", "confocal", OPEN, {"capture": LEGS}),
+    pytest.param("virtual_lights", "confocal", OPEN, {"capture": LEGS}, marks=pytest.mark.slow),
     pytest.param("virtual_lights", "exhaustive", (ROOM,), {"lasers": (2, 3), "capture": LEGS}, marks=pytest.mark.slow),
 ]
 
