@@ -16,8 +16,9 @@ from nlosrender.capture.grids import Capture, PointGrid
 from nlosrender.engine.virtual_lights.cells import Cells, WallDistance, quartered
 from nlosrender.engine.virtual_lights.graded_cells import GradedCells, Grading
 
-BLOCKS = (2, 4, 8)  # regions along each side of the sensor grid that are tried
-LEAST_POINTS = 64  # of a region: fewer keep no packets of rays together
+BLOCKS = (8, 4, 2)  # regions along each side of the sensor grid, the first that leaves enough points in each
+LEAST_POINTS = 256  # of a region
+MOST_CELLS = 1_000_000  # close to the wall, of all regions together: 0.5 GB, and some seconds
 # Cutting and lighting a patch takes as long as gathering it by so many sensor points.
 POINTS_PER_PATCH = 500
 WORTH = 0.7  # of the cost without regions: what they have to save to be worth while
@@ -44,7 +45,7 @@ class Regions:
 
 
 def regions_of(capture: Capture, unit: float, triangles: Cells, whole: GradedCells) -> Regions | None:
-    """Return the regions that make the gather cheapest, or None where one set of patches does for all.
+    """Return the regions that make the gather cheaper, or None where one set of patches does for all.
 
     Parameters
     ----------
@@ -57,37 +58,35 @@ def regions_of(capture: Capture, unit: float, triangles: Cells, whole: GradedCel
     """
     if capture.n_lasers > 1 and capture.scan_type != "confocal":
         return None  # what is near to a laser point has to be fine for all
+    blocks = next((blocks for blocks in BLOCKS if capture.n_sensors >= blocks**2 * LEAST_POINTS), 1)
     # Beyond its own size a region sees about what its neighbours see: there cells of all points do.
-    reaches = {blocks: max(capture.sensor_grid.size) / blocks / unit for blocks in BLOCKS}
-    tried = [
-        blocks
-        for blocks, reach in reaches.items()
-        if capture.n_sensors >= blocks**2 * LEAST_POINTS and whole.share_if_far(reach / 2) < WORTH
-    ]
-    if not tried:
+    reach = max(capture.sensor_grid.size) / blocks / unit
+    if blocks == 1 or whole.share_if_far(reach / 2) > WORTH:
         return None
-    best, least = None, WORTH * sum(whole.counts(1.0)) * (capture.n_sensors + POINTS_PER_PATCH)
-    for blocks in tried:
-        regions = _cut(capture, unit, triangles, reaches[blocks], blocks, whole.grading)
-        cost = sum(regions.counts(1.0)) * capture.n_sensors + regions.total(1.0) * POINTS_PER_PATCH
-        if cost < least:
-            best, least = regions, cost
-    return best
-
-
-def _cut(capture: Capture, unit: float, triangles: Cells, reach: float, blocks: int, grading: Grading) -> Regions:
-    cells = quartered(triangles, WallDistance(capture, unit), grading.wall_index, reach / 2)
-    is_near = cells.distances < reach
-    shared, close = cells.at(~is_near), cells.at(is_near)
+    cells, is_near = _coarse(capture, unit, triangles, reach, whole.grading)
+    while np.count_nonzero(is_near) * blocks**2 > MOST_CELLS:
+        reach /= 2  # what is nearest is cut finest
+        cells, is_near = _coarse(capture, unit, triangles, reach, whole.grading)
     grid = capture.sensor_grid
     rows, columns = (np.arange(n) * blocks // n for n in (grid.ny, grid.nx))
     near = []
-    for row in range(blocks):
-        for column in range(blocks):
-            part = _part_of(capture, np.ix_(rows == row, columns == column))
-            near.append(GradedCells(quartered(close, WallDistance(part, unit), grading.wall_index), grading))
+    for row, column in np.ndindex(blocks, blocks):
+        part = _part_of(capture, np.ix_(rows == row, columns == column))
+        own = quartered(cells.at(is_near), WallDistance(part, unit), whole.grading.wall_index)
+        near.append(GradedCells(own, whole.grading))
     labels = (rows[:, None] * blocks + columns).reshape(-1)
-    return Regions(labels, tuple(near), GradedCells(shared, grading))
+    regions = Regions(labels, tuple(near), GradedCells(cells.at(~is_near), whole.grading))
+    cost = sum(regions.counts(1.0)) * capture.n_sensors + regions.total(1.0) * POINTS_PER_PATCH
+    without = sum(whole.counts(1.0)) * (capture.n_sensors + POINTS_PER_PATCH)
+    return regions if cost < WORTH * without else None
+
+
+def _coarse(
+    capture: Capture, unit: float, triangles: Cells, reach: float, grading: Grading
+) -> tuple[Cells, NDArray[np.bool_]]:
+    """Return cells that are coarse close to the wall, and which of them are close to it."""
+    cells = quartered(triangles, WallDistance(capture, unit), grading.wall_index, reach / 2)
+    return cells, cells.distances < reach
 
 
 def _part_of(capture: Capture, chosen: tuple[NDArray[np.intp], ...]) -> Capture:
