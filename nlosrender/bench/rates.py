@@ -14,7 +14,7 @@ from typing import Any
 import yaml
 
 from nlosrender.bench.any_hit import trace_any_hit
-from nlosrender.bench.runs import LoadedScene, Timer
+from nlosrender.bench.runs import LoadedScene, Timer, virtual_lights_of
 from nlosrender.bench.scenes import BenchScene
 from nlosrender.errors import RenderError
 
@@ -63,14 +63,9 @@ def gather_rate(loaded: LoadedScene) -> GatherRate:
     RenderError
         The virtual-light engine does not take the scene.
     """
-    from nlosrender import pipeline
     from nlosrender.engine.path_engine import Budget
-    from nlosrender.engine.virtual_lights.engine import VirtualLightEngine
 
-    config = loaded.scene.config(engine="virtual_lights", split_bounces=False)
-    plan, engine = pipeline.prepare(config, loaded.backend, loaded.built, loaded.capture, loaded.time_axis)
-    if not isinstance(engine, VirtualLightEngine):
-        raise RenderError(f"{loaded.scene.name}: the virtual-light engine does not take this scene")
+    plan, engine = virtual_lights_of(loaded)
     fineness = engine.settle(Budget(target_error=GATHER_TARGET)).fineness or 1.0
     spent = []
     for _ in range(REPEATS + 1):  # the first run compiles

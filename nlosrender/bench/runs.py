@@ -15,9 +15,12 @@ from nlosrender.bench.scenes import BenchScene
 from nlosrender.capture.grids import Capture
 from nlosrender.capture.time_axis import TimeAxis
 from nlosrender.engine.backend import Backend, start_backend
+from nlosrender.errors import RenderError
 
 if TYPE_CHECKING:
+    from nlosrender.capture.plan import Plan
     from nlosrender.engine.path_engine import Budget
+    from nlosrender.engine.virtual_lights.engine import VirtualLightEngine
     from nlosrender.scene.build import BuiltScene
 
 Float64 = NDArray[np.float64]
@@ -83,6 +86,23 @@ def load(scene: BenchScene) -> LoadedScene:
     built = pipeline.load_scene(config)
     capture, time_axis = pipeline.describe_capture(config, built.wall, built)
     return LoadedScene(scene, backend, built, capture, time_axis)
+
+
+def virtual_lights_of(loaded: LoadedScene) -> tuple[Plan, VirtualLightEngine]:
+    """Return the plan of a scene and the virtual-light engine for it.
+
+    Raises
+    ------
+    RenderError
+        The engine does not take the scene.
+    """
+    from nlosrender.engine.virtual_lights.engine import VirtualLightEngine
+
+    config = loaded.scene.config(engine="virtual_lights", split_bounces=False)
+    plan, engine = pipeline.prepare(config, loaded.backend, loaded.built, loaded.capture, loaded.time_axis)
+    if not isinstance(engine, VirtualLightEngine):
+        raise RenderError(f"{loaded.scene.name}: the virtual-light engine does not take this scene")
+    return plan, engine
 
 
 def render(loaded: LoadedScene, budget: Budget, seed: int = 0, options: Mapping[str, Any] | None = None) -> Run:

@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from nlosrender.bench.runs import Float64, LoadedScene, Timer, load
+from nlosrender.bench.runs import Float64, LoadedScene, Timer, load, virtual_lights_of
 from nlosrender.bench.scenes import WALL_SIZE, BenchScene, closed_room, many_lasers
 
 if TYPE_CHECKING:
-    from nlosrender.capture.plan import Batch, Plan
+    from nlosrender.capture.plan import Batch
     from nlosrender.engine.engines import Engine
     from nlosrender.engine.path_engine import Budget, PathEngine
     from nlosrender.engine.virtual_lights.engine import VirtualLightEngine
@@ -71,7 +71,7 @@ def _of_gather(loaded: LoadedScene) -> Iterator[Saving]:
     """Yield what the gather leaves out: rays nothing can stop, the dark patches, colour."""
     from nlosrender.engine.path_engine import Budget
 
-    plan, engine = _virtual_lights(loaded)
+    plan, engine = virtual_lights_of(loaded)
     fineness = engine.settle(Budget(target_error=GATHER_TARGET)).fineness or 1.0
 
     def gather() -> Float64:
@@ -118,7 +118,7 @@ def _of_regions(loaded: LoadedScene) -> Iterator[Saving]:
     from nlosrender.engine.virtual_lights.tessellator import Tessellator
     from nlosrender.engine.virtual_lights.third_bounce import ThirdBounce
 
-    plan, engine = _virtual_lights(loaded)
+    plan, engine = virtual_lights_of(loaded)
     third, bin_width = engine.third, engine.tessellator.grading.bin_width
     undivided = Tessellator(engine.built, engine.capture, bin_width, may_divide=False)
     one = ThirdBounce(third.paths, undivided, third.settings, third.lanes)
@@ -130,23 +130,11 @@ def _of_reciprocity(loaded: LoadedScene) -> Iterator[Saving]:
     """Yield what taking half of an exhaustive capture from the other half saves."""
     from nlosrender.engine.virtual_lights.third_bounce import ThirdBounce
 
-    plan, engine = _virtual_lights(loaded)
+    plan, engine = virtual_lights_of(loaded)
     third = engine.third
     every = ThirdBounce(third.paths, third.tessellator, third.settings, third.lanes, is_reciprocal=False)
     ways = [lambda of=of: of.gather(plan.batches[0], FINENESS).values for of in (third, every)]
     yield _saving("pairs of points that reciprocity gives", loaded, *ways)
-
-
-def _virtual_lights(loaded: LoadedScene) -> tuple[Plan, VirtualLightEngine]:
-    from nlosrender import pipeline
-    from nlosrender.engine.virtual_lights.engine import VirtualLightEngine
-    from nlosrender.errors import RenderError
-
-    config = loaded.scene.config(engine="virtual_lights", split_bounces=False)
-    plan, engine = pipeline.prepare(config, loaded.backend, loaded.built, loaded.capture, loaded.time_axis)
-    if not isinstance(engine, VirtualLightEngine):
-        raise RenderError(f"{loaded.scene.name}: the virtual-light engine does not take this scene")
-    return plan, engine
 
 
 def _of_paths(loaded: LoadedScene) -> Iterator[Saving]:

@@ -61,8 +61,16 @@ class DevicePatches:
     areas: mi.Vector3f  # geometric normal times area
     interaction: mi.SurfaceInteraction3f  # at the centres
     reflectance: mi.Spectrum  # of Lambertian patches
-    shown: mi.Vector3f  # from the centre's float32 position to where rays from sensor points end
-    is_open: mi.Float  # 1 where nothing can stop them
+    is_open: mi.Float  # 1 where nothing can stop rays from sensor points
+
+    def points(self, index: mi.UInt32) -> mi.Vector3f:
+        """Return points of the surface, one per patch, from the centres' float32 positions: where rays end.
+
+        ``index`` chooses a low-discrepancy point of a patch. That of a cluster is its member's, whichever.
+        """
+        u, v = spread_numbers(self.start, index)
+        inside = point_inside(self.corners, u, v) + self.lift
+        return self.remainder + dr.select(self.members.w > 0, self.members.xyz, inside)
 
 
 def upload_patches(
@@ -102,10 +110,8 @@ def upload_patches(
     interaction.sh_frame = dr.select(members.w > 0, own, frame)
     number, start = on_device(mi.UInt32, parts.numbers), mi.Vector2u(*mi.sample_tea_32(mi.UInt32(seed), mi.UInt32(0)))
     dr.make_opaque(start)
-    u, v = spread_numbers(start, number)
-    shown = remainder + dr.select(members.w > 0, members.xyz, point_inside(corners, u, v) + lift)
     is_open = on_device(mi.Float, hull.is_below(patches) & ~patches.is_cluster)
-    dr.eval(interaction, reflectance, remainder, corners, areas, lift, members, shown, is_open)
+    dr.eval(interaction, reflectance, remainder, corners, areas, lift, members, is_open)
     has_clusters = bool(patches.is_cluster.any())
     return DevicePatches(
         parts,
@@ -120,7 +126,6 @@ def upload_patches(
         areas,
         interaction,
         reflectance,
-        shown,
         is_open,
     )
 

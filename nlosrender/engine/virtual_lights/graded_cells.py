@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
 from nlosrender.engine.virtual_lights.cells import Cells, normals_and_areas
 from nlosrender.engine.virtual_lights.clusters import Merger
@@ -52,10 +51,6 @@ class GradedCells:
         self.normals, self.areas = normals_and_areas(cells.corners)
         wall = grading.wall_index
         self.is_hidden = np.ones(len(cells.shapes), bool) if wall is None else cells.shapes != wall
-
-    def at(self, chosen: NDArray[np.bool_]) -> GradedCells:
-        """Return the cells that are ``chosen``."""
-        return GradedCells(self.cells.at(chosen), self.grading)
 
     def patches(self, coarseness: float) -> list[Patches]:
         """Return patches whose error is of order ``coarseness`` squared, in parts."""

@@ -11,7 +11,7 @@ import numpy as np
 from nlosrender.engine.connections import off_the_wall
 from nlosrender.engine.device_arrays import on_device
 from nlosrender.engine.transport import Transport
-from nlosrender.engine.virtual_lights.device_patches import DevicePatches, point_inside, spread_numbers
+from nlosrender.engine.virtual_lights.device_patches import DevicePatches
 from nlosrender.scene.build import BuiltScene
 
 ROWS = 5  # of four numbers each: what the gather reads of a patch
@@ -63,9 +63,10 @@ def light_patches(settings: GatherSettings, transport: Transport, patches: Devic
     """
     count = dr.width(patches.areas)
     lit = dr.arange(mi.UInt32, count)
-    arriving, delays, seen_at = mi.Spectrum(0), mi.Float(0), patches.shown
+    arriving, delays, seen_at = mi.Spectrum(0), mi.Float(0), patches.points(patches.number)
+    dr.eval(seen_at)
     if not settings.is_confocal:
-        arriving, brightest, seen_at = _illuminate(settings, transport, patches, n_lasers)
+        arriving, brightest, seen_at = _illuminate(settings, transport, patches, seen_at, n_lasers)
         lit = dr.compress(brightest > 0)
         if not dr.width(lit):
             lit = mi.UInt32(0)  # all is dark: one dark patch, since arrays of no length cannot be read
@@ -111,9 +112,11 @@ def light_patches(settings: GatherSettings, transport: Transport, patches: Devic
 
 
 def _illuminate(
-    settings: GatherSettings, transport: Transport, patches: DevicePatches, n_lasers: int
+    settings: GatherSettings, transport: Transport, patches: DevicePatches, seen_at: mi.Vector3f, n_lasers: int
 ) -> tuple[mi.Spectrum, mi.Float, mi.Vector3f]:
     """Light every patch by every laser: emission, distance, and the share of the patch that is not in shadow.
+
+    Sensor points look at ``seen_at``, or at a point that the only laser lights.
 
     Returns
     -------
@@ -141,12 +144,12 @@ def _illuminate(
     else:
         flags = dr.gather(mi.SurfaceInteraction3f, patches.interaction, patch).bsdf().flags()
         active &= (cosine > 0) | mi.has_flag(flags, mi.BSDFFlags.BackSide)
-    seen, seen_at = mi.Float(1), patches.shown
+    seen = mi.Float(1)
     if settings.needs_visibility and settings.has_one_laser:
         seen, seen_at = _share_in_light(built, patches, lit, to_rounded, active)
     elif settings.needs_visibility:
         # the very point that sensor points look at: what hides a part of a patch from both hides the same part
-        way = to_rounded + dr.gather(mi.Vector3f, patches.shown, patch)
+        way = to_rounded + dr.gather(mi.Vector3f, seen_at, patch)
         is_open = dr.gather(mi.Float, patches.is_open, patch) > 0
         seen = dr.select(is_open | is_visible(built, lit, way, active & ~is_open), mi.Float(1), 0)
     arriving = dr.select(active, arriving * seen, 0)
@@ -169,14 +172,10 @@ def _share_in_light(
     drawn among those in light makes their product right on average.
     """
     is_open = patches.is_open > 0
-    n_seen, chosen = mi.UInt32(0), mi.Vector3f(patches.shown)
+    n_seen, chosen = mi.UInt32(0), mi.Vector3f(0)
     for k in range(LASER_RAYS):
         index = patches.number * LASER_RAYS + k
-        u, v = spread_numbers(patches.start, index)
-        inside = dr.select(
-            patches.members.w > 0, patches.members.xyz, point_inside(patches.corners, u, v) + patches.lift
-        )
-        point = patches.remainder + inside
+        point = patches.points(index)
         is_lit = is_open | is_visible(built, laser, to_rounded + point, active & ~is_open)
         n_seen += dr.select(is_lit, mi.UInt32(1), 0)
         # the n-th point in light takes the place of the one before with a chance of 1 / n

@@ -39,26 +39,12 @@ class Patches:
     @classmethod
     def joined(cls, parts: list[Patches]) -> Patches:
         """Return the patches of all parts."""
+        if not parts:
+            none, index = np.zeros((0, 3)), np.zeros(0, np.uint32)
+            corners, numbers, pairs = np.zeros((0, 3, 3)), np.zeros(0), np.zeros((0, 2))
+            return cls(corners, numbers, none, none, index, index, pairs, numbers, none, index.astype(bool))
         names = [field.name for field in fields(cls)]
         return cls(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
-
-
-def no_patches() -> Patches:
-    """Return the patches of a scene without surfaces."""
-    none = np.zeros((0, 3))
-    index = np.zeros(0, np.uint32)
-    return Patches(
-        np.zeros((0, 3, 3)),
-        np.zeros(0),
-        none,
-        none,
-        index,
-        index,
-        np.zeros((0, 2)),
-        np.zeros(0),
-        none,
-        index.astype(bool),
-    )
 
 
 def split_cells(cells: Cells, splits: NDArray[np.int64]) -> Patches:
@@ -86,7 +72,7 @@ def split_cells(cells: Cells, splits: NDArray[np.int64]) -> Patches:
                 np.zeros(len(repeated), bool),
             )
         )
-    return Patches.joined(parts) if parts else no_patches()
+    return Patches.joined(parts)
 
 
 def split_weights(n: int) -> Float64:

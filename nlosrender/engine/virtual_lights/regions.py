@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from nlosrender.capture.grids import Capture, PointGrid
 from nlosrender.engine.virtual_lights.cells import Cells, WallDistance, quartered
-from nlosrender.engine.virtual_lights.graded_cells import GradedCells, Grading
+from nlosrender.engine.virtual_lights.graded_cells import GradedCells
 
 BLOCKS = (8, 4, 2)  # regions along each side of the sensor grid, the first that leaves enough points in each
 LEAST_POINTS = 256  # of a region
@@ -44,13 +44,17 @@ class Regions:
         return sum(sum(cells.counts(coarseness)) for cells in (self.shared, *self.near))
 
 
-def regions_of(capture: Capture, unit: float, triangles: Cells, whole: GradedCells) -> Regions | None:
+def regions_of(
+    capture: Capture, unit: float, distance: WallDistance, triangles: Cells, whole: GradedCells
+) -> Regions | None:
     """Return the regions that make the gather cheaper, or None where one set of patches does for all.
 
     Parameters
     ----------
     capture, unit
         Where the points are, and metres per engine unit.
+    distance
+        Distance from all of them.
     triangles
         Triangles of the meshes as cells, not quartered yet.
     whole
@@ -61,32 +65,26 @@ def regions_of(capture: Capture, unit: float, triangles: Cells, whole: GradedCel
     blocks = next((blocks for blocks in BLOCKS if capture.n_sensors >= blocks**2 * LEAST_POINTS), 1)
     # Beyond its own size a region sees about what its neighbours see: there cells of all points do.
     reach = max(capture.sensor_grid.size) / blocks / unit
-    if blocks == 1 or whole.share_if_far(reach / 2) > WORTH:
-        return None
-    cells, is_near = _coarse(capture, unit, triangles, reach, whole.grading)
-    while np.count_nonzero(is_near) * blocks**2 > MOST_CELLS:
+    while blocks > 1 and whole.share_if_far(reach / 2) <= WORTH:
+        cells = quartered(triangles, distance, whole.grading.wall_index, reach / 2)
+        is_near = cells.distances < reach
+        if np.count_nonzero(is_near) * blocks**2 <= MOST_CELLS:
+            break
         reach /= 2  # what is nearest is cut finest
-        cells, is_near = _coarse(capture, unit, triangles, reach, whole.grading)
-    grid = capture.sensor_grid
+    else:
+        return None  # too little to save
+    grid, close = capture.sensor_grid, cells.at(is_near)
     rows, columns = (np.arange(n) * blocks // n for n in (grid.ny, grid.nx))
     near = []
     for row, column in np.ndindex(blocks, blocks):
         part = _part_of(capture, np.ix_(rows == row, columns == column))
-        own = quartered(cells.at(is_near), WallDistance(part, unit), whole.grading.wall_index)
+        own = quartered(close, WallDistance(part, unit), whole.grading.wall_index)
         near.append(GradedCells(own, whole.grading))
     labels = (rows[:, None] * blocks + columns).reshape(-1)
     regions = Regions(labels, tuple(near), GradedCells(cells.at(~is_near), whole.grading))
     cost = sum(regions.counts(1.0)) * capture.n_sensors + regions.total(1.0) * POINTS_PER_PATCH
     without = sum(whole.counts(1.0)) * (capture.n_sensors + POINTS_PER_PATCH)
     return regions if cost < WORTH * without else None
-
-
-def _coarse(
-    capture: Capture, unit: float, triangles: Cells, reach: float, grading: Grading
-) -> tuple[Cells, NDArray[np.bool_]]:
-    """Return cells that are coarse close to the wall, and which of them are close to it."""
-    cells = quartered(triangles, WallDistance(capture, unit), grading.wall_index, reach / 2)
-    return cells, cells.distances < reach
 
 
 def _part_of(capture: Capture, chosen: tuple[NDArray[np.intp], ...]) -> Capture:

@@ -17,7 +17,7 @@ import numpy as np
 from nlosrender.capture.grids import Capture
 from nlosrender.engine.virtual_lights.cells import Cells, WallDistance, quartered, triangles_of_mesh
 from nlosrender.engine.virtual_lights.graded_cells import GradedCells, Grading
-from nlosrender.engine.virtual_lights.patches import Patches, no_patches
+from nlosrender.engine.virtual_lights.patches import Patches
 from nlosrender.engine.virtual_lights.regions import regions_of
 from nlosrender.engine.virtual_lights.round_shapes import ROUND_PLUGINS, RoundShape
 from nlosrender.scene.build import WALL_ID, BuiltScene
@@ -66,7 +66,7 @@ class Tessellator:
         joined = Cells.joined(triangles)
         self.cells = quartered(joined, self.distance, self.wall_index)
         whole = GradedCells(self.cells, self.grading)
-        self.regions = regions_of(capture, built.unit, joined, whole) if may_divide else None
+        self.regions = regions_of(capture, built.unit, self.distance, joined, whole) if may_divide else None
         self.shared = whole if self.regions is None else self.regions.shared
         self._is_hidden = whole.is_hidden
         self._kept = lru_cache(maxsize=4)(self._make)
@@ -87,8 +87,7 @@ class Tessellator:
         labels: list[int] = []
         parts: list[Patches] = []
         for label in wanted:
-            found = self.regions.near[label].patches(coarseness)
-            patches = Patches.joined(found) if found else no_patches()
+            patches = Patches.joined(self.regions.near[label].patches(coarseness))
             if parts and sum(map(len, parts)) + len(patches) > MOST_AT_ONCE:
                 yield labels, parts
                 labels, parts = [], []
@@ -99,8 +98,7 @@ class Tessellator:
 
     def _make(self, coarseness: float) -> Patches:
         on_round = [shape.patches(self._allowed_on(shape, coarseness)) for shape in self.round_shapes]
-        parts = [*self.shared.patches(coarseness), *on_round]
-        return Patches.joined(parts) if parts else no_patches()
+        return Patches.joined([*self.shared.patches(coarseness), *on_round])
 
     def count(self, coarseness: float) -> int:
         """Return about how many patches a sensor point would gather, on average; exactly where none merge."""

@@ -102,40 +102,42 @@ class ThirdBounce:
 
     def gather(self, batch: Batch | Pilot, coarseness: float) -> Gathered:
         """Gather a batch at one resolution."""
+        patches = self.tessellator.patches(coarseness)  # made once: large ones are not kept
         if self.is_reciprocal and isinstance(batch, Batch):
-            values = self._by_reciprocity(batch, coarseness)
+            values = self._by_reciprocity(batch, coarseness, patches)
         else:
-            values = self._sums(batch, coarseness).on_host()
-        patches = self.tessellator.patches(coarseness)
+            values = self._sums(batch, coarseness, patches).on_host()
         # of the shared ones: how a capture is cut must not show in the error it states
         merged = float(patches.areas[patches.is_cluster].sum() / max(patches.areas.sum(), 1e-300))
         count = len(patches) if self.tessellator.regions is None else self.tessellator.count(coarseness)
         return Gathered(values, max(count, 1), coarseness, merged)  # 1: nothing may face the wall
 
-    def _by_reciprocity(self, batch: Batch, coarseness: float) -> NDArray[np.float64]:
+    def _by_reciprocity(self, batch: Batch, coarseness: float, patches: Patches) -> NDArray[np.float64]:
         """Gather from every two points once: the one with the higher index stands for the sensor point.
 
         Whatever the batch, so that how a capture is cut does not show. A batch of other lasers than sensor points is
         gathered in two parts, the second with their roles exchanged.
         """
         sensors, lasers = self.paths.sensor_indices(batch), self.paths.laser_indices(batch)
-        sums = self._sums(batch, coarseness, np.searchsorted(lasers, sensors, side="right"))
+        sums = self._sums(batch, coarseness, patches, np.searchsorted(lasers, sensors, side="right"))
         if np.array_equal(sensors, lasers):
             return sums.on_host(is_symmetric=True)
         values = sums.on_host()
         exchanged = Batch(sensors=batch.lasers, lasers=batch.sensors)
-        values += self._sums(exchanged, coarseness, np.searchsorted(sensors, lasers)).on_host().swapaxes(2, 3)
+        others = self._sums(exchanged, coarseness, patches, np.searchsorted(sensors, lasers))
+        values += others.on_host().swapaxes(2, 3)
         return values
 
-    def _sums(self, batch: Batch | Pilot, coarseness: float, lasers: NDArray[np.int64] | None = None) -> BlockHistogram:
-        """Gather what all sensor points share, then what regions have of their own.
+    def _sums(
+        self, batch: Batch | Pilot, coarseness: float, patches: Patches, lasers: NDArray[np.int64] | None = None
+    ) -> BlockHistogram:
+        """Gather the ``patches`` that all sensor points share, then what regions have of their own.
 
         ``lasers`` (sensors,) tells of how many lasers each sensor point gathers the light, the first ones; None: all.
         """
         shape = self.shape(batch)
         lanes = self._lanes(batch, shape, lasers)
         histogram = BlockHistogram(shape, lanes.order)
-        patches = self.tessellator.patches(coarseness)
         if len(patches):
             lights = self._lights(lanes.transport, shape, patches, Parts.of([len(patches)], shape.replicas))
             gather_third_bounce(self.settings, lanes.transport, lights, histogram, lanes.index, lanes.replica)
