@@ -35,11 +35,12 @@ def connect_to_lasers(
     throughput: mi.Spectrum,
     origin: mi.Point3f,
     leg: mi.Vector3f,
+    coherent: bool = False,
 ) -> None:
     """Laser sampling: connect the vertex to every laser of the lane and deposit (Royo et al. 2022, section 4).
 
     The vertex lies at ``origin`` plus ``leg``: closer to a laser point than float32 tells positions apart, only the leg
-    says where it is.
+    says where it is. ``coherent``: neighbouring lanes are at neighbouring vertices, and trace their rays together.
     """
     slot = _slot(settings, bounce)
     # one place in the spot for all lasers: what a path draws must not depend on how many lasers a batch has
@@ -48,12 +49,40 @@ def connect_to_lasers(
         in_spot = _on_disc(generator, active) * settings.spot_radius
     if dr.hint(transport.lasers_per_lane == 1, mode="scalar"):
         first = mi.UInt32(0)
-        _connect(settings, transport, histogram, in_spot, lane, first, slot, si, active, opl, throughput, origin, leg)
+        _connect(
+            settings,
+            transport,
+            histogram,
+            in_spot,
+            lane,
+            first,
+            slot,
+            si,
+            active,
+            opl,
+            throughput,
+            origin,
+            leg,
+            coherent,
+        )
     else:
         laser = mi.UInt32(0)
         while dr.hint(laser < transport.n_lasers, exclude=[settings, transport, histogram]):
             _connect(
-                settings, transport, histogram, in_spot, lane, laser, slot, si, active, opl, throughput, origin, leg
+                settings,
+                transport,
+                histogram,
+                in_spot,
+                lane,
+                laser,
+                slot,
+                si,
+                active,
+                opl,
+                throughput,
+                origin,
+                leg,
+                coherent,
             )
             laser += 1
 
@@ -72,6 +101,7 @@ def _connect(
     throughput: mi.Spectrum,
     origin: mi.Point3f,
     leg: mi.Vector3f,
+    coherent: bool,
 ) -> None:
     built = transport.built
     context = mi.BSDFContext()
@@ -103,7 +133,8 @@ def _connect(
         mi.unpolarized_spectrum(value) > 0
     )  # not in place: the caller's mask serves the other lasers, too
     if settings.needs_visibility:
-        active &= ~built.scene.ray_test(connection_segment(built, si, direction, lit), coherent=False, active=active)
+        segment = connection_segment(built, si, direction, lit)
+        active &= ~built.scene.ray_test(segment, coherent=coherent, active=active)
     bins = delay_bin(transport, points, opl + distance)
     histogram.deposit(lane, laser, slot, bins, value, active)
 

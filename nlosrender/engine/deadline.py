@@ -119,14 +119,13 @@ class Horizon:
         return Deadline(on_device(mi.Float, latest), low, high, dr.opaque(mi.Float, self.detour))
 
     def deadline_of_sensors(
-        self, built: BuiltScene, capture: Capture, time_axis: TimeAxis, index: NDArray[np.integer], lanes: int
+        self, built: BuiltScene, capture: Capture, time_axis: TimeAxis, index: NDArray[np.integer], sensor: mi.UInt32
     ) -> Deadline:
-        """Return the deadline of paths from the sensor points ``index`` (n,), which ``lanes`` lanes share in turn."""
+        """Return the deadline of paths from the sensor points ``index`` (n,), of which lanes have the ``sensor``-th."""
         own = capture.scan_type == "confocal"
         sensor_legs, laser_legs = capture.sensor_legs.reshape(-1), capture.laser_legs.reshape(-1)
         legs = sensor_legs[index] + (laser_legs[index] if own else laser_legs.min())
         latest = (time_axis.end_opl - legs + capture.laser_spot_radius) / built.unit
-        sensor = dr.arange(mi.UInt32, lanes) % len(index)
         low, high = (_opaque_point(corner) for corner in self.laser_box)
         if own:
             points = mi.Point3f(*columns(capture.laser_grid.positions.reshape(-1, 3)[index] / built.unit))

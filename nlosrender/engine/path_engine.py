@@ -2,32 +2,46 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from numpy.typing import NDArray
 
 from nlosrender.capture.bounces import THIRD_BOUNCE, BounceAxis
 from nlosrender.capture.grids import Capture
 from nlosrender.capture.plan import MOST_SUMS, Batch
 from nlosrender.capture.time_axis import TimeAxis
-from nlosrender.engine.connections import offset_origin
 from nlosrender.engine.deadline import Horizon, light_leaves_window
-from nlosrender.engine.device_arrays import laser_points, sensor_points
+from nlosrender.engine.device_arrays import laser_points, on_device, sensor_points
+from nlosrender.engine.direct_paths import are_direct
+from nlosrender.engine.further_paths import (
+    DIRECT,
+    LEAST_PATHS,
+    PILOT_SAMPLES,
+    PILOT_SEED,
+    TRACED,
+    best_every,
+    first_turns,
+)
+from nlosrender.engine.hidden_share import best_hidden_fraction
 from nlosrender.engine.histogram import DeviceHistogram, Histogram, HistogramShape
 from nlosrender.engine.path_integrator import load_path_integrator
 from nlosrender.engine.pilot import Pilot, pilot_of
+from nlosrender.engine.plain_surfaces import only_normals_matter
 from nlosrender.engine.sampling import (
     Budget,
     Progress,
     Schedule,
     accumulate,
+    lane_randomness,
     pilot_replicas,
     settled_by_pilot,
 )
 from nlosrender.engine.second_bounce import deposit_second_bounce
+from nlosrender.engine.space_filling import z_order
 from nlosrender.engine.strata import Strata
 from nlosrender.engine.surface_sampler import SurfaceSampler
 from nlosrender.engine.temporal_kernel import TemporalKernel
@@ -35,9 +49,6 @@ from nlosrender.engine.transport import LaneRandomness, PathSettings, Transport
 from nlosrender.engine.virtual_lights.occlusion import nothing_occludes
 from nlosrender.errors import RenderError
 from nlosrender.scene.build import BuiltScene
-
-NEAR_RATIO = 4.0  # hidden area over pi times (its distance from the wall)^2 above which its density is too peaked
-SURROUNDED = 0.75  # share of the hemisphere above which BSDF sampling alone does better
 
 
 @dataclass(frozen=True)
@@ -54,6 +65,7 @@ class PathOptions:
     late_roulette: bool = True  # few paths go on that can only bring light after the time window
     temporal_kernel_bins: float = 0.0  # full width of the kernel in time [bins]; 0: a plain histogram
     hidden_fraction: float | None = None  # share of hidden geometry sampling on the wall; None: chosen from the scene
+    further_every: int | None = None  # of so many paths one goes on beyond the third bounce; None: found by a pilot
 
 
 class PathEngine:
@@ -85,7 +97,11 @@ class PathEngine:
         self.reason = reason
         self.built, self.capture, self.time_axis, self.options = built, capture, time_axis, options
         self.sampler = SurfaceSampler(built)
-        self.hidden_fraction = self._choose_hidden_fraction()
+        self.hidden_fraction = 0.0
+        if options.hidden_fraction is not None:
+            self.hidden_fraction = options.hidden_fraction
+        elif options.hidden_geometry_sampling:
+            self.hidden_fraction = best_hidden_fraction(built, self.sampler, capture, time_axis)
         flags = [shape.bsdf().flags() for shape in built.hidden_shapes]
         self.settings = PathSettings(
             bounces=options.bounces,
@@ -96,6 +112,7 @@ class PathEngine:
             spot_radius=capture.laser_spot_radius / built.unit,
             needs_visibility=not self._sees_everything(),
             has_transmission=any(bool(flag & mi.BSDFFlags.Transmission) for flag in flags),
+            only_normals_matter=only_normals_matter(built),
         )
         self.integrator = load_path_integrator(self.settings)
         # Throughput is per (engine unit)^2: H falls with the square of a scene's size.
@@ -138,8 +155,8 @@ class PathEngine:
             raise RenderError(
                 f"a batch of {shape.size:.2e} sums is more than 32-bit indices reach; lower render.memory_limit"
             )
-        transport = self.transport(batch, shape)
         if self._has_bounces:
+            transport = self.transport(batch, shape, self._lane_order(batch), self._further_every(budget))
             schedule = Schedule(budget, shape.replicas, known_squares)
             mean, variance, per_lane = self._accumulate(batch, shape, transport, schedule, progress)
         else:
@@ -171,7 +188,7 @@ class PathEngine:
         shape = replace(
             self.shape(pilot, self.n_slots), replicas=pilot_replicas(self.options.replicas, pilot.sensors.size)
         )
-        transport = self.transport(pilot, shape)
+        transport = self.transport(pilot, shape, self._lane_order(pilot), self._further_every(budget))
 
         def look(schedule: Schedule) -> int:
             return self._accumulate(pilot, shape, transport, schedule, lambda share: None)[2]
@@ -192,19 +209,22 @@ class PathEngine:
     def _accumulate(
         self, batch: Batch | Pilot, shape: HistogramShape, transport: Transport, schedule: Schedule, progress: Progress
     ) -> tuple[np.ndarray, np.ndarray, int]:
+        bounces, points = self.options.bounces, self.sensor_indices(batch)[self._lane_order(batch)]
+        seed, kernel = self.options.seed, self.kernel
         stage, strata = range(0), Strata.of_stage(range(0), mi.UInt32(0))
 
         def launch(histogram: DeviceHistogram, randomness: LaneRandomness, more: int) -> LaneRandomness:
             nonlocal stage, strata
+            if randomness.turn is None:
+                turns = first_turns(seed, points, self.capture.sensor_grid.nx, shape.lanes, transport.further_every)
+                randomness = replace(randomness, turn=turns)
             if stage != schedule.stage:
                 stage, strata = schedule.stage, Strata.of_stage(schedule.stage, randomness.sequence[0])
             randomness, strata = self.integrator.accumulate(transport, histogram, randomness, strata, more)
             return randomness
 
-        bounces, points = self.options.bounces, self.sensor_indices(batch)
         first = 1 if bounces.split else 0  # the second bounce has slot 0
         slots = range(-first, bounces.n_slots - first)
-        seed, kernel = self.options.seed, self.kernel
         result = accumulate(shape, points, seed, launch, schedule, progress, self.scale, slots, kernel)
         self.compile_seconds += result.compile_seconds
         return result.mean, result.variance, result.per_lane
@@ -217,20 +237,39 @@ class PathEngine:
             options.replicas, batch.sensors.size, lasers, slots, options.channels, self.time_axis.n_bins
         )
 
-    def transport(self, batch: Batch | Pilot, shape: HistogramShape) -> Transport:
-        """Return what the lanes of a batch read."""
+    def transport(
+        self,
+        batch: Batch | Pilot,
+        shape: HistogramShape,
+        order: NDArray[np.int64] | None = None,
+        further_every: int = 1,
+    ) -> Transport:
+        """Return what the lanes of a batch read.
+
+        Parameters
+        ----------
+        batch, shape
+            What is rendered, and the shape of its histogram.
+        order
+            (n,) the batch's sensor points in the order in which lanes take them; None: as they are.
+        further_every
+            Of so many paths one goes on beyond the third bounce.
+        """
         index, horizon = self.sensor_indices(batch), self.horizon
         sensors = sensor_points(self.built, self.capture, self.time_axis, index)
         lasers = laser_points(self.built, self.capture, self.time_axis, self.laser_indices(batch))
         lane = dr.arange(mi.UInt32, shape.lanes)
         sensor = lane % shape.sensors
+        if order is not None:
+            sensor = dr.gather(mi.UInt32, on_device(mi.UInt32, order), sensor)
+        owner = lane // shape.sensors * shape.sensors + sensor
         confocal = self.capture.scan_type == "confocal"
         first_laser = mi.UInt32(sensor) if confocal else dr.zeros(mi.UInt32, shape.lanes)
         per_lane = sensors.gather(sensor)
-        dr.eval(per_lane.interaction, per_lane.delay_bins, per_lane.delay_fraction, first_laser)
+        dr.eval(per_lane.interaction, per_lane.delay_bins, per_lane.delay_fraction, first_laser, owner)
         deadline = None
         if horizon is not None:
-            deadline = horizon.deadline_of_sensors(self.built, self.capture, self.time_axis, index, shape.lanes)
+            deadline = horizon.deadline_of_sensors(self.built, self.capture, self.time_axis, index, sensor)
         return Transport(
             built=self.built,
             sampler=self.sampler,
@@ -241,7 +280,43 @@ class PathEngine:
             n_lasers=dr.opaque(mi.UInt32, shape.lasers),
             bins_per_unit=dr.opaque(mi.Float, self.built.unit / self.time_axis.bin_width_opl),
             deadline=deadline,
+            owner=owner,
+            further_every=dr.opaque(mi.UInt32, further_every),
         )
+
+    def _lane_order(self, batch: Batch | Pilot) -> NDArray[np.int64]:
+        """Return the order in which lanes take a batch's sensor points: rays of a packet start near each other."""
+        positions = self.capture.sensor_grid.positions.reshape(-1, 3)[self.sensor_indices(batch)]
+        return np.argsort(z_order(positions), kind="stable")
+
+    def _further_every(self, budget: Budget) -> int:
+        """Return of how many paths one goes on beyond the third bounce: the same however the capture is cut."""
+        if not self.settings.may_stop_early:
+            return 1
+        if self.options.further_every is not None:
+            return self.options.further_every
+        has_end = budget.target_error is None and budget.time_limit_s is None
+        if has_end and (budget.spp or 0) * self.capture.n_sensors < LEAST_PATHS:
+            return 1
+        return self._best_every
+
+    @cached_property
+    def _best_every(self) -> int:
+        direct, split = are_direct(self.settings, self.sampler), self.options.bounces.split
+        return best_every(self._pilot_variance, DIRECT if direct else TRACED, split)
+
+    def _pilot_variance(self, further_every: int) -> float:
+        """Return the variance of H, summed, of a few samples at a few points: in arbitrary units."""
+        pilot, nx = pilot_of(self.capture), self.capture.sensor_grid.nx
+        replicas = pilot_replicas(self.options.replicas, pilot.sensors.size)
+        shape, order = replace(self.shape(pilot, self.n_slots), replicas=replicas), self._lane_order(pilot)
+        transport, histogram = self.transport(pilot, shape, order, further_every), DeviceHistogram(shape, self.kernel)
+        points = self.sensor_indices(pilot)[order]
+        turns = first_turns(PILOT_SEED, points, nx, shape.lanes, transport.further_every)
+        random = replace(lane_randomness(shape, points, PILOT_SEED), turn=turns)
+        strata = Strata.of_stage(range(PILOT_SAMPLES), random.sequence[0])
+        self.integrator.accumulate(transport, histogram, random, strata, PILOT_SAMPLES)
+        return float(histogram.on_host(histogram.statistics(PILOT_SAMPLES)[1])[..., :-1].sum())
 
     def second_bounce(self, batch: Batch) -> np.ndarray:
         """Return the second bounce (channel, 1, laser, sensor, row): exact, so one replica computes it."""
@@ -258,21 +333,6 @@ class PathEngine:
         """Return the flat indices of a batch's laser points."""
         return np.array(batch.lasers.flat_indices(self.capture.laser_grid.nx), dtype=np.uint32)
 
-    def _choose_hidden_fraction(self) -> float:
-        """Pick the mixture on the relay wall; one technique alone where it suffices: cheaper and less noisy."""
-        options, built = self.options, self.built
-        if options.hidden_fraction is not None:
-            return options.hidden_fraction
-        if not options.hidden_geometry_sampling or self.sampler.is_empty or built.hidden_bounds is None:
-            return 0.0
-        distance = built.hidden_bounds[0][2] / built.unit
-        # All light comes from sampled surfaces, and the wall has no mirror lobe that only its own sampling finds.
-        only_hidden = built.wall.is_planar and self.sampler.covers_everything
-        only_hidden &= not built.wall_bsdf.flags() & mi.BSDFFlags.Delta
-        if only_hidden and distance > 0 and self.sampler.area < NEAR_RATIO * math.pi * distance**2:
-            return 1.0
-        return 0.0 if self._surrounded_share() > SURROUNDED else 0.5
-
     def _sees_everything(self) -> bool:
         """Return whether a surface that faces a point of the wall is never hidden from it."""
         shapes = self.built.hidden_shapes
@@ -282,17 +342,3 @@ class PathEngine:
             return False
         smooth = any(shape.is_mesh() and shape.has_vertex_normals() for shape in shapes)
         return not smooth and nothing_occludes(self.built)
-
-    def _surrounded_share(self) -> float:
-        """Return the cosine-weighted share of directions from the sensor points that meet hidden geometry."""
-        grid = self.capture.sensor_grid
-        n_points = grid.positions.shape[0] * grid.positions.shape[1]
-        index = np.linspace(0, n_points - 1, min(n_points, 64)).astype(np.uint32)
-        points = sensor_points(self.built, self.capture, self.time_axis, index).interaction
-        lanes = dr.arange(mi.UInt32, len(index) * 64)
-        si = dr.gather(mi.SurfaceInteraction3f, points, lanes // 64)
-        k = lanes % 64
-        stratified = mi.Point2f((mi.Float(k % 8) + 0.5) / 8, (mi.Float(k // 8) + 0.5) / 8)
-        direction = si.to_world(mi.warp.square_to_cosine_hemisphere(stratified))
-        ray = mi.Ray3f(offset_origin(self.built, si, direction), direction)
-        return float(dr.mean(dr.select(self.built.scene.ray_test(ray), mi.Float(1), 0))[0])

@@ -3,26 +3,27 @@
 Paths start at sensor points. A lane belongs to one sensor point; when its path ends it starts the next one in
 the same iteration, so lanes stay busy whatever the path lengths. At every vertex the path is connected to the
 laser points (laser sampling) and goes on in a direction from the BSDF or, on the relay wall, towards a point
-sampled on the hidden geometry (hidden geometry sampling). The two are combined as one mixture density
-(one-sample MIS with the balance heuristic, Veach 1997), with the density of the vertex that the ray really
-reached; a sampled point that turns out to be occluded contributes nothing.
+sampled on the hidden geometry (hidden geometry sampling); see ``path_steps``. A sampled point that turns out to be
+occluded contributes nothing. Where hidden geometry sampling does alone, ``direct_paths`` has a quicker loop.
 """
 
 from __future__ import annotations
 
 import functools
+from dataclasses import replace
 
 import drjit as dr
 import mitsuba as mi
 
-from nlosrender.capture.bounces import FIRST_BOUNCE, BounceAxis
-from nlosrender.engine.connections import connect_to_lasers, deposit_spot, leg_to_tangent_plane, offset_origin
+from nlosrender.capture.bounces import FIRST_BOUNCE, THIRD_BOUNCE, BounceAxis
+from nlosrender.engine.connections import connect_to_lasers, deposit_spot
 from nlosrender.engine.deadline import thinned_out
 from nlosrender.engine.direct_paths import are_direct, trace_direct_paths
 from nlosrender.engine.histogram import DeviceHistogram
 from nlosrender.engine.low_discrepancy import recurrence_steps
+from nlosrender.engine.path_steps import Departure, DirectionNumbers, arrive, leave, turns_away, unit_interval
 from nlosrender.engine.strata import Strata, first_coordinate
-from nlosrender.engine.transport import HIGHEST_SURVIVAL, LaneRandomness, PathSettings, Transport
+from nlosrender.engine.transport import LaneRandomness, PathSettings, Transport
 
 PLUGIN_NAME = "nlos_path"
 
@@ -41,15 +42,14 @@ def trace_paths(
     Throughput is in units of radiance per (engine unit)^-2; the caller scales by energy and unit.
     """
     built, sampler, sensors = transport.built, transport.sampler, transport.sensors
-    scene, wall_bsdf = built.scene, built.wall_bsdf
     wall = mi.ShapePtr(built.wall_shape)
-    context = mi.BSDFContext()
-    lane = dr.arange(mi.UInt32, dr.width(sensors.delay_bins))
+    lane = transport.owner
     q = settings.hidden_fraction  # probability of hidden geometry sampling at a wall vertex
     steps = recurrence_steps(2) if 0 < q < 1 else (*recurrence_steps(1), 1)  # the second chooses the technique
     stride = strata.stride
     max_bounces, last_vertex = settings.bounces.max_bounces, settings.last_vertex
     deadline = transport.deadline if settings.thins_out else None
+    further_share = 1.0 / mi.Float(transport.further_every)
 
     # ---- State -------------------------------------------------------------------------------------------------
     generator = mi.PCG32(randomness.generator)
@@ -57,46 +57,22 @@ def trace_paths(
     seq_v, seq_t = (mi.UInt32(start) for start in randomness.sequence[1:])
     started = mi.UInt32(0)  # paths begun by this lane
     alive = mi.Bool(False)  # a ray is under way
-    ray = dr.zeros(mi.Ray3f)
+    way = Departure.none(built)  # that ray
     bounce = mi.UInt32(FIRST_BOUNCE)  # bounce index that a laser connection at the last vertex has
     throughput = mi.Spectrum(0)  # of the path up to the last vertex
-    value = mi.Spectrum(0)  # BSDF times cosine of the direction under way, undivided by its density
-    bsdf_density = mi.Float(0)  # share of BSDF sampling in that direction's density [1/sr]; 1 for delta lobes
-    hidden_density = mi.Float(0)  # share of hidden geometry sampling, before the Jacobian [1/area]
-    is_delta = mi.Bool(False)  # the direction comes from a delta lobe
     opl = mi.Float(0)  # optical path length from the sensor point [engine units]
     medium = mi.Float(1)  # refractive index along the ray
-    origin = mi.Point3f(0)  # last vertex, without ray offset
-    target = mi.Point3f(0)  # the hidden point the ray was sent to
-    target_shape = mi.ShapePtr(built.wall_shape)
-    target_primitive = mi.UInt32(0)
-    has_target = mi.Bool(False)
     is_thinned = mi.Bool(False)  # the path can only bring light after the window, and has survived that roulette
 
     # what a launch reads is no state of the loop
     while dr.hint(
-        alive | (started < n_samples), exclude=[settings, transport, histogram, built, sampler, sensors, deadline]
+        alive | (started < n_samples),
+        exclude=[settings, transport, histogram, built, sampler, sensors, deadline, further_share],
     ):
         # ---- Intersect -----------------------------------------------------------------------------------------
-        si = scene.ray_intersect(ray, mi.RayFlags.All, coherent=False, active=alive)
-        hit = alive & si.is_valid()
-        leg = dr.select(has_target, si.p - origin, leg_to_tangent_plane(built, si, origin, ray.d))
-        si.p = origin + leg
-        distance2 = dr.squared_norm(leg)
-        distance = dr.sqrt(distance2)
-        if dr.hint(q > 0, mode="scalar"):
-            # occluded: the ray met something in front of the sampled point
-            hit &= ~has_target | sampler.reached(si, target, target_shape, target_primitive)
-        on_wall = si.shape == wall
-        if dr.hint(built.wall.is_planar, mode="scalar"):
-            si.p.z = dr.select(on_wall, 0, si.p.z)  # exactly: rays that leave the wall there need no offset
-        density = mi.Float(bsdf_density)
-        if dr.hint(q > 0, mode="scalar"):
-            # not along the ray: its offset origin matters where hidden geometry comes close to the wall
-            cosine = dr.abs(dr.dot(si.n, leg)) / distance
-            jacobian = dr.select(sampler.covers(si, wall), distance2 / dr.maximum(cosine, 1e-9), 0)
-            density += hidden_density * jacobian
-        opl += medium * distance
+        there = arrive(settings, transport, way, alive)
+        si, hit = there.si, there.is_reached
+        opl += medium * there.distance
 
         # ---- Laser spot found by chance --------------------------------------------------------------------------
         if dr.hint(settings.finds_spot, mode="scalar"):
@@ -106,23 +82,25 @@ def trace_paths(
                 histogram,
                 lane,
                 si,
-                ray,
-                hit & on_wall,
-                is_delta,
+                way.ray,
+                hit & there.on_wall,
+                way.is_delta,
                 bounce,
                 opl,
                 throughput,
-                value,
-                density,
-                distance2,
+                way.value,
+                there.density,
+                there.distance2,
             )
 
-        throughput = dr.select(hit, throughput * value / density, 0)
+        throughput = dr.select(hit, throughput * way.value / there.density, 0)
         bounce += 1
         hit &= dr.any(mi.unpolarized_spectrum(throughput) != 0)
 
         # ---- Thin out what comes after the window, once a path ---------------------------------------------------
-        hit, is_thinned, throughput = thinned_out(deadline, generator, hit, is_thinned, opl, si.p, on_wall, throughput)
+        hit, is_thinned, throughput = thinned_out(
+            deadline, generator, hit, is_thinned, opl, si.p, there.on_wall, throughput
+        )
 
         # ---- Connect to the lasers and deposit ---------------------------------------------------------------------
         if dr.hint(settings.laser_sampling, mode="scalar"):
@@ -131,8 +109,9 @@ def trace_paths(
                 in_reach &= bounce >= settings.first_bounce
             if dr.hint(settings.goes_on and max_bounces is not None, mode="scalar"):
                 in_reach &= bounce <= max_bounces
+            leg = there.leg
             connect_to_lasers(
-                settings, transport, histogram, generator, lane, si, in_reach, bounce, opl, throughput, origin, leg
+                settings, transport, histogram, generator, lane, si, in_reach, bounce, opl, throughput, way.origin, leg
             )
 
         # ---- Continue, or start the next path ----------------------------------------------------------------------
@@ -158,75 +137,48 @@ def trace_paths(
         on_wall = vertex.shape == wall
 
         # ---- Sample the next direction -----------------------------------------------------------------------------
-        bits_u, bits_v, bits_t = first_coordinate(at), mi.UInt32(seq_v), mi.UInt32(seq_t)
+        numbers, t = DirectionNumbers(first_coordinate(at), unit_interval(seq_v)), unit_interval(seq_t)
         if dr.hint(settings.goes_on, mode="scalar"):
-            # A lane draws only what its path uses: numbers drawn while it idles would depend on how launches are cut.
-            bits_u = dr.select(start, bits_u, generator.next_uint32(go_on))
-            bits_v = dr.select(start, seq_v, generator.next_uint32(go_on))
-            bits_t = dr.select(start, seq_t, generator.next_uint32(go_on))
+            further = DirectionNumbers.drawn(generator, go_on)
+            numbers = dr.select(start, numbers, further)
+            t = dr.select(start, t, unit_interval(generator.next_uint32(go_on)))
         at = dr.select(start, at + stride, at)
         seq_v = dr.select(start, seq_v + steps[0], seq_v)
         seq_t = dr.select(start, seq_t + steps[1], seq_t)
-        u, v, t = _unit_interval(bits_u), _unit_interval(bits_v), _unit_interval(bits_t)
         has_target = alive & on_wall & (t < q)
         by_bsdf = alive & ~has_target
-        wo = mi.Vector3f(0, 0, 1)
-        value = mi.Spectrum(0)
-        bsdf_density = mi.Float(0)
-        is_delta = mi.Bool(False)
-        survival = mi.Float(1)
-        if dr.hint(q < 1 or settings.goes_on, mode="scalar"):
-            bsdf = vertex.bsdf()
-            lobe = generator.next_float32(by_bsdf)
-            bs, weight = bsdf.sample(context, vertex, lobe, mi.Point2f(u, v), by_bsdf)
-            wo = bs.wo
-            weight = vertex.to_world_mueller(weight, -wo, vertex.wi)
-            is_delta = by_bsdf & mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
-            share = dr.select(on_wall, 1 - q, 1.0)
-            bsdf_density = dr.select(is_delta, share, share * bs.pdf)
-            value = dr.select(is_delta, weight, weight * bs.pdf)
-            survival = dr.select(by_bsdf, dr.minimum(dr.max(mi.unpolarized_spectrum(weight)), HIGHEST_SURVIVAL), 1)
-            if dr.hint(settings.has_transmission, mode="scalar"):
-                medium = dr.select(by_bsdf & (bs.eta > 0), medium * bs.eta, medium)
+        sample = None
         if dr.hint(q > 0, mode="scalar"):
-            sample = sampler.sample(bits_u, v, has_target)
-            target, target_shape, target_primitive = sample.p, sample.shape, sample.primitive
+            sample = sampler.sample(numbers.bits_u, numbers.v, has_target)
+            dark = has_target & turns_away(transport, sample, vertex.p)
             if dr.hint(q == 1 and sampler.dark_behind, mode="scalar"):
-                # A point that shows its dark side ends the path here, without a ray; the next path starts at once.
-                dark = start & (dr.dot(sample.n, target - vertex.p) >= 0)
-                while dr.hint(dark & (started < n_samples), exclude=[sampler, sensors, vertex]):
+                # the next path starts at once
+                while dr.hint(dark & start & (started < n_samples), exclude=[transport, sampler, vertex, start]):
                     started += 1
-                    again = sampler.sample(first_coordinate(at), _unit_interval(seq_v), dark)
+                    again = sampler.sample(first_coordinate(at), unit_interval(seq_v), dark)
                     at += stride
                     seq_v += steps[0]
-                    target, target_shape, target_primitive = again.p, again.shape, again.primitive
-                    dark = dr.dot(again.n, target - vertex.p) >= 0
-                alive &= ~dark
-                has_target &= ~dark
-            to_target = target - vertex.p
-            direction = to_target * dr.rsqrt(dr.squared_norm(to_target))
-            local = vertex.to_local(direction)
-            f, pdf = wall_bsdf.eval_pdf(context, vertex, local, has_target)
-            f = vertex.to_world_mueller(f, -local, vertex.wi)
-            wo = dr.select(has_target, local, wo)
-            value = dr.select(has_target, f, value)
-            bsdf_density = dr.select(has_target, (1 - q) * pdf, bsdf_density)
-            hidden_density = dr.select(on_wall & ~is_delta, q / sampler.area, 0)
+                    sample = again
+                    dark = turns_away(transport, again, vertex.p)
+            alive &= ~dark
+            has_target &= ~dark
+        way, survival, eta = leave(
+            settings, transport, generator, vertex, on_wall, numbers, sample, by_bsdf, has_target
+        )
+        medium *= eta
+
+        # ---- Stop ----------------------------------------------------------------------------------------------------
         if dr.hint(settings.goes_on and settings.russian_roulette, mode="scalar"):
-            # after the connections of this vertex, by the albedo just met; never before it could deposit
+            # after the connections of this vertex, by the albedo just met; never before it could deposit;
+            # after the third bounce by a share besides (``further_paths``)
+            if dr.hint(settings.first_bounce == THIRD_BOUNCE, mode="scalar"):
+                survival *= dr.select(bounce == THIRD_BOUNCE, further_share, 1)
             survival = dr.select(start | (bounce < settings.first_bounce), 1, survival)
             alive &= generator.next_float32(alive & ~start) < survival
-            value /= dr.maximum(survival, 1e-9)
-        alive &= dr.any(mi.unpolarized_spectrum(value) != 0)
-        world = vertex.to_world(wo)
-        origin = mi.Point3f(vertex.p)
-        ray_origin = offset_origin(built, vertex, world)
-        if dr.hint(q > 0, mode="scalar"):
-            # from the offset origin: a parallel ray would land beside the target, in another triangle of a fine mesh
-            world = dr.select(has_target, dr.normalize(target - ray_origin), world)
-        ray = mi.Ray3f(ray_origin, world)
+            way.value /= dr.maximum(survival, 1e-9)
+        alive &= dr.any(mi.unpolarized_spectrum(way.value) != 0)
 
-    return LaneRandomness(generator, [randomness.sequence[0], seq_v, seq_t]), Strata(at, stride)
+    return replace(randomness, generator=generator, sequence=[randomness.sequence[0], seq_v, seq_t]), Strata(at, stride)
 
 
 def _at_sensor(point: mi.SurfaceInteraction3f) -> mi.Spectrum:
@@ -239,10 +191,6 @@ def _at_sensor(point: mi.SurfaceInteraction3f) -> mi.Spectrum:
     out = point.to_world(point.wi)
     horizontal = dr.normalize(dr.cross(-out, mi.Vector3f(0, 1, 0)))
     return mi.Spectrum(mi.mueller.rotate_stokes_basis_m(out, mi.mueller.stokes_basis(out), horizontal))
-
-
-def _unit_interval(bits: mi.UInt32) -> mi.Float:
-    return mi.Float(bits >> 8) * 2.0**-24
 
 
 @functools.cache
@@ -269,6 +217,7 @@ def _plugin_class(variant: str) -> type:
                 spot_radius=float(properties.get("spot_radius", 0.0)),
                 needs_visibility=bool(properties.get("needs_visibility", True)),
                 has_transmission=bool(properties.get("has_transmission", False)),
+                only_normals_matter=bool(properties.get("only_normals_matter", False)),
             )
 
         def accumulate(
@@ -283,7 +232,7 @@ def _plugin_class(variant: str) -> type:
             trace = trace_direct_paths if are_direct(self.settings, transport.sampler) else trace_paths
             count = dr.opaque(mi.UInt32, n_samples)
             advanced, strata = trace(self.settings, transport, histogram, randomness, strata, count)
-            dr.eval(histogram.sums, advanced.generator, advanced.sequence, strata.at)
+            dr.eval(histogram.sums, advanced.generator, advanced.sequence, advanced.turn, strata.at)
             return advanced, strata
 
         def to_string(self) -> str:
@@ -308,5 +257,6 @@ def load_path_integrator(settings: PathSettings) -> mi.Integrator:
             "spot_radius": settings.spot_radius,
             "needs_visibility": settings.needs_visibility,
             "has_transmission": settings.has_transmission,
+            "only_normals_matter": settings.only_normals_matter,
         }
     )

@@ -78,7 +78,7 @@ def accumulate(
     shape
         Of the batch's histogram.
     points
-        (sensors,) flat indices of the batch's sensor points: what their random numbers depend on.
+        (sensors,) flat indices of the batch's sensor points, in the lanes' order: what their random numbers depend on.
     seed
         Of the render.
     launch
@@ -93,9 +93,7 @@ def accumulate(
         As for ``DeviceHistogram``.
     """
     histogram = DeviceHistogram(shape, kernel)
-    lane = dr.arange(mi.UInt32, shape.lanes)
-    point = dr.gather(mi.UInt32, on_device(mi.UInt32, points), lane % shape.sensors)
-    randomness = LaneRandomness.seeded(seed, point * shape.replicas + lane // shape.sensors)
+    randomness = lane_randomness(shape, points, seed)
     begun, done, compile_seconds = time.perf_counter(), 0, 0.0
     while (more := schedule.next_samples(done, time.perf_counter() - begun)) > 0:
         launched = time.perf_counter()
@@ -113,6 +111,13 @@ def accumulate(
     mean, variance = histogram.statistics(done, scale, slots)
     dr.eval(mean, variance)
     return Sampled(histogram.on_host(mean), histogram.on_host(variance), done, compile_seconds)
+
+
+def lane_randomness(shape: HistogramShape, points: NDArray[np.uint32], seed: int) -> LaneRandomness:
+    """Return the random state that lanes begin with; parameters as for ``accumulate``."""
+    lane = dr.arange(mi.UInt32, shape.lanes)
+    point = dr.gather(mi.UInt32, on_device(mi.UInt32, points), lane % shape.sensors)
+    return LaneRandomness.seeded(seed, point * shape.replicas + lane // shape.sensors)
 
 
 def pilot_replicas(replicas: int, n_sensors: int) -> int:

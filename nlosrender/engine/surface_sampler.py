@@ -13,18 +13,20 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from nlosrender.engine.device_arrays import on_device
 from nlosrender.engine.space_filling import z_order
 from nlosrender.scene.build import WALL_ID, BuiltScene, wall_box
 from nlosrender.scene.pose import Float64
 
 SAMPLEABLE_PLUGINS = ("Rectangle", "Disk", "Sphere", "Cylinder")
 _FULL = 2.0**32
+MOST_GUIDE_BITS = 22  # 16 MB
 ANALYTIC = 0xFFFFFFFF  # primitive of a point that lies on no triangle
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class SurfaceSample:
-    """A point on the hidden geometry, one per lane."""
+    """A point on the hidden geometry, one per lane; not frozen, for it may be state of a loop."""
 
     p: mi.Point3f
     shape: mi.ShapePtr
@@ -85,7 +87,11 @@ class SurfaceSampler:
         cumulative = np.minimum(np.rint(np.cumsum(areas) / self.area * _FULL), _FULL - 1)
         # entry i covers the integers [edges[i], edges[i + 1]); the last one also takes 2^32 - 1
         self._edges = mi.UInt32(np.concatenate([[0], cumulative]).astype(np.uint32))
-        self._n_entries = len(areas)
+        # a guide for the search (Chen & Asau 1974): the entry at the start of each of 2^k equal parts of the integers
+        self._guide_bits = min(max((len(areas) - 1).bit_length() + 1, 1), MOST_GUIDE_BITS)
+        parts = np.arange(2**self._guide_bits, dtype=np.uint64) << np.uint64(32 - self._guide_bits)
+        guide = np.append(np.searchsorted(cumulative[:-1], parts, side="right"), len(areas) - 1)
+        self._guide = on_device(mi.UInt32, guide)
         self._owner = mi.UInt32(owner)
         if self.n_triangles:
             self._primitive = mi.UInt32(np.concatenate(primitives))
@@ -105,9 +111,7 @@ class SurfaceSampler:
         active
             Lanes that need a sample.
         """
-        entry = dr.binary_search(
-            0, self._n_entries - 1, lambda i: dr.gather(mi.UInt32, self._edges, i + 1, active) <= bits
-        )
+        entry = self._entry(bits, active)
         low = dr.gather(mi.UInt32, self._edges, entry, active)
         high = dr.gather(mi.UInt32, self._edges, entry + 1, active)
         u = dr.minimum(
@@ -131,8 +135,34 @@ class SurfaceSampler:
             point, normal = dr.select(on_analytic, at, point), dr.select(on_analytic, facing, normal)
         return SurfaceSample(point, shape, normal, primitive, within)
 
-    def surface(self, sample: SurfaceSample, direction: mi.Vector3f, active: mi.Bool) -> mi.SurfaceInteraction3f:
-        """Return the surface at sampled points of triangles as a ray in ``direction`` finds it; no ray is traced."""
+    @dr.syntax
+    def _entry(self, bits: mi.UInt32, active: mi.Bool) -> mi.UInt32:
+        """Return the entry that covers the integers ``bits``: few steps, for the guide says where it may be."""
+        part = bits >> (32 - self._guide_bits)
+        low = dr.gather(mi.UInt32, self._guide, part, active)
+        high = dr.gather(mi.UInt32, self._guide, part + 1, active)
+        while dr.hint(active & (low < high), exclude=[self, bits, active]):
+            middle = (low + high) >> 1
+            is_beyond = dr.gather(mi.UInt32, self._edges, middle + 1, active) <= bits
+            low = dr.select(is_beyond, middle + 1, low)
+            high = dr.select(is_beyond, high, middle)
+        return low
+
+    def surface(
+        self, sample: SurfaceSample, direction: mi.Vector3f, active: mi.Bool, only_normals_matter: bool = False
+    ) -> mi.SurfaceInteraction3f:
+        """Return the surface at sampled points of triangles as a ray in ``direction`` finds it; no ray is traced.
+
+        ``only_normals_matter``: its frame is any around the normal.
+        """
+        if only_normals_matter:
+            si = dr.zeros(mi.SurfaceInteraction3f)
+            si.n = dr.normalize(sample.n)
+            si.sh_frame = mi.Frame3f(si.n)
+            si.t, si.shape, si.p = mi.Float(1), sample.shape, sample.p
+            si.prim_index = sample.primitive
+            si.wi = si.to_local(-direction)
+            return si
         hit = dr.zeros(mi.PreliminaryIntersection3f)
         hit.t = mi.Float(1)
         hit.prim_uv, hit.prim_index = sample.barycentric, sample.primitive

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import drjit as dr
 import mitsuba as mi
 
-from nlosrender.capture.bounces import FIRST_BOUNCE, BounceAxis
+from nlosrender.capture.bounces import FIRST_BOUNCE, THIRD_BOUNCE, BounceAxis
 from nlosrender.engine.deadline import Deadline
 from nlosrender.engine.device_arrays import WallPoints
 from nlosrender.engine.surface_sampler import SurfaceSampler
@@ -28,6 +28,7 @@ class PathSettings:
     spot_radius: float  # of the laser on the wall [engine units]; 0 = a point
     needs_visibility: bool  # something may lie between a vertex and a laser or sensor point
     has_transmission: bool  # some BSDF refracts: the optical path length needs the medium's index
+    only_normals_matter: bool  # to the BSDFs: no textures, no anisotropy, no normals of vertices
 
     @property
     def goes_on(self) -> bool:
@@ -44,6 +45,12 @@ class PathSettings:
     def thins_out(self) -> bool:
         """Whether few paths go on that can only bring light after the time window."""
         return self.goes_on and self.russian_roulette
+
+    @property
+    def may_stop_early(self) -> bool:
+        """Whether only some of the paths may go on beyond the third bounce, which all of them deposit."""
+        is_first = self.first_bounce == THIRD_BOUNCE and self.laser_sampling
+        return self.thins_out and is_first and not self.finds_spot
 
     @property
     def finds_spot(self) -> bool:
@@ -64,12 +71,15 @@ class Transport:
     n_lasers: mi.UInt32  # opaque copy of ``lasers_per_lane``: its value is not part of the kernel
     bins_per_unit: mi.Float  # engine unit / bin width, opaque
     deadline: Deadline | None  # None: all light arrives before the end of the window
+    owner: mi.UInt32  # per lane: which lane's rows of the histogram it adds to
+    further_every: mi.UInt32  # of so many paths one goes on beyond the third bounce, with the light of all; opaque
 
     def of_lanes(self, index: mi.UInt32) -> Transport:
         """Return what the lanes at ``index`` read."""
         sensors, first_laser = self.sensors.gather(index), dr.gather(mi.UInt32, self.first_laser, index)
-        dr.eval(sensors.interaction, sensors.delay_bins, sensors.delay_fraction, first_laser)
-        return replace(self, sensors=sensors, first_laser=first_laser)
+        owner = dr.gather(mi.UInt32, self.owner, index)
+        dr.eval(sensors.interaction, sensors.delay_bins, sensors.delay_fraction, first_laser, owner)
+        return replace(self, sensors=sensors, first_laser=first_laser, owner=owner)
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,6 +88,7 @@ class LaneRandomness:
 
     generator: mi.PCG32
     sequence: list[mi.UInt32]  # low-discrepancy state, three dimensions
+    turn: mi.UInt32 | None = None  # paths until the next one that goes on beyond the third bounce
 
     @classmethod
     def seeded(cls, seed: int, lane_key: mi.UInt32) -> LaneRandomness:

@@ -170,3 +170,23 @@ def test_additive_recurrences_cover_boxes_evenly(dimensions: int) -> None:
     worst = np.abs(inside - corners.prod(axis=-1)).max()
     # The largest of 300 random deviations, sigma up to 0.5 / sqrt(n), would be above 2 sigma; these fall as 1 / n.
     assert worst < 0.5 / np.sqrt(n)
+
+
+def test_the_guide_leads_to_the_entry_that_covers_a_number() -> None:
+    """The guided search finds what a search of the whole table finds, at the edges of entries, too."""
+    sphere = {"type": "sphere", "center": [0.0, 0.0, 3.0], "radius": 1.5}  # beside triangles of a millionth of its area
+    letters = {"type": "letters", "text": "S", "height": 0.01, "center": [0, 0, 1], "normal": [0, 0, -1]}
+    config = configured(flat_wall(letters, sphere, PLATE))
+    start_backend("llvm")
+    import mitsuba as mi
+
+    from nlosrender.engine.surface_sampler import SurfaceSampler
+
+    sampler = SurfaceSampler(pipeline.load_scene(config))
+    edges = np.array(sampler._edges).astype(np.int64)
+    assert len(np.unique(edges)) > 10
+    wanted = np.concatenate([edges, edges - 1, edges + 1, np.random.default_rng(2).integers(0, 2**32, 5000)])
+    bits = np.clip(wanted, 0, 2**32 - 1)
+    expected = np.searchsorted(edges[1:-1], bits, side="right")
+    found = sampler._entry(mi.UInt32(bits.astype(np.uint32)), mi.Bool(True))
+    np.testing.assert_array_equal(np.array(found), expected)
