@@ -91,6 +91,26 @@ def test_clusters_send_on_the_light_of_their_members(
     assert patches.areas.sum() < 0.99 * areas.sum()  # what bends away from the laser sends less
 
 
+@pytest.mark.parametrize("coarseness", [1.0, 0.4])
+def test_no_cluster_lies_between_two_sheets(tmp_path: Path, coarseness: float) -> None:
+    """Surfaces of one mesh above one another, 0.15 m apart, are clusters of their own: nothing reflects between."""
+    item = sheet(tmp_path, N_FINE, waves=0.0)
+    x, y = (side.ravel() for side in np.meshgrid(np.linspace(-0.4, 0.4, N_FINE), np.linspace(-0.4, 0.4, N_FINE + 1)))
+    lower = np.stack([x, y, 0.2 * x - 0.3 * y], axis=1)
+    faces = grid_faces(N_FINE, N_FINE - 1)[:, ::-1]
+    both = np.concatenate([lower, lower + np.array([0, 0, 0.15])])
+    write_ply(tmp_path / "sheet.ply", both, np.concatenate([faces, faces + len(lower)]))
+    tessellator = tessellated(item, folder=tmp_path)
+    patches = tessellator.patches(coarseness)
+    assert patches.is_cluster.all()
+    x, y, z = (patches.centres * tessellator.built.unit - item["translate"]).T
+    heights = z - 0.2 * x + 0.3 * y
+    # less than a share p of the other sheet is let pass: p (1 - p) 0.15^2 = level^2 / 12, the level being 0.08 m
+    assert np.abs(heights - 0.15 * (heights > 0.075)).max() < 0.025 * 0.15
+    areas = [patches.areas[which].sum() for which in (heights > 0.075, heights < 0.075)]
+    assert areas == pytest.approx([tessellator.shared.areas.sum() / 2] * 2, rel=0.025)
+
+
 def test_what_a_cluster_is_made_of_does_not_matter(tmp_path: Path) -> None:
     """Cells merged in two steps have the sums of cells merged in one, and a member of each cluster lies in it."""
     tessellator = tessellated(sheet(tmp_path, N_FINE), folder=tmp_path)

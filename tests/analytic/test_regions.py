@@ -113,6 +113,23 @@ def test_cells_are_no_longer_than_their_distance_from_the_region() -> None:
             assert (cells.sizes <= np.maximum(distances, 1e-3) * (1 + 1e-6)).all()
 
 
+def test_cells_that_are_small_enough_are_quartered_by_nobody() -> None:
+    """Parted first and quartered then, cells are those quartered at once: as many, of the same sizes and distances."""
+    engine = engine_of(ROOM, PLATE)
+    from nlosrender.engine.virtual_lights.cells import Cells, parted, quartered, triangles_of_mesh
+
+    distance, shapes = engine.tessellator.distance, engine.built.hidden_shapes
+    once = quartered(Cells.joined([triangles_of_mesh(engine.built, 1, shape) for shape in shapes]), distance, None, 0.3)
+    small, large = parted(once, distance, None)
+    assert len(small.sizes) > 0 < len(large.sizes)
+    assert (small.sizes <= small.distances).all()
+    for least in (0.0, 0.2):
+        whole_cells = quartered(once, distance, None, least)
+        joined = Cells.joined([small, quartered(large, distance, None, least)])
+        for found, expected in ((joined.sizes, whole_cells.sizes), (joined.distances, whole_cells.distances)):
+            np.testing.assert_array_equal(np.sort(found), np.sort(expected))
+
+
 @pytest.mark.usefixtures("eager")
 def test_a_batch_says_what_the_whole_capture_says() -> None:
     """Regions belong to the capture: a part of its sensor points gathers the same bits alone."""

@@ -155,6 +155,13 @@ def triangles_of_mesh(built: BuiltScene, index: int, mesh: mi.Mesh) -> Cells:
     return Cells(corners, weights, shading, shapes, primitives, longest_edges(corners), np.zeros(count))
 
 
+def parted(cells: Cells, distance: WallDistance, wall_index: int | None) -> tuple[Cells, Cells]:
+    """Return the cells that ``quartered`` leaves as they are, with their distances, and those that it quarters."""
+    distances = _distances(cells, distance, wall_index)
+    large = cells.sizes > distances
+    return replace(cells, distances=distances).at(~large), cells.at(large)
+
+
 def quartered(cells: Cells, distance: WallDistance, wall_index: int | None, least: float = 0.0) -> Cells:
     """Quarter cells until none is longer than its distance from the nearest point.
 

@@ -10,6 +10,7 @@ import numpy as np
 
 from nlosrender.engine.virtual_lights.cells import Cells, normals_and_areas
 from nlosrender.engine.virtual_lights.clusters import Merger
+from nlosrender.engine.virtual_lights.grains import covered_boxes
 from nlosrender.engine.virtual_lights.patches import Patches, split_cells
 from nlosrender.scene.pose import Float64
 
@@ -76,7 +77,7 @@ class GradedCells:
 
     @cached_property
     def _counts(self) -> tuple[_CellCount, _CellCount]:
-        boxes = self.merger.boxes
+        boxes = covered_boxes(self.normals, self.areas, self.allowed)  # the merger's, which may never be needed
         hidden, wall = (_CellCount(self._ratios[of], boxes[of]) for of in (self.is_hidden, ~self.is_hidden))
         return hidden, wall
 
@@ -94,7 +95,7 @@ class _CellCount:
     ratios
         (n,) sizes of the cells over the sizes allowed.
     boxes
-        (n,) ``Merger.boxes``.
+        (n,) ``covered_boxes``.
     """
 
     def __init__(self, ratios: Float64, boxes: Float64):

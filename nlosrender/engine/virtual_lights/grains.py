@@ -14,6 +14,7 @@ from nlosrender.scene.pose import Float64
 GRID = 0.8  # edge of a box per size allowed
 TALL = 5.0  # height of a box per edge: a surface at 45 degrees to both sides rises by two
 SLOPES = 3.0  # width of the classes that slopes within a box are sorted into where it is rough, at coarseness 1
+RIDGE = 1e-6  # of the squared extent: keeps planes through points on a line defined
 SLIVER = 0.3  # of a box: less than that joins the box beside it
 PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))  # axes of the second moments
 
@@ -28,6 +29,7 @@ STEPS = np.array(
         0xAD92C5AD6764D11D,
         0x978BC24DBD49645F,
         0xD43DBFB0CF4541BD,
+        0x8F3C6E5B1D27A94B,
     ],
     np.uint64,
 )
@@ -46,6 +48,7 @@ class Grains:
 
     shapes: NDArray[np.uint32]  # (n,) index into the scene's shapes
     scales: Int64  # (n,) binary logarithm of the size allowed, rounded down: that of boxes, so that they grow with it
+    levels: Float64  # (n,) how far off its plane the surface of a box may go at coarseness 1 [engine units]
     facing: Int64  # (n,) twice the axis, + 1 where normals go along it
     in_box: Float64  # (n, 3) middles [engine units]: across the box in two directions, and upright
     places: Float64  # (n, 10) area, area times position, and times the products of its components, as ``PAIRS``
@@ -58,19 +61,21 @@ class Grains:
     def of(cls, cells: Cells, normals: Float64, areas: Float64, allowed: Float64) -> Grains:
         """Return cells as they are; parameters as for ``Merger``."""
         centres, rows = middles(cells.corners), np.arange(len(areas))
-        scales = np.floor(np.log2(allowed)).astype(np.int64)
+        scales = _scales(allowed)
         upright = np.abs(normals).argmax(axis=1)
         along = normals[rows, upright]
         light = (areas[:, None, None] * normals[:, :, None] * cells.shading_normals[:, None, :]).reshape(-1, 9)
         return cls(
             cells.shapes,
             scales,
+            # a patch of this size at distance d is up to a quarter of this off a linear delay, for all its members
+            allowed**2 / cells.distances,
             2 * upright + (along > 0),
             _in_box(centres, upright),
             _place_moments(cells.corners, centres, areas),
             _slopes(normals, upright),
             light,
-            areas * np.abs(along) / (GRID * 2.0**scales) ** 2,
+            covered_boxes(normals, areas, allowed),
             rows,
         )
 
@@ -96,6 +101,7 @@ class Grains:
         return Grains(
             self.shapes[first],
             self.scales[first],
+            self.levels[first],
             facing,
             _in_box(places[:, 1:4] / places[:, :1], upright),
             places,
@@ -114,6 +120,11 @@ class Grains:
         if is_rough.any():  # there one normal does for some directions of lasers and sensor points only
             keys += [np.where(is_rough[number], np.rint(slope / (SLOPES * coarseness)), 0) for slope in self.slopes.T]
             codes, number = _numbered(keys)
+        off, level = self._off_plane(number), coarseness * self.levels
+        is_uneven = np.bincount(number, self.areas * off**2) > np.bincount(number, self.areas * level**2) / 12
+        if is_uneven.any():  # surfaces above one another: between them there is no light, nor at one time for both
+            keys.append(np.where(is_uneven[number], np.rint(off / level), 0))
+            codes, number = _numbered(keys)
         is_sliver = np.bincount(number, self.boxes) < SLIVER * coarseness**2
         total = np.bincount(number, self.areas)
         offsets = [np.bincount(number, self.areas * (place % 1)) / total - 0.5 for place in (across, other)]
@@ -121,11 +132,35 @@ class Grains:
         shape = (int(number.max()) + 1, len(self))
         return coo_matrix((np.ones(len(self)), (number, np.arange(len(self)))), shape=shape).tocsr()
 
+    def _off_plane(self, number: Int64) -> Float64:
+        """Return the heights (n,) of grains over the best plane through all in the box that ``number`` (n,) names."""
+        total = np.maximum(np.bincount(number, self.areas), 1e-300)
+
+        def mean(values: Float64) -> Float64:
+            return (np.bincount(number, self.areas * values) / total)[number]
+
+        u, v, height = (axis - mean(axis) for axis in self.in_box.T)
+        uu, uv, vv = mean(u * u), mean(u * v), mean(v * v)
+        ridge = RIDGE * (uu + vv) + 1e-100
+        along_u, along_v = mean(u * height), mean(v * height)
+        determinant = (uu + ridge) * (vv + ridge) - uv**2
+        rise = u * ((vv + ridge) * along_u - uv * along_v) + v * ((uu + ridge) * along_v - uv * along_u)
+        return height - rise / determinant
+
     def _slope_variance(self, number: Int64) -> Float64:
         """Return the variance (m,) of the slopes, by area, of the grains in each box that ``number`` (n,) names."""
         total = np.bincount(number, self.areas)
         squares = np.bincount(number, self.areas * np.square(self.slopes).sum(axis=1)) / total
         return squares - sum(np.square(np.bincount(number, self.areas * slope) / total) for slope in self.slopes.T)
+
+
+def covered_boxes(normals: Float64, areas: Float64, allowed: Float64) -> Float64:
+    """Return how many boxes of coarseness 1 cells (n,) cover; parameters as for ``Merger``."""
+    return areas * np.abs(normals).max(axis=1) / (GRID * 2.0 ** _scales(allowed)) ** 2
+
+
+def _scales(allowed: Float64) -> Int64:
+    return np.floor(np.log2(allowed)).astype(np.int64)
 
 
 def _in_box(vectors: Float64, upright: Int64) -> Float64:
@@ -161,7 +196,7 @@ def _numbered(keys: list[NDArray]) -> tuple[UInt64, Int64]:
     are as good as random to each other: among a million one pair is the same with probability 3e-8.
     """
     codes = np.zeros(len(keys[0]), np.uint64)
-    for key, step in zip(keys, STEPS, strict=False):
+    for key, step in zip(keys, STEPS[: len(keys)], strict=True):
         codes += key.astype(np.int64).view(np.uint64) * step
     return np.unique(codes, return_inverse=True)
 

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nlosrender.capture.grids import Capture, PointGrid
-from nlosrender.engine.virtual_lights.cells import Cells, WallDistance, quartered
+from nlosrender.engine.virtual_lights.cells import Cells, WallDistance, parted, quartered
 from nlosrender.engine.virtual_lights.graded_cells import GradedCells
 
 BLOCKS = (8, 4, 2)  # regions along each side of the sensor grid, the first that leaves enough points in each
@@ -65,23 +65,29 @@ def regions_of(
     blocks = next((blocks for blocks in BLOCKS if capture.n_sensors >= blocks**2 * LEAST_POINTS), 1)
     # Beyond its own size a region sees about what its neighbours see: there cells of all points do.
     reach = max(capture.sensor_grid.size) / blocks / unit
+    wall_index = whole.grading.wall_index
+    small: Cells | None = None
     while blocks > 1 and whole.share_if_far(reach / 2) <= WORTH:
-        cells = quartered(triangles, distance, whole.grading.wall_index, reach / 2)
-        is_near = cells.distances < reach
-        if np.count_nonzero(is_near) * blocks**2 <= MOST_CELLS:
+        if small is None:  # may be many, and are the same whatever the reach
+            small, large = parted(triangles, distance, wall_index)
+        parts = (small, quartered(large, distance, wall_index, reach / 2))
+        if sum(np.count_nonzero(cells.distances < reach) for cells in parts) * blocks**2 <= MOST_CELLS:
             break
         reach /= 2  # what is nearest is cut finest
     else:
         return None  # too little to save
-    grid, close = capture.sensor_grid, cells.at(is_near)
+    close, far = (
+        Cells.joined([cells.at((cells.distances < reach) == is_near) for cells in parts]) for is_near in (True, False)
+    )
+    grid = capture.sensor_grid
     rows, columns = (np.arange(n) * blocks // n for n in (grid.ny, grid.nx))
     near = []
     for row, column in np.ndindex(blocks, blocks):
         part = _part_of(capture, np.ix_(rows == row, columns == column))
-        own = quartered(close, WallDistance(part, unit), whole.grading.wall_index)
+        own = quartered(close, WallDistance(part, unit), wall_index)
         near.append(GradedCells(own, whole.grading))
     labels = (rows[:, None] * blocks + columns).reshape(-1)
-    regions = Regions(labels, tuple(near), GradedCells(cells.at(~is_near), whole.grading))
+    regions = Regions(labels, tuple(near), GradedCells(far, whole.grading))
     cost = sum(regions.counts(1.0)) * capture.n_sensors + regions.total(1.0) * POINTS_PER_PATCH
     without = sum(whole.counts(1.0)) * (capture.n_sensors + POINTS_PER_PATCH)
     return regions if cost < WORTH * without else None
