@@ -26,12 +26,11 @@ from nlosrender.config.warnings import config_warnings
 from nlosrender.engine.backend import Backend, batch_memory, physical_memory, start_backend
 from nlosrender.files.capture_file import CaptureHeader
 from nlosrender.files.chunks import sensor_tile
-from nlosrender.files.identity import capture_identity, identity_attributes
-from nlosrender.files.interruption import uninterrupted
+from nlosrender.files.identity import capture_identity, files_read, identity_attributes
 from nlosrender.files.part_attributes import part_attributes, summed_attributes
 from nlosrender.files.partial_capture import PartialCapture
 from nlosrender.files.provenance import provenance_attributes
-from nlosrender.files.replacement import check_writable
+from nlosrender.files.replacement import check_writable, refuse_sources
 from nlosrender.files.size import disk_warnings
 from nlosrender.rendering.dask_executor import render_on_cluster
 from nlosrender.rendering.dask_worker import Job
@@ -80,8 +79,10 @@ def render_capture(
     Raises
     ------
     ConfigError
-        Something only the renderer could find wrong: a mesh that cannot be read, a BSDF that Mitsuba rejects, a part
-        that the capture does not have, a capture that does not fit the memory.
+        Something only the renderer could find wrong: a mesh that cannot be read, a BSDF that Mitsuba rejects, a
+        capture that does not fit the memory.
+    OptionError
+        The capture does not have the part that is selected.
     BackendError
         There is no usable LLVM or GPU, here or on a worker.
     FileError
@@ -93,10 +94,11 @@ def render_capture(
     """
     stopwatch, warnings = Stopwatch(), Warnings(warn)
     warnings.say(config_warnings(config))
-    with stopwatch.stage("scene"):
-        check_writable(config.output.path)
-        backend = started_backend(config)
     resolved, output = config_to_dict(config), config.output
+    with stopwatch.stage("scene"):
+        check_writable(output.path)
+        refuse_sources(output.path, files_read(resolved))
+        backend = started_backend(config)
     sharing = ALONE if cluster is None else cluster.sharing
     replicas = replicas_for(backend.lanes, config.capture.sensor_grid.n_points)
     identity = capture_identity(resolved, str(selection), backend.variant, replicas)
@@ -158,8 +160,7 @@ def started_backend(config: Config) -> Backend:
         There is no usable LLVM or GPU.
     """
     render = config.render
-    with uninterrupted():  # an import that Ctrl-C cuts off ends in errors of its own, or a crash
-        return start_backend(render.backend, colored=config.is_colored, polarized=render.polarized)
+    return start_backend(render.backend, colored=config.is_colored, polarized=render.polarized)
 
 
 def set_up_engine(

@@ -99,7 +99,7 @@ def write_frames(path: str | Path, output: str | Path, options: FrameOptions) ->
     with open_capture(path) as capture:
         if capture.header.scan_type != LINE_OF_SIGHT:
             raise FileError(
-                f"{path}: is a {capture.header.scan_type} capture of a relay wall, not what a camera sees. "
+                f"{path}: is a capture of a relay wall ({capture.header.scan_type}), not what a camera sees. "
                 "See `nlosrender plot`."
             )
         stokes = capture.header.attributes.get("channels") == STOKES

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from pathlib import Path
 
 import numpy as np
@@ -28,11 +29,10 @@ def save_exr(picture: Float32, path: Path, stokes: bool = False) -> None:
     names = STOKES_NAMES if stokes else ("Y",) if picture.shape[-1] == 1 else ("R", "G", "B")
     planes = {name: np.ascontiguousarray(picture[..., index]) for index, name in enumerate(names)}
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
-    try:
-        with OpenEXR.File(header, planes) as file:
-            file.write(str(path))
-    except RuntimeError as error:
-        raise OSError(str(error)) from error
+    content = io.BytesIO()  # OpenEXR itself opens only names in UTF-8
+    with OpenEXR.File(header, planes) as file:
+        file.write(content)
+    path.write_bytes(content.getbuffer())
 
 
 def save_png(picture: Bytes, path: Path) -> None:

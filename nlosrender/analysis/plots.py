@@ -33,7 +33,8 @@ from nlosrender.analysis.theme import (
     style,
 )
 from nlosrender.capture.bounces import FILE_BOUNCES, LINE_OF_SIGHT
-from nlosrender.errors import FileError
+from nlosrender.config.encodable import encodable
+from nlosrender.errors import FileError, OptionError
 from nlosrender.files.layout import data_unit
 from nlosrender.files.reader import StoredCapture, open_capture
 from nlosrender.files.replacement import check_writable, explained_write, partial_path, publish
@@ -76,15 +77,20 @@ def plot_capture(
     Raises
     ------
     FileError
-        The capture cannot be read, a point does not exist, or the picture cannot be written.
+        The capture cannot be read, or the picture cannot be written.
+    OptionError
+        There is no such point, or pictures have no such format.
     """
     picture = Path(out_png)
     if picture.suffix.lower() not in FORMATS:
-        raise FileError(f"{picture}: a picture's name ends in one of {', '.join(FORMATS)}")
+        raise OptionError(f"--output: got {str(picture)!r}, need a name that ends in one of {', '.join(FORMATS)}")
     target = check_writable(picture)
     if target == Path(path).resolve():
         raise FileError(f"{picture}: is the capture itself. Name another picture.")
     with open_capture(path) as capture:
+        sizes = capture.header.sizes
+        _check_point("--laser", laser, sizes["laser_y"], sizes["laser_x"])
+        _check_point("--pixel", pixel, sizes["sensor_y"], sizes["sensor_x"])
         figure = _draw(capture, laser, pixel)
     partial = partial_path(target)
     with explained_write(picture):
@@ -94,6 +100,13 @@ def plot_capture(
         finally:
             partial.unlink(missing_ok=True)
     return picture
+
+
+def _check_point(option: str, point: tuple[int, int] | None, rows: int, columns: int) -> None:
+    if point is not None and not (0 <= point[0] < rows and 0 <= point[1] < columns):
+        raise OptionError(
+            f"{option}: got {point[0]},{point[1]}, need a row from 0 to {rows - 1} and a column from 0 to {columns - 1}"
+        )
 
 
 def _draw(capture: StoredCapture, laser: tuple[int, int] | None, pixel: tuple[int, int] | None) -> Figure:
@@ -110,7 +123,8 @@ def _draw(capture: StoredCapture, laser: tuple[int, int] | None, pixel: tuple[in
     for part in (heading, upper, lower):
         part.set_facecolor(GROUND)
     # a dollar sign in a file name is not the start of a formula
-    heading.text(0.012, 0.66, header.path.name, color=INK, size=15, weight="bold", va="center", parse_math=False)
+    title = encodable(header.path.name)
+    heading.text(0.012, 0.66, title, color=INK, size=15, weight="bold", va="center", parse_math=False)
     heading.text(0.012, 0.12, _subtitle(header, view), color=FAINT, size=10.5, va="center", parse_math=False)
     _draw_frames(upper, capture, view, pixel)
     left, center, right = lower.subplots(1, 3, width_ratios=[1.55, 0.75, 1.2])

@@ -12,8 +12,15 @@ from nlosrender.files.unit_log import UnfinishedRender
 
 
 def is_unfinished(path: str | Path) -> bool:
-    """Return whether a path is the folder of an unfinished capture."""
-    return (Path(path) / JOURNAL).is_file()
+    """Return whether a path is the folder of an unfinished capture.
+
+    Raises
+    ------
+    FileError
+        Folders above it may not be looked into.
+    """
+    with explained_read(Path(path)):
+        return (Path(path) / JOURNAL).is_file()
 
 
 def summarise_unfinished(folder: str | Path) -> dict[str, object]:

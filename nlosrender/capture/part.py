@@ -11,7 +11,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 from nlosrender.capture.tile import Tile
-from nlosrender.errors import ConfigError, Problem
+from nlosrender.errors import OptionError
 
 Range = tuple[int, int]  # [first, last)
 
@@ -110,7 +110,7 @@ class Selection:
 
         Raises
         ------
-        ConfigError
+        OptionError
             There are fewer laser points or strips than asked for.
         """
         everything = tiling.everything(n_lasers)
@@ -119,18 +119,18 @@ class Selection:
             if not 0 <= first < last <= n_lasers:
                 found = f"the laser points of this capture are 0:{n_lasers}"
                 hint = "" if n_lasers > 1 else "; cut it with --shard"
-                raise ConfigError(Problem(str(self), "", f"need A < B, and {found}{hint}."))
+                raise OptionError(f"{self}: need A < B, and {found}{hint}.")
             return Part(self.lasers, everything.strips)
         if self.shard is None:
             return everything
         number, count = self.shard
         if not 1 <= number <= count:
-            raise ConfigError(Problem(str(self), "", "need I/N with 1 <= I <= N."))
+            raise OptionError(f"{self}: need I/N with 1 <= I <= N.")
         if count <= n_lasers:
             return Part(_dealt(n_lasers, number, count), everything.strips)
         if count > tiling.n_strips:
             most = max(n_lasers, tiling.n_strips)
-            raise ConfigError(Problem(str(self), "", f"this capture can be cut into at most {most} shards."))
+            raise OptionError(f"{self}: this capture can be cut into at most {most} shards.")
         return Part(everything.lasers, _dealt(tiling.n_strips, number, count))
 
 

@@ -27,6 +27,7 @@ from nlosrender.cli import (
     render_command,
 )
 from nlosrender.cli.interrupt_watch import InterruptWatch
+from nlosrender.cli.streams import open_closed_streams, print_any_name
 from nlosrender.errors import EXIT_FAILURE, EXIT_INTERRUPTED, NlosError
 
 app = typer.Typer(
@@ -68,6 +69,8 @@ def _global_options(
 
 def main() -> None:
     """Run the command line; turn every explained error into a message on stderr and its exit code."""
+    open_closed_streams()
+    print_any_name()
     try:
         with InterruptWatch():
             app()

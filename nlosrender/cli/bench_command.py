@@ -31,15 +31,17 @@ def bench(
     seconds: Annotated[float, typer.Option(min=1.0, help="Time for all of it, compilation on top.")] = 300.0,
     mesh: Annotated[
         Path | None,
-        typer.Option(help="Mesh about 0.8 m high, such as the Stanford bunny: adds the bunny's three scenes."),
+        typer.Option(
+            help="Mesh about 0.8 m high, such as the Stanford bunny: adds the bunny's three scenes.", readable=False
+        ),
     ] = None,
     peer: Annotated[
         str | None,
         typer.Option(metavar="COMMAND", help="Also race another renderer, see 'make bench-peers'."),
     ] = None,
-    output: Annotated[Path, typer.Option("-o", "--output", help="OUTPUT.json and OUTPUT.png are written.")] = Path(
-        "out/bench"
-    ),
+    output: Annotated[
+        Path, typer.Option("-o", "--output", help="OUTPUT.json and OUTPUT.png are written.", readable=False)
+    ] = Path("out/bench"),
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object instead of a table.")] = False,
 ) -> None:
     """Measure run time against error on scenes with known truth, scaling, and rates."""
@@ -49,7 +51,6 @@ def bench(
     from nlosrender.bench.report import table, write_json, write_plot
     from nlosrender.bench.scenes import built_in_scenes
     from nlosrender.engine.backend import start_backend
-    from nlosrender.files.interruption import uninterrupted
 
     if mesh is not None and not mesh.is_file():
         raise typer.BadParameter(f"{mesh}: there is no such file", param_hint="--mesh")
@@ -59,8 +60,7 @@ def bench(
     scenes = [known[_one_of(name, known, "--scene")] for name in names]
     parts = [_one_of(name, PARTS, "--part") for name in part or PARTS]
     json_path, png_path = _outputs(output)
-    with uninterrupted():  # an import that Ctrl-C cuts off can end in a crash
-        start_backend()
+    start_backend()
     found = run_benchmark(scenes, seconds, parts, peer, lambda what: typer.echo(what, err=True))
     report = found.report()
     write_json(json_path, report)

@@ -71,8 +71,8 @@ def register(app: typer.Typer) -> None:
 
 
 def compare(
-    capture: Annotated[Path, typer.Argument(metavar="A", help="Capture to judge.")],
-    reference: Annotated[Path, typer.Argument(metavar="B", help="Capture to judge it by.")],
+    capture: Annotated[Path, typer.Argument(metavar="A", help="Capture to judge.", readable=False)],
+    reference: Annotated[Path, typer.Argument(metavar="B", help="Capture to judge it by.", readable=False)],
     max_rel_l2: MaxRelL2 = None,
     max_energy: MaxEnergy = None,
     max_shift: MaxShift = None,
@@ -102,10 +102,17 @@ def compare(
 
 
 def check(
-    folder: Annotated[Path, typer.Argument(metavar="DATASET_DIR", help="Folder with the captures to judge.")],
+    folder: Annotated[
+        Path, typer.Argument(metavar="DATASET_DIR", help="Folder with the captures to judge.", readable=False)
+    ],
     reference: Annotated[
         Path,
-        typer.Option("--reference", metavar="DIR", help="Folder with captures of the same names to judge them by."),
+        typer.Option(
+            "--reference",
+            metavar="DIR",
+            help="Folder with captures of the same names to judge them by.",
+            readable=False,
+        ),
     ],
     max_rel_l2: MaxRelL2 = None,
     max_energy: MaxEnergy = None,

@@ -78,9 +78,11 @@ def _places(report: dict[str, Any]) -> Iterator[str]:
 
 def _tolerances(report: dict[str, Any]) -> Iterator[str]:
     for finding in report["tolerances"]:
-        value = INFINITE if finding["value"] is None else f"{finding['value']:.4g}{finding['unit']}"
+        value, limit = (
+            INFINITE if finding[key] is None else f"{finding[key]:.4g}{finding['unit']}" for key in ("value", "limit")
+        )
         state = "EXCEEDS" if finding["exceeds"] else "within"
-        yield f"{state:<12} {finding['quantity']}: {value}, tolerance {finding['limit']:.4g}{finding['unit']}"
+        yield f"{state:<12} {finding['quantity']}: {value}, tolerance {limit}"
 
 
 def _number(value: float | None) -> str:

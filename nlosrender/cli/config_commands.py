@@ -46,6 +46,8 @@ def new(
     scan_type: Annotated[ScanTypeOption, typer.Option(help="Scan the starter is for.")] = ScanTypeOption.confocal,
 ) -> None:
     """Write a commented starter config that can be rendered as it is."""
+    import shlex
+
     from nlosrender.config.template import starter_config
 
     if path == "-":
@@ -62,11 +64,11 @@ def new(
         raise FileError(f"{path}: there is no folder {target.parent}; create it first.") from error
     except (OSError, ValueError) as error:
         raise FileError(f"{path}: cannot be written: {getattr(error, 'strerror', None) or error}.") from error
-    typer.echo(f"{path}: written; nlosrender validate {path} checks it after changes.")
+    typer.echo(f"{path}: written; nlosrender validate {shlex.quote(path)} checks it after changes.")
 
 
 def validate(
-    configs: Annotated[list[Path], typer.Argument(metavar="CONFIG...", help="Config files.")],
+    configs: Annotated[list[Path], typer.Argument(metavar="CONFIG...", help="Config files.", readable=False)],
     overrides: Annotated[
         list[str] | None, typer.Option("--set", metavar="a.b.c=VALUE", help="Put a value over the file's; repeatable.")
     ] = None,

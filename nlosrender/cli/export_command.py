@@ -28,7 +28,14 @@ def export(
     ],
     output: Annotated[
         Path | None,
-        typer.Option("-o", "--output", metavar="OUT", help="File to write.", show_default="FILE-FORMAT.hdf5 or .mat"),
+        typer.Option(
+            "-o",
+            "--output",
+            metavar="OUT",
+            help="File to write.",
+            show_default="FILE-FORMAT.hdf5 or .mat",
+            readable=False,
+        ),
     ] = None,
     bounces: Annotated[str, typer.Option(metavar="3|all", help="Light to export; bounces are summed.")] = "all",
     as_json: Annotated[bool, typer.Option("--json", help="Print the report as one JSON object.")] = False,

@@ -9,7 +9,9 @@ import typer
 
 from nlosrender.cli.capture_table import printable, summary_table
 
-CaptureFile = Annotated[Path, typer.Argument(metavar="FILE", help="Capture in Z-NLOS HDF5, by any writer.")]
+CaptureFile = Annotated[
+    Path, typer.Argument(metavar="FILE", help="Capture in Z-NLOS HDF5, by any writer.", readable=False)
+]
 
 
 def register(app: typer.Typer) -> None:
@@ -61,7 +63,9 @@ def plot(
     file: CaptureFile,
     output: Annotated[
         Path | None,
-        typer.Option("-o", "--output", metavar="OUT.png", help="Picture to write.", show_default="FILE.png"),
+        typer.Option(
+            "-o", "--output", metavar="OUT.png", help="Picture to write.", show_default="FILE.png", readable=False
+        ),
     ] = None,
     laser: Annotated[
         str | None,

@@ -18,7 +18,7 @@ def register(app: typer.Typer) -> None:
 
 
 def frames(
-    file: Annotated[Path, typer.Argument(metavar="FILE", help="Capture of scan type line_of_sight.")],
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="Capture of scan type line_of_sight.", readable=False)],
     output: Annotated[
         Path | None,
         typer.Option(
@@ -27,6 +27,7 @@ def frames(
             metavar="DIR|OUT.gif",
             help="Folder to fill, or the animation alone.",
             show_default="FILE-frames",
+            readable=False,
         ),
     ] = None,
     kind: Annotated[

@@ -1,4 +1,4 @@
-"""Ctrl-C ends a command in one way, whatever it hits: an import, for instance, turns it into errors of its own."""
+"""Ctrl-C and its like end a command in one way, whatever they hit: an import, say, makes errors of its own of them."""
 
 from __future__ import annotations
 
@@ -7,20 +7,23 @@ from types import FrameType, TracebackType
 from typing import Self
 
 from nlosrender.errors import IncompleteRender, InterruptedRender
+from nlosrender.interruption import SIGNALS
 
 
 class InterruptWatch:
-    """Inside its block, Ctrl-C becomes KeyboardInterrupt, and so does every error that comes after it.
+    """Inside its block, ``SIGNALS`` become KeyboardInterrupt, and so does every error that comes after one.
 
-    Renders hold the signal back while they save; what they say of it passes, and so does success.
+    Renders hold the signals back while they save; what they say of them passes, and so does success.
     """
 
     def __init__(self) -> None:
         self._came = False
 
     def __enter__(self) -> Self:
-        if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # shells let background jobs ignore it
-            signal.signal(signal.SIGINT, self._interrupt)
+        for number in SIGNALS:
+            # anything else is another program's wish: shells let background jobs ignore Ctrl-C
+            if signal.getsignal(number) in (signal.default_int_handler, signal.SIG_DFL):
+                signal.signal(number, self._interrupt)  # not the system's way: it would leave half-written files
         return self
 
     def __exit__(

@@ -23,14 +23,12 @@ def doctor(as_json: Annotated[bool, typer.Option("--json", help="Print one JSON 
     from nlosrender.engine import llvm
     from nlosrender.engine.backend import cuda_available, start_backend
     from nlosrender.errors import BackendError
-    from nlosrender.files.interruption import uninterrupted
     from nlosrender.files.provenance import package_versions
 
     libraries = llvm.find_libraries()
     has_gpu = cuda_available()
     try:
-        with uninterrupted():  # an import that Ctrl-C cuts off can end in a crash
-            backend, trouble = start_backend(), None
+        backend, trouble = start_backend(), None
     except BackendError as error:
         backend, trouble = None, error
     if as_json:

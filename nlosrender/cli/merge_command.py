@@ -19,9 +19,12 @@ def register(app: typer.Typer) -> None:
 
 def merge(
     parts: Annotated[
-        list[Path], typer.Argument(metavar="PART...", help="Files rendered with --shard or --lasers, in any order.")
+        list[Path],
+        typer.Argument(
+            metavar="PART...", help="Files rendered with --shard or --lasers, in any order.", readable=False
+        ),
     ],
-    output: Annotated[Path, typer.Option("--output", "-o", help="File to write.")],
+    output: Annotated[Path, typer.Option("--output", "-o", help="File to write.", readable=False)],
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress bar, no report.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print the report as one JSON object.")] = False,
 ) -> None:

@@ -29,8 +29,12 @@ def paper(
         bool, typer.Option("--meshes-only", help="Write the generated meshes of the room configurations and stop.")
     ] = False,
     seed: Annotated[int, typer.Option(min=0, help="Of every render.")] = 0,
-    configs: Annotated[Path, typer.Option(help="Folder of the paper's configurations.")] = Path("configs/paper"),
-    output: Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="Folder to write.")] = Path("out/paper"),
+    configs: Annotated[Path, typer.Option(help="Folder of the paper's configurations.", readable=False)] = Path(
+        "configs/paper"
+    ),
+    output: Annotated[
+        Path, typer.Option("-o", "--output", metavar="DIR", help="Folder to write.", readable=False)
+    ] = Path("out/paper"),
 ) -> None:
     """Reproduce the figures and tables of Royo et al. 2022 into one HTML page."""
     from nlosrender.bench.paper.reproduce import FIGURES, reproduce

@@ -24,7 +24,9 @@ def register(app: typer.Typer) -> None:
 
 
 def plan(
-    config: Annotated[Path, typer.Argument(metavar="CONFIG", help="The YAML file that describes the capture.")],
+    config: Annotated[
+        Path, typer.Argument(metavar="CONFIG", help="The YAML file that describes the capture.", readable=False)
+    ],
     overrides: Annotated[
         list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Override one key; may be repeated.")
     ] = None,

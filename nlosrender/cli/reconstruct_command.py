@@ -30,7 +30,14 @@ def reconstruct(
     file: CaptureFile,
     output: Annotated[
         Path | None,
-        typer.Option("-o", "--output", metavar="OUT.hdf5", help="Volume to write.", show_default="FILE-METHOD.hdf5"),
+        typer.Option(
+            "-o",
+            "--output",
+            metavar="OUT.hdf5",
+            help="Volume to write.",
+            show_default="FILE-METHOD.hdf5",
+            readable=False,
+        ),
     ] = None,
     method: Annotated[str, typer.Option(help="phasor, or backprojection (any relay wall, slower).")] = "phasor",
     wavelength: Annotated[

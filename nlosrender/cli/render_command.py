@@ -34,9 +34,11 @@ def register(app: typer.Typer) -> None:
 
 
 def render(
-    config: Annotated[Path, typer.Argument(metavar="CONFIG", help="The YAML file that describes the capture.")],
+    config: Annotated[
+        Path, typer.Argument(metavar="CONFIG", help="The YAML file that describes the capture.", readable=False)
+    ],
     output: Annotated[
-        Path | None, typer.Option("--output", "-o", help="File to write, instead of output.path.")
+        Path | None, typer.Option("--output", "-o", help="File to write, instead of output.path.", readable=False)
     ] = None,
     overrides: Annotated[
         list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Override one key; may be repeated.")
@@ -84,10 +86,13 @@ def render(
     from nlosrender.config.load import load_config
     from nlosrender.config.places import with_places
     from nlosrender.config.sweep_load import load_sweep
-    from nlosrender.errors import ConfigError
+    from nlosrender.errors import ConfigError, FileError
+    from nlosrender.files.replacement import refuse_sources
     from nlosrender.pipeline import render_capture
 
     changes = list(overrides or [])
+    if output is not None and output.name in ("", ".."):
+        raise FileError(f"{output}: is a folder. Name a file in it, such as {output / 'capture.hdf5'}")
     if output is not None:
         changes.append(f"output.path={_quoted(output)}")
     sweep = load_sweep(config, changes)
@@ -100,6 +105,7 @@ def render(
             )
         return
     loaded = load_config(config, changes)
+    refuse_sources(loaded.output.path, [config])
     try:
         with (
             _cluster(executor, scheduler, workers) as cluster,

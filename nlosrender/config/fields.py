@@ -15,6 +15,7 @@ from typing import Annotated, Any, Literal
 from pydantic import GetCoreSchemaHandler, GetJsonSchemaHandler
 from pydantic_core import CoreSchema, core_schema
 
+from nlosrender.config.encodable import is_encodable
 from nlosrender.config.refusal import refuse
 from nlosrender.config.vectors import length
 
@@ -89,7 +90,7 @@ def _number(
 def _integer(need: str, allows: Callable[[int], bool], advice: str = "") -> Callable[[object], int]:
     def check(value: object) -> int:
         if isinstance(value, bool) or not isinstance(value, int) or not allows(value):
-            raise refuse(value, need, _quoted_number(value) or advice)
+            raise refuse(value, need, _quoted_number(value) or _broken_integer(value) or advice)
         return value
 
     return check
@@ -127,6 +128,12 @@ def _vector(
     return check
 
 
+def _broken_integer(value: object) -> str:
+    if isinstance(value, float) and value.is_integer() and abs(value) < 1e15:  # shown as the integer that it is not
+        return f"Write {value:.0f}, without point and exponent."
+    return ""
+
+
 def _quoted_number(value: object) -> str:
     if not isinstance(value, str):
         return ""
@@ -134,7 +141,7 @@ def _quoted_number(value: object) -> str:
         float(value)
     except ValueError:
         return ""
-    return "Write the number without quotes."
+    return "Write the number without underscores." if "_" in value else "Write the number without quotes."
 
 
 def _brightness(value: object) -> Any:
@@ -155,7 +162,7 @@ def _flag(value: object) -> bool:
 def _text(value: object) -> str:
     if not isinstance(value, str):
         raise refuse(value, "text", "" if value is None else "Put it in quotes.")
-    if not value.strip() or any(ord(character) < 32 or 0xD800 <= ord(character) < 0xE000 for character in value):
+    if not value.strip() or any(ord(character) < 32 for character in value) or not is_encodable(value):
         raise refuse(value, "text that is not blank and has no control characters or halves of characters")
     return value
 

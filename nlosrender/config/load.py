@@ -60,6 +60,9 @@ def read_text(path: Path) -> str:
         It cannot be read, is no text or far too long.
     """
     try:
+        if path.is_fifo():  # a look for a sweep comes before the capture, and one for places after it
+            message = "is a pipe, and a config is read more than once. Save it as a file."
+            raise ConfigError(Problem(str(path), "", message))
         with path.open("rb") as file:
             content = file.read(MAX_BYTES + 1)
         return content.decode("utf-8-sig")
@@ -132,7 +135,13 @@ def validate_document(document: Document, folder: Path) -> Config:
     ConfigError
         With every problem found, the document's own included.
     """
-    return _validate(document, {"folder": Path(folder).absolute(), "stem": Path(document.source).stem or "capture"})
+    return _validate(document, {"folder": Path(folder).absolute(), "stem": default_name(document.source)})
+
+
+def default_name(source: str) -> str:
+    """Return the name of a capture whose config gives none: that of its file, which may hold what a name may not."""
+    letters = (letter if letter.isprintable() and letter != "\\" else "-" for letter in Path(source).stem)
+    return "".join(letters).strip() or "capture"
 
 
 def config_to_dict(config: Config) -> dict[str, Any]:

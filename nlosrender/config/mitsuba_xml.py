@@ -24,7 +24,7 @@ from nlosrender.config.bsdf_table import (
     TEXTURE_TYPES,
 )
 from nlosrender.config.fields import Checked
-from nlosrender.config.plugin_check import config_folder, existing_file
+from nlosrender.config.plugin_check import config_folder, existing_file, mitsuba_file
 from nlosrender.config.refusal import Fault, listed, refuse
 from nlosrender.config.xml_numbers import check_numbers
 from nlosrender.config.xml_shapes import at_line, check_xml_bsdf, check_xml_shape
@@ -205,7 +205,7 @@ def _check(element: Element, folder: Path) -> None:
 def _absolute_files(element: Element, folder: Path) -> None:
     for key in _file_keys(element):
         if element.get(key) is not None:
-            file, problem = existing_file(str(element.get(key)), folder)
+            file, problem = mitsuba_file(str(element.get(key)), folder)
             if problem:
                 raise ValueError(problem.removesuffix("."))
             element.set(key, str(file))

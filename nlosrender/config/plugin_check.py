@@ -9,6 +9,7 @@ from typing import Any
 
 from pydantic import ValidationInfo
 
+from nlosrender.config.encodable import is_encodable
 from nlosrender.config.fields import LONGEST, as_finite
 from nlosrender.config.frozen import freeze
 from nlosrender.config.refusal import Fault, KeyPath, raise_faults, refusal, shown
@@ -80,7 +81,7 @@ class PluginCheck:
         if not isinstance(value, str) or not value.strip():
             self.refuse(path, value, "the name of a file")
             return ""
-        absolute, problem = existing_file(value, self.folder)
+        absolute, problem = mitsuba_file(value, self.folder)
         if problem:
             self.fault(path, problem)
         return str(absolute)
@@ -163,6 +164,15 @@ def existing_file(name: str, folder: Path) -> tuple[Path, str]:
     hint = nearest(path.name, alike) if path.parent.is_dir() else None
     advice = f" Did you mean {hint}?" if hint and found == "no file" else ""
     return path, f"got {name}, but there is {found} at {path}. Relative names start at the YAML's folder.{advice}"
+
+
+def mitsuba_file(name: str, folder: Path) -> tuple[Path, str]:
+    """Return as ``existing_file`` does, for a file that Mitsuba opens by its name."""
+    path, problem = existing_file(name, folder)
+    if not problem and not is_encodable(str(path)):
+        what = f"got {shown(name)}; Mitsuba opens files with names in UTF-8 only, not {path}."
+        problem = f"{what} Rename it, or its folder."
+    return path, problem
 
 
 def _finite_list(value: object, sizes: tuple[int, ...]) -> list[float] | None:

@@ -12,6 +12,8 @@ from typing import Literal
 from pydantic import ValidationError
 from pydantic_core import InitErrorDetails, PydanticCustomError
 
+from nlosrender.config.encodable import encodable
+
 FAULT = "fault"  # error type of everything built here, so that it is told from pydantic's own
 KeyPath = tuple[str | int, ...]
 _LONGEST_SHOWN = 60  # characters of a wrong value that still help
@@ -40,7 +42,8 @@ class Fault:
 
     def as_error(self) -> PydanticCustomError:
         """Return the fault in the form a pydantic validator may raise."""
-        context = {"message": self.message, "at": self.at, "needs": self.needs, "depth": len(self.path)}
+        message = encodable(self.message)  # pydantic cannot hold names of files as they are
+        context = {"message": message, "at": self.at, "needs": self.needs, "depth": len(self.path)}
         return PydanticCustomError(FAULT, "{message}", context)
 
 

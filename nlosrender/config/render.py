@@ -71,7 +71,7 @@ class RenderConfig(Section):
     temporal_kernel_opl: LengthOrZero = 0.0
     """m of optical path, full width of a kernel that spreads each path in time: less noise, a bias; 0: a histogram"""
     russian_roulette: Flag = True
-    """end paths of low weight early, without bias"""
+    """end paths of low weight early, without bias; the walks of virtual lights always end so"""
     seed: Seed = 0
     """start of the random numbers; the same seed gives the same file"""
     backend: Literal["auto", "llvm", "cuda"] = "auto"

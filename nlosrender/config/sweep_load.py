@@ -14,7 +14,7 @@ from typing import Any
 from pydantic import ValidationError
 
 from nlosrender.config.document import Config
-from nlosrender.config.load import MOST_PROBLEMS, overridden_document, read_text, validate_document
+from nlosrender.config.load import MOST_PROBLEMS, default_name, overridden_document, read_text, validate_document
 from nlosrender.config.overrides import put
 from nlosrender.config.refusal import KeyPath, shown
 from nlosrender.config.sweep import SweepConfig
@@ -214,7 +214,7 @@ def _capture_document(base: Document, settings: tuple[_Setting, ...], index: int
 
 def _set_output(document: Document, index: int) -> None:
     """Fill in the pattern of the output's name; what is no text is left to the validation."""
-    name = document.tree.get("name", Path(document.source).stem)
+    name = document.tree.get("name", default_name(document.source))
     output = document.tree.setdefault("output", {})
     if not isinstance(output, dict) or not isinstance(name, str):
         return

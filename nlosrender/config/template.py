@@ -114,7 +114,7 @@ render:
   laser_sampling: true           # connect paths to the laser point; false needs laser_spot_radius > 0; default true
   hidden_geometry_sampling: true # sample points on the hidden geometry; default true
   temporal_kernel_opl: 0.0       # m, width of a kernel in time that smooths the noise of paths; default 0: a histogram
-  russian_roulette: true         # end weak paths early, without bias; default true
+  russian_roulette: true         # end weak paths early, without bias; virtual lights always do; default true
   seed: 0                        # 0..4294967295; default 0
   backend: auto                  # auto | llvm | cuda; default auto
   color: auto                    # auto | grey | rgb; default auto: rgb only where the scene has colours

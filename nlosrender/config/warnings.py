@@ -82,6 +82,11 @@ def _bounces(config: Config) -> Iterator[str]:
 def _budget(config: Config) -> Iterator[str]:
     if config.render.spp is None and config.render.target_error is None and config.render.time_limit_s is not None:
         yield "render.time_limit_s alone: the error is whatever the time allows; the file says how large it is."
+    if config.render.max_bounces is None and not config.render.russian_roulette:
+        yield (
+            "render.max_bounces is null and russian_roulette false: paths end when they leave the scene or carry "
+            "nothing, and in a closed one that may take for ever. Limit max_bounces."
+        )
 
 
 def _file(config: Config) -> Iterator[str]:

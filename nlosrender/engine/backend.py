@@ -12,6 +12,7 @@ from typing import Literal
 
 from nlosrender.engine import llvm
 from nlosrender.errors import BackendError, RenderError
+from nlosrender.interruption import uninterrupted
 
 BackendName = Literal["auto", "llvm", "cuda"]
 
@@ -47,7 +48,7 @@ def cuda_available() -> bool:
 
 
 def start_backend(wanted: BackendName = "auto", *, colored: bool = False, polarized: bool = False) -> Backend:
-    """Choose LLVM or CUDA, and activate the Mitsuba variant.
+    """Choose LLVM or CUDA, and activate the Mitsuba variant; Ctrl-C waits until that is done.
 
     Parameters
     ----------
@@ -61,8 +62,20 @@ def start_backend(wanted: BackendName = "auto", *, colored: bool = False, polari
     Raises
     ------
     BackendError
-        There is no GPU although ``cuda`` is wanted, or no LLVM that works. The message says what to install.
+        There is no GPU although ``cuda`` is wanted, or no LLVM that works, or no current folder. The message says what
+        to do.
+    KeyboardInterrupt
+        Ctrl-C was pressed meanwhile.
     """
+    with uninterrupted():  # an import that Ctrl-C cuts off ends in errors of its own, or a crash
+        return _started(wanted, colored, polarized)
+
+
+def _started(wanted: BackendName, colored: bool, polarized: bool) -> Backend:
+    try:
+        os.getcwd()
+    except OSError as error:  # Mitsuba's import would end the process
+        raise BackendError(f"the current folder is gone ({error.strerror}). Change to another one.") from error
     if wanted == "cuda" and not cuda_available():
         raise BackendError(
             "render.backend: cuda: no NVIDIA driver with a device was found. Use backend: llvm, or install the driver."

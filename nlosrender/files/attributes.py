@@ -13,6 +13,8 @@ from collections.abc import Mapping
 import h5py
 import numpy as np
 
+from nlosrender.config.encodable import encodable
+
 # An object header holds an attribute of at most 64 KiB. Variable-length text lies in the heap and is not bound by
 # it; arrays are, and go there as JSON text when they are larger.
 MAX_STORED_BYTES = 2**24  # of an attribute by anyone: larger ones are not read
@@ -99,8 +101,7 @@ def _plain(value: object) -> object:
 
 
 def _clean(text: str) -> str:
-    # file names that are not UTF-8 arrive with surrogates, which HDF5's text cannot hold; nor can it a zero byte
-    return text.encode("utf-8", "backslashreplace").decode("utf-8").replace("\0", "\\0")
+    return encodable(text).replace("\0", "\\0")  # HDF5's text ends at a zero byte
 
 
 def _native(value: object) -> object:

@@ -9,10 +9,10 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from nlosrender.files.interruption import uninterrupted
 from nlosrender.files.layout import Float64
 from nlosrender.files.reader import StoredCapture
 from nlosrender.files.scan import Scan, light_bands
+from nlosrender.interruption import uninterrupted
 
 
 class HFormat(IntEnum):

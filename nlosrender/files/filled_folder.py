@@ -9,8 +9,8 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from nlosrender.errors import FileError
-from nlosrender.files.interruption import uninterrupted
 from nlosrender.files.replacement import explained_write
+from nlosrender.interruption import uninterrupted
 
 
 @contextmanager

@@ -118,6 +118,19 @@ def _value_with_content(key: str, value: Any) -> Any:
     return _with_content(value)
 
 
+def files_read(resolved_config: Any) -> Iterator[str]:
+    """Yield the names of the meshes, images and scenes that a configuration names."""
+    if isinstance(resolved_config, Mapping):
+        for key, value in resolved_config.items():
+            if isinstance(value, str) and key in (FILE_KEY, SCENE_KEY):
+                yield value
+            else:
+                yield from files_read(value)
+    elif isinstance(resolved_config, (list, tuple)):
+        for item in resolved_config:
+            yield from files_read(item)
+
+
 def _content_of_scene(name: str) -> str | list[str]:
     """Return the digest of a Mitsuba scene, and those of the files it names, which may change while it does not."""
     try:

@@ -1,7 +1,8 @@
 """An append-only list of records that survives the process being killed at any byte.
 
 One line per record: CRC-32 of the rest, a space, JSON. A line that was cut off fails its checksum; it and everything
-after it never happened. The file is locked while it is open; the system drops the lock with the process.
+after it never happened. After a power failure the last records may be gone: those that must not be are ``durable``.
+The file is locked while it is open; the system drops the lock with the process.
 """
 
 from __future__ import annotations
@@ -54,8 +55,8 @@ class Journal:
         for record, _ in _lines(self.path):
             yield record
 
-    def append(self, record: Mapping[str, Any]) -> None:
-        """Add a record.
+    def append(self, record: Mapping[str, Any], *, durable: bool = False) -> None:
+        """Add a record; with ``durable`` it has reached the disk on return, and a power failure leaves it.
 
         Raises
         ------
@@ -67,9 +68,11 @@ class Journal:
         while written < len(line):  # the system may take less than it is given, as the disk fills
             written += os.pwrite(self._descriptor, line[written:], self._end + written)
         self._end += len(line)
+        if durable:
+            os.fsync(self._descriptor)
 
     def clear(self) -> None:
-        """Forget all records.
+        """Forget all records, on the disk too.
 
         Raises
         ------
@@ -77,6 +80,8 @@ class Journal:
             The system refuses.
         """
         os.ftruncate(self._descriptor, 0)
+        if self._end:
+            os.fsync(self._descriptor)  # or old records might come back after a power failure
         self._end = 0
 
     def close(self) -> None:

@@ -19,7 +19,6 @@ from nlosrender.capture.tile import Tile
 from nlosrender.config.canonical import tree_hash
 from nlosrender.errors import FileError
 from nlosrender.files import layout
-from nlosrender.files.interruption import uninterrupted
 from nlosrender.files.part_attributes import CHECKSUMS, NOTE, PART, SUMS, json_object, summed_attributes
 from nlosrender.files.pieces import PackedChunk
 from nlosrender.files.reader import explained_read, open_hdf5
@@ -28,6 +27,7 @@ from nlosrender.files.shards import Shard, read_shards
 from nlosrender.files.sink import CaptureSink, sample_names
 from nlosrender.files.sums import Sums
 from nlosrender.files.unit_log import CHECKSUM_RANGE, placed_checksum
+from nlosrender.interruption import uninterrupted
 
 Progress = Callable[[float], None]
 

@@ -3,7 +3,9 @@
 A folder ``.NAME.partial`` beside the output holds the samples, an HDF5 file, and a journal. HDF5 does not survive a
 kill: its tables are in memory until it is closed. So nothing is read from them. The journal says for each finished
 unit where the bytes of its chunks lie and what their checksums are; those bytes are written once, before the journal's
-record, and never moved. From them a new HDF5 file is built when the earlier one was not closed properly.
+record, and never moved. From them a new HDF5 file is built when the earlier one was not closed properly. A unit is not
+waited for until it has reached the disk: after a power failure its record may be there and its bytes not, or torn, and
+its checksums tell; it is rendered again.
 """
 
 from __future__ import annotations
@@ -23,13 +25,13 @@ from nlosrender.errors import FileError
 from nlosrender.files.capture_file import CaptureHeader
 from nlosrender.files.header_writer import root_attributes
 from nlosrender.files.identity import differences
-from nlosrender.files.interruption import uninterrupted
 from nlosrender.files.journal import Journal, JournalInUseError
 from nlosrender.files.pieces import Cutter, PackedChunk
 from nlosrender.files.replacement import check_writable, explained_write, partial_folder, publish, synchronise
 from nlosrender.files.sink import CaptureSink, new_capture, sample_names
 from nlosrender.files.sums import Sums
 from nlosrender.files.unit_log import StoredChunk, Tally, UnfinishedRender, UnitKey, unit_record, units_of
+from nlosrender.interruption import uninterrupted
 
 JOURNAL = "journal"
 MOST_DIFFERENCES = 6  # that are listed
@@ -139,7 +141,8 @@ class PartialCapture:
             return sink
 
         if self.tally.units and self._state.closed:
-            self._note({"opened": True})
+            # on the disk before HDF5 changes its tables: a closed file's are believed
+            self._note({"opened": True}, durable=True)
             with suppress(FileError):  # damaged all the same: it is built anew
                 names = sample_names(store_variance)
                 self._sink = CaptureSink(self._samples(), self.path, names, reserved=root_attributes(header))
@@ -264,7 +267,9 @@ class PartialCapture:
                         self.store(unit, copies, sums)
             finally:
                 os.close(descriptor)
-            self._note({"switched_to": state.generation})
+            with explained_write(self.path):
+                synchronise(self._samples())  # before the old file goes: its units would have to be done again
+            self._note({"switched_to": state.generation}, durable=True)
         except BaseException:
             # the old file still counts
             if self._sink is not None:
@@ -286,15 +291,15 @@ class PartialCapture:
                     self._sink.close()
                     with explained_write(self.path):
                         synchronise(self._samples())
-                    self._note({"closed": True})
+                    self._note({"closed": True}, durable=True)
                 except FileError:  # the journal knows enough to build the file anew
                     self._sink.abandon()
                 self._sink = None
             self._journal.close()
 
-    def _note(self, record: Mapping[str, Any]) -> None:
+    def _note(self, record: Mapping[str, Any], *, durable: bool = False) -> None:
         with uninterrupted(), explained_write(self.path):
-            self._journal.append(record)
+            self._journal.append(record, durable=durable)
 
     def _samples(self) -> Path:
         return self.folder / f"samples.{self._state.generation}.hdf5"

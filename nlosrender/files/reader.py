@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import os
 import stat
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -188,7 +190,8 @@ def explained_read(path: Path) -> Iterator[None]:
             f"{path}: claims to hold more than fits into memory. Read a part of it, or render it again."
         ) from error
     except PermissionError as error:
-        raise FileError(f"{path}: may not be read: {error}") from error
+        reason = os.strerror(error.errno or errno.EACCES)  # h5py's own text runs over a line
+        raise FileError(f"{path}: may not be read: {reason}. Ask for the right to read it, or copy it.") from error
     # h5py passes on HDF5's complaints about damaged content as any of these
     except (OSError, RuntimeError, KeyError, ValueError, TypeError, OverflowError) as error:
         raise FileError(f"{path}: cannot be read: {error}. {_advice(error)}") from error

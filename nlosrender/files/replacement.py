@@ -5,7 +5,7 @@ from __future__ import annotations
 import errno
 import os
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
@@ -55,6 +55,19 @@ def check_writable(path: str | Path, *, overwrite: bool = True, source: str | Pa
     except (OSError, ValueError) as error:  # ValueError: a zero byte in the name
         raise FileError(f"{path}: cannot be used as an output: {error}") from error
     return target
+
+
+def refuse_sources(path: str | Path, sources: Iterable[str | Path]) -> None:
+    """Make sure that what is written to ``path`` replaces nothing of what is read for it.
+
+    Raises
+    ------
+    FileError
+        It is one of ``sources``.
+    """
+    target = os.path.realpath(path)
+    if any(os.path.realpath(source) == target for source in sources):
+        raise FileError(f"{path}: is read for this and would be replaced. Name another output.")
 
 
 def partial_path(target: Path) -> Path:

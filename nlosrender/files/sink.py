@@ -16,11 +16,11 @@ from nlosrender.files.attributes import set_attributes
 from nlosrender.files.capture_file import CaptureHeader
 from nlosrender.files.chunks import chunk_shape
 from nlosrender.files.header_writer import root_attributes, sample_attributes, write_header
-from nlosrender.files.interruption import uninterrupted
 from nlosrender.files.pieces import PackedChunk
 from nlosrender.files.replacement import explained_write
 from nlosrender.files.shielded_file import ShieldedFile
 from nlosrender.files.unit_log import StoredChunk
+from nlosrender.interruption import uninterrupted
 
 GZIP_LEVEL = 4  # told to HDF5, which packs only chunks that are filled in parts
 # h5py's default of 1 MiB holds no second chunk: a chunk filled in parts would be packed and unpacked for each part

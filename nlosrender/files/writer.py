@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 
 from nlosrender.files import layout
 from nlosrender.files.capture_file import CaptureHeader
-from nlosrender.files.interruption import uninterrupted
 from nlosrender.files.pieces import TILE_AXES, Cutter
 from nlosrender.files.replacement import check_writable, explained_write, partial_path, publish
 from nlosrender.files.sink import CaptureSink, new_capture
+from nlosrender.interruption import uninterrupted
 
 __all__ = ["CaptureWriter", "check_writable"]
 

@@ -7,6 +7,7 @@ import signal
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from multiprocessing import resource_tracker
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -14,7 +15,7 @@ from nlosrender.errors import BackendError
 from nlosrender.rendering.sharing import Sharing
 
 if TYPE_CHECKING:
-    from distributed import Client
+    from distributed import Client, LocalCluster
 
 CONNECT_SECONDS = 10.0  # for a scheduler to answer
 WORKER_SECONDS = 60.0  # for workers to join it
@@ -57,14 +58,7 @@ def joined_cluster(scheduler: str | None = None, workers: int | None = None) -> 
         return
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     count = workers or cores
-    with (
-        # memory_limit 0: units are planned to fit, and dask would kill workers for what is the machine's file cache
-        distributed.LocalCluster(
-            n_workers=count, threads_per_worker=1, processes=True, memory_limit=0, dashboard_address=None
-        ) as local,
-        distributed.Client(local) as client,
-    ):
-        client.register_plugin(_deaf_to_ctrl_c())
+    with _local_workers(count) as local, distributed.Client(local) as client:
         # the process that writes takes a share of the memory, too
         yield Cluster(client, Sharing(workers=count, memory_shares=count + 1), threads=max(1, cores // count))
 
@@ -101,12 +95,17 @@ def _awaited(client: Client, scheduler: str, wanted: int | None) -> int:
     return len(client.scheduler_info()["workers"])
 
 
-def _deaf_to_ctrl_c() -> object:
-    """Return what lets workers finish their unit when Ctrl-C reaches every process of the terminal."""
-    from distributed import WorkerPlugin
+def _local_workers(count: int) -> LocalCluster:
+    """Start processes that finish their unit when Ctrl-C reaches every process of the terminal."""
+    from distributed import LocalCluster
 
-    class DeafToCtrlC(WorkerPlugin):
-        def setup(self, worker: object) -> None:
-            signal.signal(signal.SIGINT, signal.SIG_IGN)
-
-    return DeafToCtrlC()
+    resource_tracker.ensure_running()  # a process of Python's own: starting it lets the signal through again
+    # inherited by dask's thread, and by every worker that it ever starts, from the worker's first moment on
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        # memory_limit 0: units are planned to fit, and dask would kill workers for what is the machine's file cache
+        return LocalCluster(
+            n_workers=count, threads_per_worker=1, processes=True, memory_limit=0, dashboard_address=None
+        )
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)

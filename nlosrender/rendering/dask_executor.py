@@ -14,9 +14,9 @@ from itertools import islice
 from typing import TYPE_CHECKING
 
 from nlosrender.capture.plan import Unit
-from nlosrender.errors import BackendError, IncompleteRender, InterruptedRender
-from nlosrender.files.interruption import StopRequest
+from nlosrender.errors import BackendError, IncompleteRender, InterruptedRender, RenderError
 from nlosrender.files.partial_capture import PartialCapture
+from nlosrender.interruption import StopRequest
 from nlosrender.rendering.dask_cluster import Cluster
 from nlosrender.rendering.dask_worker import Job, PackedUnit, Refusal, render_remotely
 from nlosrender.rendering.local import kept
@@ -70,7 +70,7 @@ def render_on_cluster(
     InterruptedRender
         A stop was requested before the last unit.
     IncompleteRender
-        The scheduler is gone, or a unit took several workers down with it.
+        The scheduler is gone, or a unit took several workers down with it; RenderError where no unit is finished.
     BackendError, RenderError, FileError
         A worker cannot render, a unit cannot be rendered or stored.
     """
@@ -94,7 +94,9 @@ def render_on_cluster(
         writer.wait()
     except (BackendError, IncompleteRender) as error:
         writer.wait()
-        raise type(error)(f"{partial.path}: {error} The render stopped{kept(partial, total)}") from error
+        begins_anew = isinstance(error, IncompleteRender) and not partial.tally.units
+        kind = RenderError if begins_anew else type(error)
+        raise kind(f"{partial.path}: {error} The render stopped{kept(partial, total)}") from error
     finally:
         writer.close()
         flight.cancel()

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 
 from nlosrender.capture.plan import Unit
 from nlosrender.errors import FileError, IncompleteRender, InterruptedRender, RenderError
-from nlosrender.files.interruption import StopRequest, stop_request
 from nlosrender.files.partial_capture import PartialCapture
+from nlosrender.interruption import StopRequest, stop_request
 from nlosrender.rendering.report import Progress, Stopwatch, Warn
 from nlosrender.rendering.units import RenderedUnit, UnitWriter, finished_unit, render_unit
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 @contextmanager
 def resumable(partial: PartialCapture) -> Iterator[StopRequest]:
-    """Let the first SIGINT or SIGTERM inside the block be a request, and say what is left after a failure.
+    """Let the first signal to stop inside the block be a request, and say what is left after a failure.
 
     Raises
     ------

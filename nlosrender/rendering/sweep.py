@@ -12,11 +12,11 @@ from nlosrender.config.canonical import tree_hash
 from nlosrender.config.document import Config
 from nlosrender.config.load import config_to_dict
 from nlosrender.config.sweep_load import Sweep
-from nlosrender.errors import ConfigError, FileError, InterruptedRender, Problem, RenderError
+from nlosrender.errors import ConfigError, FileError, InterruptedRender, OptionError, RenderError
 from nlosrender.files.dataset_index import IndexEntry, relative_name, stored_entry, write_index
 from nlosrender.files.identity import comparable_config
-from nlosrender.files.interruption import StopRequest, stop_request
 from nlosrender.files.replacement import explained_write, partial_folder
+from nlosrender.interruption import StopRequest, stop_request
 from nlosrender.rendering.report import Progress, RenderReport, Warn
 
 INDEX_SECONDS = 10.0  # between two writings of the index: that of a large dataset takes a while
@@ -105,7 +105,7 @@ def render_sweep(
 
     Raises
     ------
-    ConfigError
+    OptionError
         The sweep has fewer captures than shards.
     FileError
         A folder, the index or a capture cannot be written, or there is nothing to resume.
@@ -145,17 +145,17 @@ def chosen_captures(n_captures: int, shard: Shard | None) -> range:
 
     Raises
     ------
-    ConfigError
+    OptionError
         There are fewer captures than shards, or no such shard.
     """
     if shard is None:
         return range(n_captures)
     number, count = shard
     if not 1 <= number <= count:
-        raise ConfigError(Problem(f"--shard {number}/{count}", "", "need I/N with 1 <= I <= N."))
+        raise OptionError(f"--shard {number}/{count}: need I/N with 1 <= I <= N.")
     if count > n_captures:
         message = f"this sweep has {n_captures} captures and can be cut into at most as many shards."
-        raise ConfigError(Problem(f"--shard {number}/{count}", "", message))
+        raise OptionError(f"--shard {number}/{count}: {message}")
     return range(number - 1, n_captures, count)
 
 

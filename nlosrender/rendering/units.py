@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 
 from nlosrender.capture.plan import Unit
 from nlosrender.files import layout
-from nlosrender.files.interruption import uninterrupted
 from nlosrender.files.partial_capture import PartialCapture
 from nlosrender.files.pieces import Cutter, PackedChunk, packed_chunks
 from nlosrender.files.sums import Sums, sums_of
+from nlosrender.interruption import uninterrupted
 from nlosrender.rendering.report import Progress, Stopwatch
 
 if TYPE_CHECKING:

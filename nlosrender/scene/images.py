@@ -50,7 +50,7 @@ def _exr_size(path: Path) -> tuple[int, int] | None:
     import OpenEXR
 
     try:
-        with OpenEXR.File(str(path), header_only=True) as file:
+        with path.open("rb") as stream, OpenEXR.File(stream, header_only=True) as file:
             low, high = file.header()["dataWindow"]
     except (OSError, RuntimeError, ValueError, KeyError, TypeError):
         return None

@@ -126,8 +126,12 @@ def medium_warnings(surfaces: Iterable[tuple[str, mi.Shape]]) -> tuple[str, ...]
         f"{key}: light crosses it bent as well as unbent, and which medium it is in behind is a guess: arrival times "
         "there are wrong. Leave out the mask, null or thin part of its BSDF, or its glass."
         for key, shape in surfaces
-        if shape.bsdf().flags() & mi.BSDFFlags.Null and any(_bends(part) for part in _innermost(shape.bsdf()))
+        if shape.bsdf().flags() & mi.BSDFFlags.Null and _bends_and_does_not(list(_innermost(shape.bsdf())))
     )
+
+
+def _bends_and_does_not(parts: list[mi.BSDF]) -> bool:
+    return any(_bends(part) for part in parts) and any(part.flags() & mi.BSDFFlags.Null for part in parts)
 
 
 def _bends(bsdf: mi.BSDF) -> bool:
@@ -136,11 +140,36 @@ def _bends(bsdf: mi.BSDF) -> bool:
 
 
 def _innermost(bsdf: mi.BSDF) -> Iterator[mi.BSDF]:
-    """Yield the BSDFs in a BSDF that hold no other: those in a blend, a mask, under a bump map; or itself."""
+    """Yield the BSDFs in a BSDF that hold no other and that light meets: those in a blend, a mask, under a bump map.
+
+    A BSDF that holds none yields itself, and a mask with holes an empty BSDF for them.
+    """
     above = mi.traverse(bsdf).hierarchy  # of every part, textures too: what it is part of, and how deep
-    parts = [part for part in above if isinstance(part, mi.BSDF)]
-    holders = [above[part][0] for part in parts]
-    yield from (part for part in parts if part not in holders)
+    parts = [part for part, (holder, _) in above.items() if isinstance(part, mi.BSDF) and holder is bsdf]
+    if bsdf.class_name() == "MaskBSDF":
+        low, high = _extremes(bsdf, "opacity")
+        parts = parts if high > 0 else []
+        if low < 1:
+            yield mi.load_dict({"type": "null"})
+    elif bsdf.class_name() == "BlendBSDF":
+        low, high = _extremes(bsdf, "weight")  # of the second one
+        parts = [part for part, is_met in zip(parts, (low < 1, high > 0), strict=True) if is_met]
+    elif not parts:
+        yield bsdf
+    for part in parts:
+        yield from _innermost(part)
+
+
+def _extremes(bsdf: mi.BSDF, texture: str) -> tuple[float, float]:
+    """Return the least and the largest value of a texture of a BSDF; 0 and 1 where it does not tell."""
+    parameters = mi.traverse(bsdf)
+    # not its items: some of other parameters cannot be read
+    names = [name for name in parameters.keys() if name.startswith(f"{texture}.")]  # noqa: SIM118
+    told = [np.ravel(np.asarray(parameters[name])) for name in names if name.endswith((".value", ".data"))]
+    if not told:
+        return 0.0, 1.0
+    values = np.concatenate([part / 255 if part.dtype.kind == "u" else part for part in told])  # 8 bits: 0 to 1
+    return float(values.min()), float(values.max())
 
 
 def _index_of(bsdf: mi.BSDF) -> float:

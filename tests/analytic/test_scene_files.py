@@ -13,6 +13,7 @@ from views import View, see, view_config
 
 from nlosrender import pipeline
 from nlosrender.config.bsdf_table import MEDIA, METALS
+from nlosrender.config.document import Config
 from nlosrender.config.mitsuba_xml import read_mitsuba_xml
 from nlosrender.config.xml_shapes import placement
 from nlosrender.engine.backend import start_backend
@@ -78,21 +79,82 @@ def test_two_media_behind_one_surface_are_refused(second: dict[str, Any]) -> Non
     assert caught.value.problems[0].key == "scene.hidden_geometry.0.bsdf"
 
 
+HALF = {"type": "checkerboard", "color0": 1.0, "color1": 0.5}
+
+
 @pytest.mark.parametrize(
-    ("inner", "warns"), [(GLASS, True), ({"type": "dielectric"}, True), ({"type": "plastic"}, False)]
+    ("bsdf", "warns"),
+    [
+        ({"type": "mask", "opacity": 0.5, "inner": GLASS}, True),
+        ({"type": "mask", "opacity": 0.5, "inner": {"type": "dielectric"}}, True),
+        ({"type": "mask", "opacity": HALF, "inner": GLASS}, True),
+        ({"type": "bumpmap", "map": EVEN, "inner": {"type": "mask", "opacity": 0.5, "inner": GLASS}}, True),
+        ({"type": "blendbsdf", "weight": 0.5, "a": GLASS, "b": {"type": "null"}}, True),
+        ({"type": "mask", "opacity": 0.5, "inner": {"type": "plastic"}}, False),
+        ({"type": "mask", "opacity": 1.0, "inner": GLASS}, False),
+        ({"type": "mask", "opacity": 0.0, "inner": GLASS}, False),
+        ({"type": "mask", "opacity": HALF | {"color1": 1.0}, "inner": {"type": "dielectric"}}, False),
+        ({"type": "blendbsdf", "weight": 0.0, "a": GLASS, "b": {"type": "null"}}, False),
+        ({"type": "blendbsdf", "weight": 1.0, "a": GLASS, "b": {"type": "null"}}, False),
+    ],
 )
-def test_glass_that_lets_light_in_unbent_is_warned_about(inner: dict[str, Any], warns: bool) -> None:
-    """Behind a mask light has no index of refraction going in and one coming out: it would outrun itself."""
-    ball = {"type": "sphere", "center": [0, 0, 0.5], "radius": 0.3}
-    ball |= {"bsdf": {"type": "mask", "opacity": 0.5, "inner": inner}}
+def test_glass_that_lets_light_in_unbent_is_warned_about(bsdf: dict[str, Any], warns: bool) -> None:
+    """Behind the hole of a mask light has no index of refraction going in and one coming out: it would outrun itself.
+
+    Where nothing is a hole, or all of it, there is nothing to say.
+    """
+    ball = {"type": "sphere", "center": [0, 0, 0.5], "radius": 0.3, "bsdf": bsdf}
     view = configured(view_config(ball, emitters=[LAMP], spp=1))
     hidden = configured(flat_wall(ball, spp=1))
     for config in (view, hidden):
-        _, engine, _ = pipeline.set_up_engine(config, pipeline.started_backend(config))
-        from nlosrender.engine.scene_warnings import scene_warnings
-
-        said = [text for text in scene_warnings(engine) if "bent as well as unbent" in text]
+        said = bent_and_unbent(config)
         assert [text.split(":")[0] for text in said] == ["scene.hidden_geometry.0.bsdf"] * warns
+
+
+@pytest.mark.parametrize(("opacity", "warns"), [("0.5", True), ("1", False)])
+def test_a_mask_of_a_scene_file(tmp_path: Path, opacity: str, warns: bool) -> None:
+    """The same is said of XML."""
+    content = f"""<shape type='cube'><bsdf type='mask'><float name='opacity' value='{opacity}'/>
+      <bsdf type='dielectric'/></bsdf></shape>"""
+    scene = {"mitsuba": write_scene(tmp_path, content)}
+    said = bent_and_unbent(configured(view_config(emitters=[LAMP], spp=1, scene=scene), folder=tmp_path))
+    assert len(said) == warns
+
+
+def bent_and_unbent(config: Config) -> list[str]:
+    """What is said of light that crosses a surface in two ways, before a render."""
+    _, engine, _ = pipeline.set_up_engine(config, pipeline.started_backend(config))
+    from nlosrender.engine.scene_warnings import scene_warnings
+
+    return [text for text in scene_warnings(engine) if "bent as well as unbent" in text]
+
+
+COLOURED = """<shape type='sphere'><point name='center' x='9' y='0' z='0'/>
+  <bsdf type='diffuse'><rgb name='reflectance' value='0.1 0.2 0.3'/></bsdf></shape>"""  # out of sight
+
+
+@pytest.mark.parametrize(
+    "reflectance", ["<spectrum name='reflectance' value='0.5'/>", "<float name='reflectance' value='0.5'/>"]
+)
+def test_a_uniform_reflectance_is_grey(tmp_path: Path, reflectance: str) -> None:
+    """A number for all wavelengths has no colour in a render that has three, under a white lamp."""
+    plate = f"<shape type='rectangle'><bsdf type='diffuse'>{reflectance}</bsdf></shape>"
+    lamp = LAMP | {"position": [0, 0, 2]}
+    steady = seen(tmp_path, plate + COLOURED, emitters=[lamp], camera=PINHOLE).steady
+    # the middle is lit along its normal from 2 m: intensity / 2^2, times reflectance / pi
+    np.testing.assert_allclose(steady[:, 1, 2], 0.5 / np.pi / 4, rtol=1e-4)  # the pixel's width, float32
+
+
+def test_a_uniform_light_has_the_colour_of_equal_energy(tmp_path: Path) -> None:
+    """Of light a number for all wavelengths is no white: sRGB's is D65. Its luminance is the number, as in grey."""
+    lamp = """<shape type='rectangle'><emitter type='area'><spectrum name='radiance' value='0.5'/></emitter></shape>"""
+    color = seen(tmp_path, lamp + COLOURED, emitters=[], camera=PINHOLE, max_bounces=0).steady[:, 1, 2]
+    grey = seen(tmp_path, lamp, emitters=[], camera=PINHOLE, max_bounces=0).steady[:, 1, 2]
+    # equal energy, XYZ = (1, 1, 1), by the matrix of IEC 61966-2-1
+    np.testing.assert_allclose(
+        color, 0.5 * np.array([1.2048, 0.9483, 0.9089]), rtol=2e-3
+    )  # Mitsuba's colour curves are sampled
+    np.testing.assert_allclose(np.dot([0.2126, 0.7152, 0.0722], color), grey, rtol=2e-3)
 
 
 def test_a_metal_has_the_colours_it_has_in_yaml(tmp_path: Path) -> None:

@@ -13,7 +13,7 @@ import pytest
 from typer.testing import CliRunner
 
 from nlosrender.cli.app import app
-from nlosrender.errors import EXIT_BAD_INPUT, EXIT_USAGE, FileError
+from nlosrender.errors import EXIT_BAD_INPUT, EXIT_USAGE, FileError, OptionError
 from nlosrender.files.capture_file import CaptureHeader
 from nlosrender.files.writer import CaptureWriter
 from nlosrender.scene.pose import Pose
@@ -157,10 +157,12 @@ def test_points_that_are_not(capture: Path, option: str, point: str) -> None:
 
 
 def test_points_outside(capture: Path) -> None:
-    """A point outside the grid names the grid's size."""
-    result = CliRunner().invoke(app, ["plot", str(capture), "--pixel", "4,0"])
-    assert isinstance(result.exception, FileError)
-    assert "sensor_y 4 is outside the capture, which has 0 to 3" in str(result.exception)
+    """A point outside the grid is a usage error that names the grid's size."""
+    for option, point, rows, columns in (("--pixel", "4,0", 4, 5), ("--pixel", "0,5", 4, 5), ("--laser", "1,0", 1, 1)):
+        result = CliRunner().invoke(app, ["plot", str(capture), option, point])
+        assert isinstance(result.exception, OptionError)
+        allowed = f"need a row from 0 to {rows - 1} and a column from 0 to {columns - 1}"
+        assert str(result.exception) == f"{option}: got {point}, {allowed}"
 
 
 @pytest.mark.parametrize(("command", "creates"), [("info", "creates nothing"), ("plot", "creates z.png")])

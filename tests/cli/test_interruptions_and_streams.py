@@ -8,13 +8,17 @@ import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from types import ModuleType, SimpleNamespace
 
 import h5py
+import numpy as np
 import pytest
-from point_captures import cells, points_header, write_points
+from partial_captures import write_part
+from point_captures import cells, point_light, points_header, write_points
 
-from nlosrender import pipeline
+from nlosrender.capture.part import Selection
 from nlosrender.cli.progress import progress_bar
+from nlosrender.engine import backend
 from nlosrender.errors import EXIT_BAD_INPUT, EXIT_FAILURE, EXIT_INTERRUPTED, EXIT_OK, FileError
 from nlosrender.files.exports import export_capture
 from nlosrender.files.filled_folder import filled_folder
@@ -55,20 +59,47 @@ def test_an_interrupted_command_says_so(after: str, expected: tuple[int, str]) -
     assert (done.returncode, done.stderr, done.stdout) == (*expected, "")
 
 
-def test_the_renderer_starts_in_one_piece(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Ctrl-C waits for Mitsuba's import, which it would leave in ruins, for plan as for render."""
-    from rendering import configured, flat_wall
+class CutOffMitsuba(ModuleType):
+    """A Mitsuba during whose start Ctrl-C is pressed."""
 
-    finished = []
+    LogLevel = SimpleNamespace(Error=0)
+    started = False
 
-    def start(*arguments: object, **options: object) -> None:
+    def set_variant(self, variant: str) -> None:
         signal.raise_signal(signal.SIGINT)
-        finished.append(True)
 
-    monkeypatch.setattr(pipeline, "start_backend", start)
+    def set_log_level(self, level: int) -> None:
+        self.started = True
+
+
+def test_the_renderer_starts_in_one_piece(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Ctrl-C waits for Mitsuba's import, which it would leave in ruins, whichever command starts it."""
+    mitsuba = CutOffMitsuba("mitsuba")
+    monkeypatch.setitem(sys.modules, "mitsuba", mitsuba)
+    monkeypatch.setattr(backend, "_load_llvm", lambda: "none")
     with pytest.raises(KeyboardInterrupt):
-        pipeline.forecast_capture(configured(flat_wall()))
-    assert finished == [True]
+        backend.start_backend("llvm")
+    assert mitsuba.started
+
+
+@pytest.mark.parametrize("command", [("paper", "--figure", "table1", "--quick"), ("doctor",)])
+def test_a_command_is_interrupted_while_mitsuba_is_imported(tmp_path: Path, command: tuple[str, ...]) -> None:
+    """Exit code 130 and one word, at the moment that hurts most: Mitsuba is half there."""
+    (tmp_path / "configs").symlink_to(Path(__file__).parents[2] / "configs")
+    # Mitsuba looks for Dr.Jit first, in code of its own that a KeyboardInterrupt cuts off
+    code = (
+        "import signal, sys\n"
+        "class Finder:\n"
+        "    def find_spec(self, name, path=None, target=None):\n"
+        "        if name == 'drjit':\n"
+        "            signal.raise_signal(signal.SIGINT)\n"
+        "            print('mitsuba is being imported', flush=True)\n"
+        "sys.meta_path.insert(0, Finder())\n"
+        "main()\n"
+    )
+    done = run_process(code, *command, cwd=tmp_path)
+    assert (done.returncode, done.stderr.splitlines()[-1]) == (EXIT_INTERRUPTED, "interrupted"), done.stderr
+    assert done.stdout == "mitsuba is being imported\n"
 
 
 def test_an_interrupted_export_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -87,6 +118,60 @@ def test_an_interrupted_export_leaves_nothing(tmp_path: Path, monkeypatch: pytes
         export_capture(capture, tmp_path / "out.hdf5", "tal")
     assert finished == ["/H"]
     assert [path.name for path in tmp_path.iterdir()] == ["wall.hdf5"]
+
+
+STOPPED = {  # commands, and a function each that is called while their output is half-written
+    ("frames", "view.hdf5"): "analysis.frames.save_exr",
+    ("frames", "view.hdf5", "-o", "view.gif"): "analysis.frames.publish",
+    ("plot", "wall.hdf5"): "analysis.plots.publish",
+    ("export", "wall.hdf5", "--format", "tal"): "files.exports_tal._write_enum",
+    ("export", "wall.hdf5", "--format", "fk"): "files.exports.publish",
+    ("reconstruct", "wall.hdf5", "--voxels", "8"): "analysis.reconstruction.volume_file.set_attributes",
+    ("merge", "part1.hdf5", "part2.hdf5", "-o", "merged.hdf5"): "files.merge._copy",
+}
+
+
+@pytest.fixture(scope="module")
+def captures(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with captures of a wall and of a camera, and the two halves of one."""
+    folder = tmp_path_factory.mktemp("captures")
+    sensors, points = cells(5, 3, 1.0, 0.8), [(0, 0, 0.8)]
+    write_points(folder / "wall.hdf5", points_header("confocal", sensors), points)
+    view = points_header("line_of_sight", sensors, np.zeros((1, 1, 3)), bins=(0.0, 0.02, 200))
+    write_points(folder / "view.hdf5", view, points)
+    header = points_header("exhaustive", sensors)
+    light = point_light(header, points)
+    for number in (1, 2):
+        half = Selection(shard=(number, 2))
+        write_part(folder / f"part{number}.hdf5", header, np.stack([light, light])[None], half)
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("arguments", "number"),
+    [*((arguments, "SIGTERM") for arguments in STOPPED), (("export", "wall.hdf5", "--format", "fk"), "SIGHUP")],
+)
+def test_a_batch_systems_notice_leaves_nothing_half_written(
+    captures: Path, arguments: tuple[str, ...], number: str
+) -> None:
+    """SIGTERM, or the end of the terminal, ends every command that writes as Ctrl-C does: one word, no file."""
+    module, _, name = f"nlosrender.{STOPPED[arguments]}".rpartition(".")
+    before = sorted(captures.rglob("*"))
+    code = (
+        f"import signal, {module} as module\n"
+        "from pathlib import Path\n"
+        f"call = module.{name}\n"
+        "def stopped(*arguments):\n"
+        "    print(*(path for path in Path().rglob('*') if path.name.endswith('.partial')), flush=True)\n"
+        f"    signal.raise_signal(signal.{number})\n"
+        "    return call(*arguments)\n"
+        f"module.{name} = stopped\n"
+        "main()\n"
+    )
+    done = run_process(code, *arguments, cwd=captures)
+    assert (done.returncode, done.stderr) == (EXIT_INTERRUPTED, "interrupted\n")
+    assert ".partial" in done.stdout
+    assert sorted(captures.rglob("*")) == before
 
 
 @pytest.mark.parametrize("exists", [False, True])

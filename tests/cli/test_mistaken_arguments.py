@@ -26,6 +26,7 @@ CHOICES = [  # every option with a fixed set of values
     ("reconstruct", "none.hdf5", "--bounces", "4"),
     ("frames", "none.hdf5", "--format", "banana"),
     ("frames", "none.hdf5", "--format", "mp4"),
+    ("plot", "none.hdf5", "-o", "out.jpg"),
     ("bench", "--scene", "banana"),
     ("bench", "--part", "banana"),
     ("paper", "--figure", "banana"),

@@ -55,6 +55,15 @@ def test_a_render_leaves_a_valid_file_and_an_honest_report(scan, tmp_path):
         assert json.loads(file.attrs["config"])["render"]["spp"] == 64
 
 
+@pytest.mark.parametrize("part", [("--lasers", "0:99"), ("--shard", "1/16")])
+def test_a_part_that_the_capture_does_not_have(part, tmp_path):
+    """A mistake in the arguments, exit code 2, though only the configuration tells; nothing is left."""
+    config = write_config(tmp_path, "exhaustive")
+    done = run("render", config, "-o", "a.hdf5", *part, cwd=tmp_path)
+    assert (done.returncode, f"error: {' '.join(part)}: " in done.stderr) == (2, True), done.stderr
+    assert list(tmp_path.iterdir()) == [config]
+
+
 def test_the_output_defaults_to_the_name_of_the_configuration(tmp_path):
     """scene.yaml gives scene.hdf5 in the current folder, and the report says so."""
     done = run("render", write_config(tmp_path), cwd=tmp_path)

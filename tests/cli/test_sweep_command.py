@@ -139,7 +139,8 @@ def test_shards_deal_whole_captures(dataset: Path, tmp_path: Path) -> None:
     assert (report["rendered"], report["earlier"]) == (0, 4)
     for entry, other in zip(index_of(tmp_path)["captures"], index_of(dataset)["captures"], strict=True):
         assert entry["energy"] == other["energy"]
-    assert "at most as many shards" in run(tmp_path, "render", config, "--shard", "1/5").stderr
+    done = run(tmp_path, "render", config, "--shard", "1/5")
+    assert (done.returncode, "at most as many shards" in done.stderr) == (EXIT_USAGE, True)
     assert run(tmp_path, "render", config, "--lasers", "0:1").returncode == EXIT_USAGE
 
 

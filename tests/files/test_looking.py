@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -14,7 +15,7 @@ import pytest
 from nlosrender.analysis import laser_view as views
 from nlosrender.analysis.plots import plot_capture
 from nlosrender.analysis.summary import summarise
-from nlosrender.errors import FileError
+from nlosrender.errors import FileError, OptionError
 from nlosrender.files.provenance import provenance_attributes
 from nlosrender.files.reader import open_capture
 from nlosrender.files.writer import CaptureWriter
@@ -159,23 +160,29 @@ def test_a_dark_capture_has_a_picture(tmp_path: Path, header_of: Callable) -> No
 
 
 @pytest.mark.parametrize(
-    ("picture", "points", "message"),
+    ("picture", "points", "error", "message"),
     [
-        ("a.png", {"laser": (2, 0)}, r"laser_y 2 is outside"),
-        ("a.png", {"pixel": (0, 5)}, r"sensor_x 5 is outside"),
-        ("a.jpeg", {}, r"a picture's name ends in one of \.png, \.pdf, \.svg"),
-        ("none/a.png", {}, r"there is no folder"),
-        ("capture.png", {}, r"is the capture itself"),
+        ("a.png", {"laser": (2, 0)}, OptionError, r"--laser: got 2,0, need a row from 0 to 1 and a column from 0 to 2"),
+        ("a.png", {"pixel": (0, 5)}, OptionError, r"--pixel: got 0,5, need a row from 0 to 3 and a column from 0 to 4"),
+        ("a.jpeg", {}, OptionError, r"--output: got 'a.jpeg', need a name that ends in one of \.png, \.pdf, \.svg"),
+        ("none/a.png", {}, FileError, r"there is no folder"),
+        ("capture.png", {}, FileError, r"is the capture itself"),
     ],
 )
 def test_pictures_that_cannot_be(
-    tmp_path: Path, header_of: Callable, write_capture: Callable, picture: str, points: dict, message: str
+    tmp_path: Path,
+    header_of: Callable,
+    write_capture: Callable,
+    picture: str,
+    points: dict,
+    error: type[Exception],
+    message: str,
 ) -> None:
     """Points outside and unusable names are refused; nothing is written, and never over the capture."""
     path = tmp_path / "capture.png"
     write_capture(path, header_of())
     before = path.read_bytes()
-    with pytest.raises(FileError, match=message):
-        plot_capture(path, tmp_path / picture, **points)
+    with contextlib.chdir(tmp_path), pytest.raises(error, match=message):
+        plot_capture(path, Path(picture), **points)
     assert path.read_bytes() == before
     assert list(tmp_path.iterdir()) == [path]

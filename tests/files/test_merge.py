@@ -13,7 +13,7 @@ import pytest
 from partial_captures import CONFIG, part_of, write_part
 
 from nlosrender.capture.part import WHOLE, Part, Selection
-from nlosrender.errors import ConfigError, FileError
+from nlosrender.errors import FileError, OptionError
 from nlosrender.files.merge import merge_captures
 from nlosrender.files.unit_log import CHECKSUM_RANGE, placed_checksum
 from nlosrender.files.validation import validate_file
@@ -126,7 +126,7 @@ def test_shards_cover_everything_once(header_of: Callable, scan_type: str, count
 )
 def test_parts_that_do_not_exist(header_of: Callable, scan_type: str, selection: Selection, message: str) -> None:
     """A part that the capture does not have is refused with what it has."""
-    with pytest.raises(ConfigError, match=message):
+    with pytest.raises(OptionError, match=message):
         part_of(header_of(scan_type), selection)
 
 

@@ -189,8 +189,9 @@ def test_a_rebuild_that_is_killed_is_begun_again(
         assert_same(tmp_path / "whole.hdf5", copy / "a.hdf5")
 
 
+@pytest.mark.parametrize("share", [0.0, 0.5], ids=["missing", "torn"])
 def test_bytes_that_never_reached_the_disk_cost_their_unit(
-    tmp_path: Path, header_of: Callable, block_of: Callable
+    tmp_path: Path, header_of: Callable, block_of: Callable, share: float
 ) -> None:
     """After a power failure the journal may know of more than there is: checksums tell, the unit is done again."""
     header = header_of()
@@ -206,10 +207,83 @@ def test_bytes_that_never_reached_the_disk_cost_their_unit(
     _, _, offset, length, _ = json.loads(lines[3].partition(b" ")[2])["chunks"][2]
     (samples,) = folder.glob("samples.*")
     with samples.open("r+b") as stream:
-        stream.seek(offset)
-        stream.write(bytes(length))
+        arrived = round(share * length)
+        stream.seek(offset + arrived)
+        stream.write(bytes(length - arrived))
     assert write_part(path, header, block) == 4
     assert_same(tmp_path / "whole.hdf5", path)
+
+
+@pytest.mark.parametrize("built_anew", [False, True])
+def test_power_failures_after_going_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, header_of: Callable, block_of: Callable, built_anew: bool
+) -> None:
+    """Records that nobody waited for are lost, whatever has reached the samples: the file is the same all the same.
+
+    What the journal has for sure is what it was at its last fsync. So the folder is copied before every write and in
+    the middle of it, with that journal, and the render continued from the copies.
+    """
+    header = header_of()
+    block = block_of(header)
+    write_part(tmp_path / "whole.hdf5", header, block)
+    (tmp_path / "run").mkdir()
+    path = tmp_path / "run" / "a.hdf5"
+    with pytest.raises(Stopped):
+        write_part(path, header, block, stop_after=3)
+    journal = partial_folder(path) / "journal"
+    if built_anew:
+        journal.write_bytes(b"".join(journal.read_bytes().splitlines(keepends=True)[:-1]))  # as if not closed properly
+    on_disk = [journal.read_bytes()]  # that run was long ago
+    copies: list[Path] = []
+    true_write, true_sync = os.pwrite, os.fsync
+
+    def copying(descriptor: int, content: bytes, offset: int) -> int:
+        half = len(content) // 2
+        for part in (content[:half], content[half:]):
+            true_write(descriptor, part, offset)
+            offset += len(part)
+            copies.append(tmp_path / f"copy{len(copies)}")
+            shutil.copytree(partial_folder(path), partial_folder(copies[-1] / "a.hdf5"))
+            (partial_folder(copies[-1] / "a.hdf5") / "journal").write_bytes(on_disk[0])
+        return len(content)
+
+    def synchronising(descriptor: int) -> None:
+        true_sync(descriptor)
+        if os.path.samestat(os.fstat(descriptor), journal.stat()):
+            on_disk[0] = journal.read_bytes()
+
+    monkeypatch.setattr(os, "pwrite", copying)
+    monkeypatch.setattr(os, "fsync", synchronising)
+    with pytest.raises(Stopped):
+        write_part(path, header, block, stop_after=2)
+    monkeypatch.undo()
+    monkeypatch.setattr("nlosrender.files.chunks.CHUNK_SAMPLES", 7 * 2 * 3)
+    assert len(copies) > 20
+    every = 7 if built_anew else 1
+    for copy in copies[::every]:
+        assert write_part(copy / "a.hdf5", header, block) >= 3  # what was finished long ago is not done again
+        assert_same(tmp_path / "whole.hdf5", copy / "a.hdf5")
+
+
+def test_an_old_journal_does_not_come_back(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, header_of: Callable, block_of: Callable
+) -> None:
+    """What --overwrite throws away is off the disk before the first new sample is on it."""
+    path = tmp_path / "a.hdf5"
+    with pytest.raises(Stopped):
+        write_part(path, header_of(), block_of(header_of()), stop_after=3)
+    journal = partial_folder(path) / "journal"
+    sizes: list[int] = []
+    true_sync = os.fsync
+
+    def synchronising(descriptor: int) -> None:
+        true_sync(descriptor)
+        if os.path.samestat(os.fstat(descriptor), journal.stat()):
+            sizes.append(journal.stat().st_size)
+
+    monkeypatch.setattr(os, "fsync", synchronising)
+    with PartialCapture.claim(path, {}, resume=False):
+        assert sizes == [0]
 
 
 def test_another_render_is_not_continued(tmp_path: Path, header_of: Callable, block_of: Callable) -> None:

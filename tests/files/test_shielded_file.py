@@ -11,9 +11,9 @@ import h5py
 import numpy as np
 import pytest
 
-from nlosrender.files.interruption import uninterrupted
 from nlosrender.files.shielded_file import ShieldedFile
 from nlosrender.files.writer import CaptureWriter
+from nlosrender.interruption import uninterrupted
 
 
 def failing_after(limit: int) -> Callable[[int, bytes, int], int]:

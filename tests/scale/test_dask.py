@@ -165,6 +165,53 @@ def test_ctrl_c_saves_and_either_executor_goes_on(folder: Path) -> None:
     assert_same(folder / "whole.hdf5", folder / "a.hdf5")
 
 
+@pytest.mark.slow
+def test_a_unit_that_ends_its_workers_stops_the_render(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Exit code 5 and what to do; what was finished is saved, and the same command goes on."""
+    report_of(start(folder, "-o", "whole.hdf5", "--json"))
+    with monkeypatch.context() as patched:
+        patched.setenv("DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES", "0")  # deaths that are a unit's own bad luck
+        process = start(folder, *DASK)
+        wait_for_units(folder, process, 2)
+        local_workers(process)[0].kill()
+        code, _, errors = ended(process)
+    assert (code, "Traceback" in errors) == (5, False), errors
+    assert "a unit has ended every worker process it was given to. Lower render.memory_limit" in errors
+    assert f" of {N_UNITS} units are finished and saved. The same command goes on from there." in errors
+    assert 2 <= report_of(start(folder, *DASK, "--json"))["resumed_units"] < N_UNITS  # type: ignore[operator]
+    assert_same(folder / "whole.hdf5", folder / "a.hdf5")
+
+
+@pytest.mark.slow
+def test_a_first_unit_that_ends_its_workers_leaves_nothing(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """There is nothing to go on with: a failure, exit code 1."""
+    monkeypatch.setenv("DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES", "0")
+    process = start(folder, *DASK, "--set", "render.spp=100000000")
+    while not any((folder / ".a.hdf5.partial").glob("samples.*")):
+        assert process.poll() is None, process.communicate()
+        time.sleep(0.01)
+    time.sleep(1)  # the first units are on their way
+    local_workers(process)[0].kill()
+    code, _, errors = ended(process)
+    assert (code, "Traceback" in errors) == (1, False), errors
+    assert "before anything was finished; nothing is kept" in errors
+    assert not (folder / ".a.hdf5.partial").exists()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seconds", [0.0, 0.3, 1.0])
+def test_ctrl_c_while_workers_start(folder: Path, seconds: float) -> None:
+    """They do not hear it from their first moment on: one word is all that is said."""
+    process = start(folder, *DASK)
+    while not local_workers(process):
+        time.sleep(0.01)
+    time.sleep(seconds)
+    os.killpg(process.pid, signal.SIGINT)
+    code, _, errors = ended(process)
+    assert (code, "Traceback" in errors, "Fatal" in errors) == (130, False, False), errors
+    assert not (folder / "a.hdf5").exists()
+
+
 @contextmanager
 def dask_processes(folder: Path, workers: int) -> Iterator[list[subprocess.Popen[bytes]]]:
     """A scheduler that writes ``scheduler.json``, and workers without a nanny: the dead stay dead."""

@@ -58,6 +58,8 @@ MISTAKES = [
     ("nx: 3", "nx: §3.5", "capture.sensor_grid.nx", r"got 3\.5, need an integer >= 1"),
     ("nx: 3", "nx: §true", "capture.sensor_grid.nx", r"got true, need an integer"),
     ("nx: 3", 'nx: §"3"', "capture.sensor_grid.nx", r"got '3' \(text\), need an integer.*without quotes"),
+    ("nx: 3", "nx: §1_0", "capture.sensor_grid.nx", r"got '1_0' \(text\), need an integer.*without underscores"),
+    ("nx: 3", "nx: §3e0", "capture.sensor_grid.nx", r"got 3, need an integer.*Write 3, without point and exponent"),
     ("ny: 5", "ny: §[5]", "capture.sensor_grid.ny", r"got \[5\], need an integer"),
     ("width: 2.0", "width: §-1", "scene.relay_wall.width", r"got -1, need a number > 0"),
     ("width: 2.0", "width: §true", "scene.relay_wall.width", r"got true, need a number > 0"),

@@ -251,6 +251,7 @@ def test_the_examples_in_the_starter_are_valid(tmp_path: Path) -> None:
         ("time_axis.start_opl=1", "start_opl is not 0"),
         ("capture.account_first_and_last_bounces=false", "loaders expect the first and last legs"),
         ("render.time_limit_s=3", "time_limit_s alone"),
+        ("render={max_bounces: null, russian_roulette: false}", "may take for ever. Limit max_bounces"),
         ("capture.sensor_grid.nx=6", r"sensor_grid\.nx is 6: y-tal's converter"),
     ],
 )

@@ -10,6 +10,7 @@ import numpy as np
 from nlosrender.analysis.reconstruction.reconstruct import SEPARATOR, Reconstruction, settings_text
 from nlosrender.analysis.reconstruction.score import Score, otsu_threshold
 from nlosrender.analysis.theme import COLORMAP, FAINT, GROUND, INK, MARK, color_bar, style
+from nlosrender.config.encodable import encodable
 from nlosrender.files.layout import Float64
 from nlosrender.files.replacement import check_writable, explained_write, partial_path, publish
 from nlosrender.files.scan import Float32
@@ -72,7 +73,8 @@ def _figure(reconstruction: Reconstruction, silhouette: Float64 | None, score: S
     side, below = max(depth, 0.25 * width), max(depth, 0.25 * height)
     tall = 11.0 * (height + below) / (2.25 * width + side) + 1.5
     figure = Figure(figsize=(13.0, min(max(tall, 4.5), 14.0)), facecolor=GROUND, layout="constrained")
-    figure.suptitle(reconstruction.source.name, color=INK, size=14, weight="bold", x=0.01, ha="left", parse_math=False)
+    title = encodable(reconstruction.source.name)
+    figure.suptitle(title, color=INK, size=14, weight="bold", x=0.01, ha="left", parse_math=False)
     axes = figure.subplots(2, 3, width_ratios=[width, side, 1.15 * width], height_ratios=[height, below])
     front = reconstruction.front_view()
     _show(axes[0, 0], front, grid.x, grid.y, "front view, as the wall sees it", "x [m]", "y [m]")

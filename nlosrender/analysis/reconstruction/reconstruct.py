@@ -15,6 +15,7 @@ from nlosrender.analysis.reconstruction.pulse import DEFAULT_CYCLES, Pulse, defa
 from nlosrender.analysis.reconstruction.threads import Progress
 from nlosrender.analysis.reconstruction.voxel_grid import VoxelGrid, expected_box, voxel_grid
 from nlosrender.capture.bounces import FIRST_BOUNCE
+from nlosrender.config.fields import LONGEST
 from nlosrender.errors import OptionError
 from nlosrender.files.layout import Float64
 from nlosrender.files.reader import open_capture
@@ -58,13 +59,12 @@ class ReconstructionSettings:
             ("voxel-size", None if self.voxel_size is None else (self.voxel_size,), (1,)),
             ("volume-size", self.volume_size, (1, 3)),
         ):
-            if lengths is not None and not (len(lengths) in counts and all(0 < x < np.inf for x in lengths)):
-                raise OptionError(
-                    f"--{option}: got {_listed(lengths)}, need {' or '.join(map(str, counts))} length > 0 [m]"
-                )
+            if lengths is not None and not (len(lengths) in counts and all(0 < x <= LONGEST for x in lengths)):
+                need = f"{' or '.join(map(str, counts))} length > 0, at most {LONGEST:g} [m]"
+                raise OptionError(f"--{option}: got {_listed(lengths)}, need {need}")
         center = self.volume_center
-        if center is not None and not (len(center) == 3 and np.isfinite(center).all()):
-            raise OptionError(f"--volume-center: got {_listed(center)}, need x, y, z [m]")
+        if center is not None and not (len(center) == 3 and all(abs(x) <= LONGEST for x in center)):
+            raise OptionError(f"--volume-center: got {_listed(center)}, need x, y, z of at most {LONGEST:g} [m]")
 
 
 @dataclass(frozen=True, eq=False)

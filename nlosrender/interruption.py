@@ -1,4 +1,4 @@
-"""Ctrl-C waits: while HDF5 works, whose objects an exception would leave in ruins, and for a unit to be finished."""
+"""Ctrl-C waits: for Mitsuba's import and for HDF5, which an exception would leave in ruins, and for units to finish."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from types import FrameType
 
-SIGNALS = (signal.SIGINT, signal.SIGTERM)
+SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)  # Ctrl-C, a batch system's notice, a terminal that is gone
 
 
 @dataclass
@@ -38,7 +38,7 @@ class _Noting:
 
 @contextmanager
 def stop_request() -> Iterator[StopRequest]:
-    """Note the first SIGINT or SIGTERM inside the block instead of acting on it; the second one interrupts.
+    """Note the first of ``SIGNALS`` inside the block instead of acting on it; the second one interrupts.
 
     A block inside another one shares its request. Outside the main thread no signal ever comes.
 
@@ -61,7 +61,7 @@ def stop_request() -> Iterator[StopRequest]:
 
 @contextmanager
 def uninterrupted() -> Iterator[None]:
-    """Hold back SIGINT and SIGTERM inside the block and deliver the last of them right after it.
+    """Hold back ``SIGNALS`` inside the block and deliver the last of them right after it.
 
     An exception that leaves the block takes precedence. Outside the main thread nothing needs to be held back:
     Python delivers signals to the main thread only.

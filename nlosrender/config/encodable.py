@@ -1,0 +1,13 @@
+"""Text and UTF-8: the bytes of a file's name that are no text reach Python as surrogates, which UTF-8 cannot hold."""
+
+from __future__ import annotations
+
+
+def is_encodable(text: str) -> bool:
+    """Return whether UTF-8 can hold ``text``."""
+    return not any(0xD800 <= ord(character) < 0xE000 for character in text)
+
+
+def encodable(text: str) -> str:
+    """Return ``text`` with what UTF-8 cannot hold written out, such as ``caf\\udce9``."""
+    return text.encode("utf-8", "backslashreplace").decode("utf-8")
