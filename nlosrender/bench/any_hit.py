@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from nlosrender.bench.runs import Float64, LoadedScene, Timer
+
+if TYPE_CHECKING:
+    from nlosrender.engine.virtual_lights.third_bounce import LitPatches
 
 REPEATS = 3
 RAYS_PER_LAUNCH = 2**24
 SPREAD = 1024  # counters that the lanes share, so that they rarely wait for one another
 
 
-def trace_any_hit(loaded: LoadedScene, positions: Float64, facing: Float64) -> tuple[int, float]:
+def trace_any_hit(loaded: LoadedScene, lit: LitPatches, *, only_asked: bool = False) -> tuple[int, float]:
     """Trace the shadow ray of every pair of sensor point and patch that face each other, and do nothing else.
 
     The rays are those of the gather, and in its order: neighbouring lanes are neighbouring sensor points looking at
@@ -23,8 +26,10 @@ def trace_any_hit(loaded: LoadedScene, positions: Float64, facing: Float64) -> t
     ----------
     loaded
         Scene and sensor points.
-    positions, facing
-        (n, 3) where the gather's rays end [engine units], and normals of the patches.
+    lit
+        Patches of the gather; all sensor points look at them.
+    only_asked
+        Whether to leave out the rays that the gather leaves out: those that nothing can stop.
 
     Returns
     -------
@@ -35,23 +40,29 @@ def trace_any_hit(loaded: LoadedScene, positions: Float64, facing: Float64) -> t
     import mitsuba as mi
 
     from nlosrender.engine.connections import WALL_OFFSET
+    from nlosrender.engine.device_arrays import on_device
     from nlosrender.engine.space_filling import z_order
+    from nlosrender.engine.virtual_lights.lights import SHORT
 
     built, n_sensors = loaded.built, loaded.capture.n_sensors
     points = loaded.capture.sensor_grid.positions.reshape(-1, 3) / built.unit
-    sensors = _device_points(mi, points[np.argsort(z_order(points), kind="stable")])
-    centres, normals = _device_points(mi, positions), _device_points(mi, facing)
+    order = np.argsort(z_order(points), kind="stable")
+    sensors, tiles = _device_points(mi, points[order]), on_device(mi.UInt32, lit.tiles[order])
+    centres, normals = _device_points(mi, lit.positions), _device_points(mi, lit.normals)
+    clearance = on_device(mi.UInt32, lit.clearance if only_asked else np.zeros_like(lit.clearance))
     step = max(1, RAYS_PER_LAUNCH // n_sensors)
     dr.eval(sensors, centres, normals)
 
     def trace(first: int) -> tuple[int, int]:
-        count = min(step, len(positions) - first) * n_sensors
+        count = min(step, len(lit.positions) - first) * n_sensors
         index = dr.arange(mi.UInt32, count)
         patch = index // n_sensors + dr.opaque(mi.UInt32, first)
         origin = dr.gather(mi.Point3f, sensors, index % n_sensors) + mi.Vector3f(0, 0, WALL_OFFSET)
         towards = dr.gather(mi.Point3f, centres, patch) - origin
         turned = (dr.dot(mi.Vector3f(dr.gather(mi.Point3f, normals, patch)), towards) < 0) & (towards.z > 0)
-        ray = mi.Ray3f(origin, towards, mi.Float(1 - 1e-4), mi.Float(0), [])
+        known = dr.gather(mi.UInt32, clearance, patch)
+        turned &= (known & dr.gather(mi.UInt32, tiles, index % n_sensors)) == 0
+        ray = mi.Ray3f(origin, towards, mi.Float(1 - SHORT), mi.Float(0), [])
         hit = built.scene.ray_test(ray, coherent=False, active=turned)
         # sums inside the kernel: nothing of the size of the rays is written
         counts = dr.zeros(mi.UInt32, 2 * SPREAD)
@@ -62,10 +73,10 @@ def trace_any_hit(loaded: LoadedScene, positions: Float64, facing: Float64) -> t
     spent, rays = [], 0
     for _ in range(REPEATS):
         timer = Timer()
-        rays = sum(trace(first)[0] for first in range(0, len(positions), step))
+        rays = sum(trace(first)[0] for first in range(0, len(lit.positions), step))
         spent.append(timer.read()[0])
     return rays, min(spent)
 
 
-def _device_points(mi: Any, points: np.ndarray) -> Any:
+def _device_points(mi: Any, points: Float64) -> Any:
     return mi.Point3f(np.ascontiguousarray(points.T, dtype=np.float32))

@@ -27,8 +27,8 @@ class GatherRate:
     """How the third bounce's gather compares with tracing its shadow rays and doing nothing else.
 
     A pair is a sensor point and a patch. The gather's time is all of it: patches, lighting, histogram. The any-hit
-    queries are the same rays in the same order, neighbouring sensor points to one patch at a time, with those to open
-    patches; pairs that face away from each other are traced by neither.
+    queries are the rays of all lit pairs that face each other, from the wall to the patch, in the gather's order:
+    neighbouring sensor points to one patch at a time. The gather itself asks for fewer.
     """
 
     scene: str
@@ -37,10 +37,10 @@ class GatherRate:
     lit_patches: int  # of them, seen by a laser point: only these are gathered
     pairs: int  # sensor points times all patches: the rays of a gather that leaves out none
     rays: int  # lit pairs that face each other
-    open_patches: int  # lit ones between which and the wall nothing can lie: they take no ray
-    open_rays: int  # of ``rays``
+    asked_rays: int  # of ``rays``: the gather leaves out those that nothing can stop
     gather_seconds: float
     any_hit_seconds: float  # for ``rays``
+    asked_seconds: float  # for ``asked_rays``
     traces_rays: bool  # the gather leaves out visibility where nothing can occlude
 
     def report(self) -> dict[str, Any]:
@@ -51,7 +51,7 @@ class GatherRate:
             "gather_rays_per_second": self.rays / self.gather_seconds,
             "any_hit_rays_per_second": self.rays / self.any_hit_seconds,
             "gather_share_of_any_hit": self.any_hit_seconds / self.gather_seconds,
-            "rays_left_out": 1 - ((self.rays - self.open_rays) / self.pairs if self.traces_rays else 0.0),
+            "rays_left_out": 1 - (self.asked_rays / self.pairs if self.traces_rays else 0.0),
         }
 
 
@@ -74,10 +74,8 @@ def gather_rate(loaded: LoadedScene) -> GatherRate:
             engine.third.gather(batch, fineness)
         spent.append(timer.read()[0])
     lit = engine.third.lit_patches(plan.batches[0], fineness)
-    rays, any_hit_seconds = trace_any_hit(loaded, lit.positions, lit.normals)
-    open_rays = 0
-    if lit.is_open.any():
-        open_rays, _ = trace_any_hit(loaded, lit.positions[lit.is_open], lit.normals[lit.is_open])
+    rays, any_hit_seconds = trace_any_hit(loaded, lit)
+    asked_rays, asked_seconds = trace_any_hit(loaded, lit, only_asked=True)
     n_patches = len(engine.tessellator.patches(fineness))
     return GatherRate(
         loaded.scene.name,
@@ -86,10 +84,10 @@ def gather_rate(loaded: LoadedScene) -> GatherRate:
         len(lit.positions),
         n_patches * loaded.capture.n_sensors,
         rays,
-        int(lit.is_open.sum()),
-        open_rays,
+        asked_rays,
         statistics.median(spent[1:]),
         any_hit_seconds,
+        asked_seconds,
         engine.settings.needs_visibility,
     )
 

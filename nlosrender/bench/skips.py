@@ -26,6 +26,7 @@ ROOM_TARGET = 0.03
 ROOM_POINTS = 64  # sensor points along each side: enough for regions
 LASERS = 12  # along each side, and as many sensor points
 FINENESS = 0.3
+NEVER = 10**12  # points
 MIXTURE = 0.5  # of BSDF and hidden geometry sampling at the wall, where one of them suffices
 
 
@@ -79,8 +80,8 @@ def _of_gather(loaded: LoadedScene) -> Iterator[Saving]:
 
     if not engine.settings.needs_visibility:
         yield _saving("rays where nothing can lie between", loaded, gather, _tracing_all(engine, gather))
-    elif engine.third.lit_patches(plan.batches[0], fineness).is_open.any():
-        yield _saving("rays to patches all the wall sees", loaded, gather, _without_hull(engine, gather))
+    elif engine.third.lit_patches(plan.batches[0], fineness).clearance.any():
+        yield _saving("rays that nothing can stop", loaded, gather, _without_clearances(gather))
 
 
 def _tracing_all(engine: VirtualLightEngine, gather: Callable[[], Float64]) -> Callable[[], Float64]:
@@ -89,26 +90,24 @@ def _tracing_all(engine: VirtualLightEngine, gather: Callable[[], Float64]) -> C
     def traced() -> Float64:
         third = engine.third
         known, third.settings = third.settings, replace(third.settings, needs_visibility=True)
-        hull, corners = third.hull, third.hull.corners
-        hull.corners = None
         try:
-            return gather()
+            return _without_clearances(gather)()
         finally:
-            third.settings, hull.corners = known, corners
+            third.settings = known
 
     return traced
 
 
-def _without_hull(engine: VirtualLightEngine, gather: Callable[[], Float64]) -> Callable[[], Float64]:
-    """Return ``gather`` with rays to patches that lie in the hull of the hidden geometry."""
+def _without_clearances(gather: Callable[[], Float64]) -> Callable[[], Float64]:
+    """Return ``gather`` with rays all the way to every patch that faces a sensor point."""
+    from nlosrender.engine.virtual_lights import clearance
 
     def traced() -> Float64:
-        hull, corners = engine.third.hull, engine.third.hull.corners
-        hull.corners = None
+        known, clearance.LEAST_POINTS = clearance.LEAST_POINTS, NEVER
         try:
             return gather()
         finally:
-            hull.corners = corners
+            clearance.LEAST_POINTS = known
 
     return traced
 

@@ -45,6 +45,9 @@ def skipped_work(engine: Engine, *, scene_is_colored: bool) -> tuple[Skipped, ..
         skipped.append(
             Skipped("visibility rays", "one convex object stands alone before a planar wall: nothing lies between")
         )
+    elif isinstance(engine, VirtualLightEngine) and engine.third.clearances.are_worthwhile(engine.capture.n_sensors):
+        why = "where nothing can lie between a patch and a part of the wall"
+        skipped.append(Skipped("visibility rays that nothing can stop", why))
     if isinstance(engine, VirtualLightEngine) or paths.hidden_fraction > 0:
         dark = built.n_triangles - paths.sampler.n_triangles
         if dark:

@@ -139,7 +139,7 @@ def test_kernels_do_not_know_where_the_window_ends() -> None:
         for start in (0.0, -1.0, 0.5):
             axis = replace(engine.time_axis, start_opl=start)
             paths = type(engine)(engine.built, engine.capture, axis, engine.options)
-            walks = type(lights.further)(paths, lights.tessellator, lights.settings.needs_visibility)
+            walks = type(lights.further)(paths, lights.tessellator, lights.further.clearances)
             dr.kernel_history_clear()
             paths.render(stage.batch, Budget(spp=16))
             walks.accumulate(stage.batch, walks.histogram(stage.batch, 2), 0)

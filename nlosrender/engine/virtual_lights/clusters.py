@@ -50,7 +50,7 @@ class Merger:
     """
 
     def __init__(self, cells: Cells, normals: Float64, areas: Float64, allowed: Float64, light: Float64):
-        self.cells, self.light = cells, light
+        self.cells, self.normals, self.light = cells, normals, light
         self._cells = Grains.of(cells, normals, areas, allowed)
         self._grains: dict[float, Grains] = {}  # per coarseness
 
@@ -86,6 +86,7 @@ class Merger:
             middles(self.cells.weights[stands])[:, 1:],
             np.zeros(len(merged)),
             middles(self.cells.corners[stands]),
+            self.normals[stands],
             np.ones(len(merged), bool),
         )
 

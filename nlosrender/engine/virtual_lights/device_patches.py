@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from nlosrender.engine.device_arrays import columns, on_device
 from nlosrender.engine.low_discrepancy import recurrence_steps
 from nlosrender.engine.space_filling import z_order
-from nlosrender.engine.virtual_lights.occlusion import HiddenHull
+from nlosrender.engine.virtual_lights.clearance import Surface
 from nlosrender.engine.virtual_lights.patches import Patches
 from nlosrender.scene.build import BuiltScene
 from nlosrender.scene.pose import Float64
@@ -61,7 +61,7 @@ class DevicePatches:
     areas: mi.Vector3f  # geometric normal times area
     interaction: mi.SurfaceInteraction3f  # at the centres
     reflectance: mi.Spectrum  # of Lambertian patches
-    is_open: mi.Float  # 1 where nothing can stop rays from sensor points
+    member_normals: mi.Vector3f  # geometric, where shadow rays end
 
     def points(self, index: mi.UInt32) -> mi.Vector3f:
         """Return points of the surface, one per patch, from the centres' float32 positions: where rays end.
@@ -72,10 +72,14 @@ class DevicePatches:
         inside = point_inside(self.corners, u, v) + self.lift
         return self.remainder + dr.select(self.members.w > 0, self.members.xyz, inside)
 
+    def surface(self, points: mi.Vector3f) -> Surface:
+        """Return the surface at ``points``, as ``points`` returns them: what may hide it from the wall."""
+        interaction = self.interaction
+        others = dr.select(self.members.w > 0, self.member_normals, mi.Vector3f(interaction.sh_frame.n))
+        return Surface(mi.Point3f(interaction.p + points), mi.Vector3f(interaction.n), others)
 
-def upload_patches(
-    built: BuiltScene, patches: Patches, parts: Parts, hull: HiddenHull, seed: int, is_near: bool
-) -> DevicePatches:
+
+def upload_patches(built: BuiltScene, patches: Patches, parts: Parts, seed: int, is_near: bool) -> DevicePatches:
     """Bring patches to the device, neighbours together, and evaluate their reflectance and shading frames.
 
     Parameters
@@ -84,8 +88,6 @@ def upload_patches(
         The scene and what it was cut into, region after region.
     parts
         Region of each patch, and its number there.
-    hull
-        Tells which patches the whole wall sees.
     seed
         Of the points that stand for their patches where visibility is asked for. A point at random makes a partly
         hidden patch count by its visible share, on average; one for all sensor points keeps their rays together.
@@ -110,8 +112,8 @@ def upload_patches(
     interaction.sh_frame = dr.select(members.w > 0, own, frame)
     number, start = on_device(mi.UInt32, parts.numbers), mi.Vector2u(*mi.sample_tea_32(mi.UInt32(seed), mi.UInt32(0)))
     dr.make_opaque(start)
-    is_open = on_device(mi.Float, hull.is_below(patches) & ~patches.is_cluster)
-    dr.eval(interaction, reflectance, remainder, corners, areas, lift, members, is_open)
+    member_normals = mi.Vector3f(to_points(patches.member_normals))
+    dr.eval(interaction, reflectance, remainder, corners, areas, lift, members, member_normals)
     has_clusters = bool(patches.is_cluster.any())
     return DevicePatches(
         parts,
@@ -126,7 +128,7 @@ def upload_patches(
         areas,
         interaction,
         reflectance,
-        is_open,
+        member_normals,
     )
 
 

@@ -19,7 +19,12 @@ from nlosrender.engine.histogram import Histogram
 from nlosrender.engine.path_engine import PathEngine, PathOptions
 from nlosrender.engine.pilot import pilot_of
 from nlosrender.engine.sampling import DEFAULT_TARGET, Budget, Progress
-from nlosrender.engine.virtual_lights.further_bounces import FurtherBounces, rounds_needed
+from nlosrender.engine.virtual_lights.further_bounces import (
+    SHARES_OF_THIRD,
+    SQUARES,
+    FurtherBounces,
+    rounds_needed,
+)
 from nlosrender.engine.virtual_lights.lights import GatherSettings
 from nlosrender.engine.virtual_lights.occlusion import nothing_occludes
 from nlosrender.engine.virtual_lights.reciprocity import is_reciprocal
@@ -75,7 +80,8 @@ class VirtualLightEngine:
         self.third = ThirdBounce(self.paths, self.tessellator, self.settings, lanes, reciprocal)
         self.further: FurtherBounces | None = None  # else the path engine
         if self.has_further_bounces and self.settings.is_diffuse:
-            self.further = FurtherBounces(self.paths, self.tessellator, self.settings.needs_visibility)
+            clearances = self.third.clearances if self.settings.needs_visibility else None
+            self.further = FurtherBounces(self.paths, self.tessellator, clearances)
         self.reason = f"Lambertian surfaces before a {'planar' if built.wall.is_planar else 'curved'} wall"
         self._settled: dict[Budget, Budget] = {}
 
@@ -126,10 +132,11 @@ class VirtualLightEngine:
         share = THIRD_OF_MANY if self.has_further_bounces else THIRD_ALONE
         if budget.time_limit_s is not None:
             return replace(budget, fineness=self._fineness_in_time(budget, share * target))
+        if self.further is not None:
+            share = SHARES_OF_THIRD[0]
         fineness, third = self.third.settle(pilot, share * target)
-        settled = replace(budget, fineness=fineness)
         if self.further is None:
-            return settled
+            return replace(budget, fineness=fineness)
         goal = REST_OF_MANY * target
         replicas = max(2, PILOT_LANES // pilot.sensors.size // 2 * 2)
         histogram = self.further.histogram(pilot, replicas)
@@ -138,7 +145,11 @@ class VirtualLightEngine:
             self.further.accumulate(pilot, histogram, done)
             done += 1
             error = histogram.relative_error(done, third.squares)
-        return replace(settled, rounds=rounds_needed(error, done, goal))
+        share = self.further.share_of_third(third.n_patches, error * math.sqrt(done) / target)
+        if share < SHARES_OF_THIRD[0]:
+            fineness, _ = self.third.settle(pilot, share * target)
+        rounds = rounds_needed(error, done, math.sqrt(SQUARES - share**2) * target)
+        return replace(budget, fineness=fineness, rounds=rounds)
 
     def render(self, batch: Batch, budget: Budget, progress: Progress = lambda fraction: None) -> Histogram:
         """Render one batch; as ``PathEngine.render``, whose errors it raises.

@@ -16,6 +16,7 @@ from nlosrender.engine.histogram import DeviceHistogram, HistogramShape
 from nlosrender.engine.path_engine import PathEngine
 from nlosrender.engine.pilot import Pilot, spread
 from nlosrender.engine.transport import Transport
+from nlosrender.engine.virtual_lights.clearance import Clearances, Outlook, Surface
 from nlosrender.engine.virtual_lights.device_patches import to_points
 from nlosrender.engine.virtual_lights.lights import is_visible
 from nlosrender.engine.virtual_lights.sites import Sites, SiteSampler
@@ -29,6 +30,8 @@ TRIED_PER_AXIS = 2  # laser points by which the vertices of walks are judged
 MOST_VALUES = 2**24  # impulses of a round times lasers, for memory
 WALKS_PER_SITE = (16, 64)  # walks are cheap beside the gather when many sensor points share them
 MOST_ROUNDS = 2**20  # of a target that is out of reach
+# Of the target error: what the third bounce may take, and the squares of the third bounce and of the rest together.
+SHARES_OF_THIRD, SQUARES = (0.65, 0.5, 0.35), 0.9
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,6 +40,7 @@ class SiteTable:
 
     packed: mi.Float  # eight a site: position, first impulse; normal times area, end of the impulses
     shading: mi.Normal3f
+    clearance: mi.UInt32  # see ``Clearances.of``
     first: mi.UInt32  # per replica: its sites are first[r] to first[r + 1]
 
 
@@ -49,12 +53,12 @@ class FurtherBounces:
         Engine whose scene, points and histogram shapes are used.
     tessellator
         Holds the cells the sites lie on.
-    needs_visibility
-        Whether anything may lie between wall and hidden surfaces.
+    clearances
+        Tell what may lie between wall and hidden surfaces; None: nothing may.
     """
 
-    def __init__(self, paths: PathEngine, tessellator: Tessellator, needs_visibility: bool):
-        self.paths, self.needs_visibility = paths, needs_visibility
+    def __init__(self, paths: PathEngine, tessellator: Tessellator, clearances: Clearances | None):
+        self.paths, self.clearances = paths, clearances
         self.built, self.options = paths.built, paths.options
         built, capture, time_axis = paths.built, paths.capture, paths.time_axis
         self.sampler = SiteSampler(tessellator, paths.horizon)
@@ -82,6 +86,24 @@ class FurtherBounces:
         """Impulses that every sensor point receives per round, at most."""
         return self.sites_per_round * self.impulses_per_site
 
+    def share_of_third(self, patches: int, noise: float) -> float:
+        """Return the one of ``SHARES_OF_THIRD`` with which patches and walks together take the fewest rays.
+
+        Parameters
+        ----------
+        patches
+            That the largest share takes: their number goes with the error to the power of -4/3 where shadows decide.
+        noise
+            Error of one round over the target error.
+        """
+        rays_per_round = self.sites_per_round * (1 + self.impulses_per_site * self.is_confocal)
+
+        def rays(share: float) -> float:
+            finer = patches * (SHARES_OF_THIRD[0] / share) ** (4 / 3)
+            return finer * 4 / 3 + rays_per_round * max(1, math.ceil(noise**2 / (SQUARES - share**2)))
+
+        return min(SHARES_OF_THIRD, key=rays)
+
     def histogram(self, batch: Batch | Pilot, replicas: int) -> DeviceHistogram:
         """Return an empty histogram of a batch: bounce slots from the fourth bounce on."""
         bounces = self.options.bounces
@@ -101,15 +123,19 @@ class FurtherBounces:
         impulses = walk_back(plan, transport, sites, self.tried, int(state[1]))
         if not impulses.count:
             return
-        table = self._table(plan, sites, impulses)
+        outlook = Outlook.of(self.built, self.paths.capture, batch)
+        table = self._table(plan, sites, impulses, outlook)
         lowest = mi.UInt32(THIRD_BOUNCE + 1)
         slots = dr.minimum(impulses.bounces - lowest, shape.slots - 1) if self.options.bounces.split else lowest * 0
         slots = dr.full(mi.UInt32, 0, impulses.count) + slots
         dr.eval(slots)
-        _gather_impulses(transport, self.needs_visibility, self.is_confocal, table, impulses, slots, shape, histogram)
+        needs_visibility = self.clearances is not None
+        _gather_impulses(
+            transport, needs_visibility, self.is_confocal, outlook, table, impulses, slots, shape, histogram
+        )
         dr.eval(histogram.sums)
 
-    def _table(self, plan: WalkPlan, sites: Sites, impulses: Impulses) -> SiteTable:
+    def _table(self, plan: WalkPlan, sites: Sites, impulses: Impulses, outlook: Outlook) -> SiteTable:
         used, starts = np.unique(impulses.sites, return_index=True)
         ends = np.append(starts[1:], impulses.count)
         first = np.searchsorted(used, np.arange(plan.replicas + 1) * plan.sites)
@@ -118,7 +144,12 @@ class FurtherBounces:
         rows[:, 0:3], rows[:, 3] = sites.positions[used], as_float[0]
         rows[:, 4:7], rows[:, 7] = sites.normals[used] * sites.areas[used, None], as_float[1]
         shading = mi.Normal3f(to_points(sites.normals[used]))
-        return SiteTable(on_device(mi.Float, rows.ravel()), shading, on_device(mi.UInt32, first))
+        clearance = mi.UInt32(0)
+        if self.clearances is not None:
+            surface = Surface(to_points(sites.positions[used]), mi.Vector3f(shading), mi.Vector3f(shading))
+            where, active = dr.zeros(mi.UInt32, len(used)), dr.full(mi.Bool, True, len(used))
+            clearance = self.clearances.of(surface, outlook, where, active)
+        return SiteTable(on_device(mi.Float, rows.ravel()), shading, clearance, on_device(mi.UInt32, first))
 
 
 @dr.syntax
@@ -126,6 +157,7 @@ def _gather_impulses(
     transport: Transport,
     needs_visibility: bool,
     is_confocal: bool,
+    outlook: Outlook,
     table: SiteTable,
     impulses: Impulses,
     slots: mi.UInt32,
@@ -143,9 +175,11 @@ def _gather_impulses(
     own_laser = transport.lasers.gather(transport.first_laser)
     site = dr.gather(mi.UInt32, table.first, replica)
     end = dr.gather(mi.UInt32, table.first, replica + 1)
+    tile = outlook.tile_bit(mi.UInt32(0), sensor.p)
 
     while dr.hint(
-        site < end, exclude=[transport, table, impulses, histogram, built, sensors, sensor, wall_bsdf, end, own_laser]
+        site < end,
+        exclude=[transport, table, impulses, histogram, built, sensors, sensor, wall_bsdf, end, own_laser, tile],
     ):
         # ---- The site as the sensor point sees it ------------------------------------------------------------------
         at = dr.gather(mi.Vector4f, table.packed, site * 2)
@@ -159,7 +193,8 @@ def _gather_impulses(
         weight *= dr.maximum(-dr.dot(areas, direction), 0) / distance2
         active = dr.any(weight > 0)
         if dr.hint(needs_visibility, mode="scalar"):
-            active = is_visible(built, sensor, to_site, active)
+            clearance = dr.gather(mi.UInt32, table.clearance, site)
+            active = is_visible(built, sensor, to_site, active, clearance, tile)
 
         # ---- Deposit its impulses ------------------------------------------------------------------------------------
         delay = distance * scale + sensors.delay_fraction

@@ -26,6 +26,7 @@ def gather_third_bounce(
     histogram: BlockHistogram,
     lane: mi.UInt32,
     part: mi.UInt32,
+    tile: mi.UInt32,
 ) -> None:
     """Deposit the third bounce: lane by lane over the patches of its part.
 
@@ -39,6 +40,8 @@ def gather_third_bounce(
         Where to, and the row of each lane of ``transport``.
     part
         The part of ``lights`` that each lane gathers.
+    tile
+        The bit of the tile that its sensor point lies in, see ``Outlook``.
     """
     built, sensors = transport.built, transport.sensors
     sensor, wall_bsdf = sensors.interaction, built.wall_bsdf
@@ -64,6 +67,7 @@ def gather_third_bounce(
             sensor,
             wall_bsdf,
             own_laser,
+            tile,
         ],
     ):
         # ---- The patch as the sensor point sees it -----------------------------------------------------------------
@@ -90,8 +94,10 @@ def gather_third_bounce(
 
         # ---- Visibility --------------------------------------------------------------------------------------------
         if dr.hint(settings.needs_visibility, mode="scalar"):
-            is_open = rows[4].w > 0
-            active &= is_open | is_visible(built, sensor, from_sensor + shown, active & ~is_open)
+            # in front of the plane through the point that is looked at, not through the centre
+            way = from_sensor + shown
+            clearance = dr.select(dr.dot(areas, way) < 0, mi.UInt32(rows[4].w), 0)
+            active = is_visible(built, sensor, way, active, clearance, tile)
 
         # ---- Reflect towards the lasers and deposit ----------------------------------------------------------------
         scale = transport.bins_per_unit

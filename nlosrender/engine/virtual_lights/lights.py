@@ -11,6 +11,7 @@ import numpy as np
 from nlosrender.engine.connections import off_the_wall
 from nlosrender.engine.device_arrays import on_device
 from nlosrender.engine.transport import Transport
+from nlosrender.engine.virtual_lights.clearance import Clearances, Outlook
 from nlosrender.engine.virtual_lights.device_patches import DevicePatches
 from nlosrender.scene.build import BuiltScene
 
@@ -35,7 +36,7 @@ class Lights:
     """What the gather's loop reads: patches that are lit, packed so that one load brings four numbers."""
 
     # 20 a patch: three corners, each with one component of normal times area; the centre, and 1 for a cluster; from it
-    # to where rays from sensor points end, and 1 where nothing can stop them
+    # to where rays from sensor points end, and its clearance, see ``Clearances.of``
     packed: mi.Float
     remainder: mi.Float | None  # four a patch: what float32 rounds off the centre; None where that does not count
     shading: mi.Normal3f  # shading normals
@@ -49,7 +50,22 @@ class Lights:
     first: mi.UInt32  # of part k: its patches are first[k] to first[k + 1]
 
 
-def light_patches(settings: GatherSettings, transport: Transport, patches: DevicePatches, n_lasers: int) -> Lights:
+@dataclass(frozen=True, eq=False)
+class Clearing:
+    """What it takes to leave visibility rays out."""
+
+    clearances: Clearances
+    outlook: Outlook  # a rectangle per region of the patches
+
+    def of(self, patches: DevicePatches, seen_at: mi.Vector3f, active: mi.Bool) -> mi.UInt32:
+        """Return the clearance of patches where rays end, see ``Clearances.of``."""
+        where = on_device(mi.UInt32, patches.parts.regions)
+        return self.clearances.of(patches.surface(seen_at), self.outlook, where, active)
+
+
+def light_patches(
+    settings: GatherSettings, transport: Transport, patches: DevicePatches, clearing: Clearing, n_lasers: int
+) -> Lights:
     """Return the patches that some laser of the batch lights; confocal captures keep all and light them as they go.
 
     Parameters
@@ -58,6 +74,8 @@ def light_patches(settings: GatherSettings, transport: Transport, patches: Devic
         What the gather does and reads.
     patches
         All patches of a resolution.
+    clearing
+        Tells which visibility rays may be left out.
     n_lasers
         Lasers of the batch.
     """
@@ -65,11 +83,16 @@ def light_patches(settings: GatherSettings, transport: Transport, patches: Devic
     lit = dr.arange(mi.UInt32, count)
     arriving, delays, seen_at = mi.Spectrum(0), mi.Float(0), patches.points(patches.number)
     dr.eval(seen_at)
+    clearance, is_lit = dr.zeros(mi.UInt32, count), dr.full(mi.Bool, True, count)
+    if settings.needs_visibility and not settings.has_one_laser:
+        clearance = clearing.of(patches, seen_at, is_lit)
     if not settings.is_confocal:
-        arriving, brightest, seen_at = _illuminate(settings, transport, patches, seen_at, n_lasers)
-        lit = dr.compress(brightest > 0)
+        arriving, is_lit, seen_at = _illuminate(settings, transport, patches, clearing, seen_at, clearance, n_lasers)
+        lit = dr.compress(is_lit)
         if not dr.width(lit):
             lit = mi.UInt32(0)  # all is dark: one dark patch, since arrays of no length cannot be read
+    if settings.needs_visibility and settings.has_one_laser:
+        clearance = clearing.of(patches, seen_at, is_lit)
     lit, first = (on_device(mi.UInt32, values) for values in patches.parts.sorted(np.array(lit.numpy())))
     if not settings.is_confocal:
         index = dr.arange(mi.UInt32, dr.width(lit) * n_lasers)
@@ -85,8 +108,9 @@ def light_patches(settings: GatherSettings, transport: Transport, patches: Devic
         dr.gather(mi.SurfaceInteraction3f, patches.interaction, lit),
     )
     is_cluster = dr.gather(mi.Vector4f, patches.members, lit).w
-    shown, is_open = dr.gather(mi.Vector3f, seen_at, lit), dr.gather(mi.Float, patches.is_open, lit)
-    rows = [(a, areas.x), (b, areas.y), (c, areas.z), (interaction.p, is_cluster), (shown, is_open)]
+    shown = dr.gather(mi.Vector3f, seen_at, lit)
+    clear = mi.Float(dr.gather(mi.UInt32, clearance, lit))
+    rows = [(a, areas.x), (b, areas.y), (c, areas.z), (interaction.p, is_cluster), (shown, clear)]
     packed = dr.zeros(mi.Float, 4 * ROWS * dr.width(lit))
     lane = dr.arange(mi.UInt32, dr.width(lit))
     for k, (point, fourth) in enumerate(rows):
@@ -112,8 +136,14 @@ def light_patches(settings: GatherSettings, transport: Transport, patches: Devic
 
 
 def _illuminate(
-    settings: GatherSettings, transport: Transport, patches: DevicePatches, seen_at: mi.Vector3f, n_lasers: int
-) -> tuple[mi.Spectrum, mi.Float, mi.Vector3f]:
+    settings: GatherSettings,
+    transport: Transport,
+    patches: DevicePatches,
+    clearing: Clearing,
+    seen_at: mi.Vector3f,
+    clearance: mi.UInt32,
+    n_lasers: int,
+) -> tuple[mi.Spectrum, mi.Bool, mi.Vector3f]:
     """Light every patch by every laser: emission, distance, and the share of the patch that is not in shadow.
 
     Sensor points look at ``seen_at``, or at a point that the only laser lights.
@@ -121,8 +151,8 @@ def _illuminate(
     Returns
     -------
     tuple
-        What arrives (of Lambertian patches: leaves), index = laser * n_patches + patch; the most of it per patch; and
-        from the patches' centres to where sensor points look at them.
+        What arrives (of Lambertian patches: leaves), index = laser * n_patches + patch; whether anything does, per
+        patch; and from the patches' centres to where sensor points look at them.
     """
     built = transport.built
     n_patches = dr.width(patches.areas)
@@ -150,13 +180,16 @@ def _illuminate(
     elif settings.needs_visibility:
         # the very point that sensor points look at: what hides a part of a patch from both hides the same part
         way = to_rounded + dr.gather(mi.Vector3f, seen_at, patch)
-        is_open = dr.gather(mi.Float, patches.is_open, patch) > 0
-        seen = dr.select(is_open | is_visible(built, lit, way, active & ~is_open), mi.Float(1), 0)
+        tile = clearing.outlook.tile_bit(mi.UInt32(0), lit.p)
+        is_before = dr.dot(dr.gather(mi.Vector3f, patches.areas, patch), way) < 0  # the plane through that point
+        clear = dr.select(is_before, dr.gather(mi.UInt32, clearance, patch), 0)
+        seen = dr.select(is_visible(built, lit, way, active, clear, tile), mi.Float(1), 0)
     arriving = dr.select(active, arriving * seen, 0)
     brightest = dr.zeros(mi.Float, n_patches)
     dr.scatter_reduce(dr.ReduceOp.Max, brightest, dr.max(arriving), patch)
-    dr.eval(arriving, brightest, seen_at)
-    return arriving, brightest, seen_at
+    is_lit = brightest > 0
+    dr.eval(arriving, is_lit, seen_at)
+    return arriving, is_lit, seen_at
 
 
 def _share_in_light(
@@ -171,12 +204,11 @@ def _share_in_light(
     Shares of a patch that laser and sensor point see are not independent where one edge throws both shadows. A point
     drawn among those in light makes their product right on average.
     """
-    is_open = patches.is_open > 0
     n_seen, chosen = mi.UInt32(0), mi.Vector3f(0)
     for k in range(LASER_RAYS):
         index = patches.number * LASER_RAYS + k
         point = patches.points(index)
-        is_lit = is_open | is_visible(built, laser, to_rounded + point, active & ~is_open)
+        is_lit = is_visible(built, laser, to_rounded + point, active)
         n_seen += dr.select(is_lit, mi.UInt32(1), 0)
         # the n-th point in light takes the place of the one before with a chance of 1 / n
         takes = is_lit & (mi.sample_tea_float32(index, patches.start.x) * mi.Float(n_seen) < 1)
@@ -184,13 +216,24 @@ def _share_in_light(
     return mi.Float(n_seen) / LASER_RAYS, chosen
 
 
-def is_visible(built: BuiltScene, wall_point: mi.SurfaceInteraction3f, way: mi.Vector3f, active: mi.Bool) -> mi.Bool:
-    """Return whether nothing lies on the way from a point of the wall to a point of a patch."""
+def is_visible(
+    built: BuiltScene,
+    wall_point: mi.SurfaceInteraction3f,
+    way: mi.Vector3f,
+    active: mi.Bool,
+    clearance: mi.UInt32 | None = None,
+    tile: mi.UInt32 | None = None,
+) -> mi.Bool:
+    """Return whether nothing lies on the way from a point of the wall to a point of a hidden surface.
+
+    ``clearance`` is that of the latter, and ``tile`` the bit of the tile the former lies in.
+    """
     origin = off_the_wall(built, wall_point)
     direction = way - (origin - wall_point.p)
     end = dr.maximum(1 - SHORT - LEAST_SHORT * dr.rsqrt(dr.squared_norm(direction)), 0)
+    asked = active if clearance is None else active & ((clearance & tile) == 0)
     ray = mi.Ray3f(origin, direction, end, mi.Float(0), [])
-    return active & ~built.scene.ray_test(ray, coherent=False, active=active)
+    return active & ~(asked & built.scene.ray_test(ray, coherent=False, active=asked))
 
 
 def four_corners(a: mi.Point3f, b: mi.Point3f, c: mi.Point3f) -> tuple[mi.Point3f, ...]:

@@ -27,6 +27,7 @@ class Patches:
     barycentric: Float64  # (n, 2) the centre within that triangle
     lifts: Float64  # (n,) height of the surface over the plane of the corners: where shadow rays may end
     members: Float64  # (n, 3) where shadow rays of a cluster end; elsewhere the centre
+    member_normals: Float64  # (n, 3) geometric, there
     is_cluster: NDArray[np.bool_]  # (n,)
 
     def __len__(self) -> int:
@@ -42,7 +43,7 @@ class Patches:
         if not parts:
             none, index = np.zeros((0, 3)), np.zeros(0, np.uint32)
             corners, numbers, pairs = np.zeros((0, 3, 3)), np.zeros(0), np.zeros((0, 2))
-            return cls(corners, numbers, none, none, index, index, pairs, numbers, none, index.astype(bool))
+            return cls(corners, numbers, none, none, index, index, pairs, numbers, none, none, index.astype(bool))
         names = [field.name for field in fields(cls)]
         return cls(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
 
@@ -58,17 +59,19 @@ def split_cells(cells: Cells, splits: NDArray[np.int64]) -> Patches:
         corners = np.einsum("pkb,tbx->tpkx", weights, cells.corners[owners]).reshape(-1, 3, 3)
         centres = np.einsum("pb,tbx->tpx", weights.mean(axis=1), cells.weights[owners]).reshape(-1, 3)
         repeated = np.repeat(owners, n * n)
+        units = normals[repeated] / lengths[repeated, None]
         parts.append(
             Patches(
                 corners,
                 lengths[repeated] / (2 * n * n),
                 corners.mean(axis=1),
-                normals[repeated] / lengths[repeated, None],
+                units,
                 cells.shapes[repeated],
                 cells.primitives[repeated],
                 centres[:, 1:],
                 np.zeros(len(repeated)),
                 corners.mean(axis=1),
+                units,
                 np.zeros(len(repeated), bool),
             )
         )

@@ -123,6 +123,7 @@ def _sphere(shape: RoundShape, n: int) -> Patches:
         # seen from within, a plane through points of the sphere lies in front of it already
         np.maximum(outside, 0) * radius * (1 - np.linalg.norm(unit.mean(axis=1), axis=1)),
         centre + radius * direction,
+        outside * direction,
         np.zeros(count, bool),
     )
 
@@ -161,6 +162,7 @@ def _cylinder(shape: RoundShape, around: int, along: int) -> Patches:
         np.zeros((count, 2)),
         np.full(count, lift),
         centres,
+        outside * radial / radius,
         np.zeros(count, bool),
     )
 

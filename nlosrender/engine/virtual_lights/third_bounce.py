@@ -18,10 +18,10 @@ from nlosrender.engine.pilot import Pilot
 from nlosrender.engine.space_filling import z_order
 from nlosrender.engine.transport import Transport
 from nlosrender.engine.virtual_lights.block_histogram import BlockHistogram
+from nlosrender.engine.virtual_lights.clearance import Clearances, Outlook, count_sensors
 from nlosrender.engine.virtual_lights.device_patches import Parts, upload_patches
 from nlosrender.engine.virtual_lights.gather import gather_third_bounce
-from nlosrender.engine.virtual_lights.lights import ROWS, GatherSettings, Lights, light_patches
-from nlosrender.engine.virtual_lights.occlusion import HiddenHull
+from nlosrender.engine.virtual_lights.lights import ROWS, Clearing, GatherSettings, Lights, light_patches
 from nlosrender.engine.virtual_lights.patches import Patches
 from nlosrender.engine.virtual_lights.tessellator import MAX_PATCHES, Tessellator
 
@@ -52,11 +52,12 @@ class Gathered:
 
 @dataclass(frozen=True, eq=False)
 class LitPatches:
-    """Patches that some laser point lights [engine units]."""
+    """Patches that some laser point lights [engine units], and what is known of the rays that sensor points ask for."""
 
     positions: NDArray[np.float64]  # (n, 3) where rays from sensor points end
     normals: NDArray[np.float64]  # (n, 3)
-    is_open: NDArray[np.bool_]  # (n,) whether nothing can stop these rays
+    clearance: NDArray[np.uint32]  # (n,) see ``Clearances.of``
+    tiles: NDArray[np.uint32]  # (sensors,) bit of the tile that each sensor point lies in, numbered as in the batch
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,7 +99,7 @@ class ThirdBounce:
     ):
         self.paths, self.tessellator, self.settings, self.lanes = paths, tessellator, settings, lanes
         self.is_reciprocal = is_reciprocal
-        self.hull = HiddenHull(paths.built)
+        self.clearances = Clearances(paths.built)
 
     def gather(self, batch: Batch | Pilot, coarseness: float) -> Gathered:
         """Gather a batch at one resolution."""
@@ -139,8 +140,10 @@ class ThirdBounce:
         lanes = self._lanes(batch, shape, lasers)
         histogram = BlockHistogram(shape, lanes.order)
         if len(patches):
-            lights = self._lights(lanes.transport, shape, patches, Parts.of([len(patches)], shape.replicas))
-            gather_third_bounce(self.settings, lanes.transport, lights, histogram, lanes.index, lanes.replica)
+            outlook = self._outlook(batch)
+            lights = self._lights(lanes.transport, shape, patches, Parts.of([len(patches)], shape.replicas), outlook)
+            tile = outlook.tile_bit(mi.UInt32(0), lanes.transport.sensors.interaction.p)
+            gather_third_bounce(self.settings, lanes.transport, lights, histogram, lanes.index, lanes.replica, tile)
         for labels, near in self.tessellator.regional_patches(coarseness, np.unique(lanes.regions).tolist()):
             parts = Parts.of([len(one) for one in near], shape.replicas)
             if not len(parts.numbers):  # nothing is close to the wall there
@@ -148,26 +151,41 @@ class ThirdBounce:
             chosen = np.flatnonzero(np.isin(lanes.regions, labels))
             part = np.searchsorted(labels, lanes.regions[chosen]) * shape.replicas + chosen // shape.sensors
             index = on_device(mi.UInt32, chosen)
-            some = lanes.transport.of_lanes(index)
-            lights = self._lights(some, shape, Patches.joined(near), parts)
-            gather_third_bounce(self.settings, some, lights, histogram, index, on_device(mi.UInt32, part))
+            some, outlook = lanes.transport.of_lanes(index), self._outlook(batch, labels)
+            lights = self._lights(some, shape, Patches.joined(near), parts, outlook)
+            tile = outlook.tile_bit(on_device(mi.UInt32, part // shape.replicas), some.sensors.interaction.p)
+            gather_third_bounce(self.settings, some, lights, histogram, index, on_device(mi.UInt32, part), tile)
         return histogram
 
     def lit_patches(self, batch: Batch | Pilot, coarseness: float) -> LitPatches:
         """Return the patches that the gather of a batch goes through, in its order; those all sensor points share."""
         shape = self.shape(batch)
-        transport = self._lanes(batch, shape).transport
-        patches = self.tessellator.patches(coarseness)
-        lights = self._lights(transport, shape, patches, Parts.of([len(patches)], shape.replicas))
-        rows = np.array(lights.packed, np.float64).reshape(-1, ROWS, 4)
-        centre, shown = rows[:, ROWS - 2], rows[:, ROWS - 1]
-        normals = np.array(lights.interaction.n, np.float64).T
-        return LitPatches(centre[:, :3] + shown[:, :3], normals, shown[:, 3] > 0)
+        lanes, patches = self._lanes(batch, shape), self.tessellator.patches(coarseness)
+        parts, outlook = Parts.of([len(patches)], shape.replicas), self._outlook(batch)
+        lights = self._lights(lanes.transport, shape, patches, parts, outlook)
+        rows = np.array(lights.packed, np.float32).reshape(-1, ROWS, 4)
+        ends, normals = (rows[:, ROWS - 2] + rows[:, ROWS - 1])[:, :3], np.array(lights.interaction.n, np.float64).T
+        tiles = np.empty(shape.sensors, np.uint32)
+        bits = np.array(outlook.tile_bit(mi.UInt32(0), lanes.transport.sensors.interaction.p))
+        tiles[lanes.order] = bits[: shape.sensors]
+        return LitPatches(ends.astype(np.float64), normals, rows[:, ROWS - 1, 3].astype(np.uint32), tiles)
 
-    def _lights(self, transport: Transport, shape: HistogramShape, patches: Patches, parts: Parts) -> Lights:
+    def _lights(
+        self, transport: Transport, shape: HistogramShape, patches: Patches, parts: Parts, outlook: Outlook
+    ) -> Lights:
         is_near = self.tessellator.nearest < NEAR
-        on_device = upload_patches(self.paths.built, patches, parts, self.hull, self.paths.options.seed, is_near)
-        return light_patches(self.settings, transport, on_device, shape.lasers)
+        on_device = upload_patches(self.paths.built, patches, parts, self.paths.options.seed, is_near)
+        return light_patches(self.settings, transport, on_device, Clearing(self.clearances, outlook), shape.lasers)
+
+    def _outlook(self, batch: Batch | Pilot, regions: list[int] | None = None) -> Outlook:
+        """Return what patches are seen from: all points, or the sensor points of some regions."""
+        built, capture = self.paths.built, self.paths.capture
+        if regions is None or self.tessellator.regions is None:
+            return Outlook.of(built, capture, batch, with_lasers=not self.settings.has_one_laser)
+        labels = self.tessellator.regions.labels
+        points = capture.sensor_grid.positions.reshape(-1, 3) / built.unit
+        groups = [points[labels == label] for label in regions]
+        return Outlook.around(groups, count_sensors(capture, batch) // len(self.tessellator.regions.near))
 
     def pair(self, batch: Batch | Pilot, fineness: float) -> tuple[Gathered, Gathered]:
         """Gather a batch at ``fineness`` and at the coarser resolution it is compared with."""
