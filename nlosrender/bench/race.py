@@ -184,9 +184,9 @@ def _shared_error(one: np.ndarray, other: np.ndarray, reference: Reference) -> f
     common, the reference's own error included. That is taken off; a rest below it says nothing.
     """
     squares = float((reference.values**2).sum())
-    products = one * other
-    deviation = math.sqrt(float((products**2).sum()))
-    shared = float(products.sum())
+    # per sensor point: the bins of one are not independent where numbers are low-discrepancy
+    products = (one * other).sum(axis=-1)
+    deviation, shared = math.sqrt(float((products**2).sum())), float(products.sum())
     rest = shared / squares - reference.error**2
     if shared < SIGNIFICANT * deviation or rest < reference.error**2:
         return None
