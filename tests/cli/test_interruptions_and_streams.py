@@ -155,11 +155,29 @@ def test_a_batch_systems_notice_leaves_nothing_half_written(
     captures: Path, arguments: tuple[str, ...], number: str
 ) -> None:
     """SIGTERM, or the end of the terminal, ends every command that writes as Ctrl-C does: one word, no file."""
-    module, _, name = f"nlosrender.{STOPPED[arguments]}".rpartition(".")
     before = sorted(captures.rglob("*"))
-    code = (
+    done = run_process(_raising(arguments, number, "SIG_DFL"), *arguments, cwd=captures)
+    assert (done.returncode, done.stderr) == (EXIT_INTERRUPTED, "interrupted\n")
+    assert ".partial" in done.stdout
+    assert sorted(captures.rglob("*")) == before
+
+
+def test_a_command_that_shall_outlive_its_terminal_does(captures: Path, tmp_path: Path) -> None:
+    """``nohup`` has SIGHUP ignored: the command goes on."""
+    arguments = ("export", "wall.hdf5", "--format", "fk")
+    code, written = _raising(arguments, "SIGHUP", "SIG_IGN"), tmp_path / "wall.mat"
+    done = run_process(code, *arguments, "-o", str(written), cwd=captures)
+    assert done.returncode == 0
+    assert written.stat().st_size > 0
+
+
+def _raising(arguments: tuple[str, ...], number: str, handler: str) -> str:
+    """Return code that runs a command and sends it a signal while it writes; ``handler`` is what its parent left it."""
+    module, _, name = f"nlosrender.{STOPPED[arguments]}".rpartition(".")
+    return (
         f"import signal, {module} as module\n"
         "from pathlib import Path\n"
+        f"signal.signal(signal.{number}, signal.{handler})\n"
         f"call = module.{name}\n"
         "def stopped(*arguments):\n"
         "    print(*(path for path in Path().rglob('*') if path.name.endswith('.partial')), flush=True)\n"
@@ -168,10 +186,6 @@ def test_a_batch_systems_notice_leaves_nothing_half_written(
         f"module.{name} = stopped\n"
         "main()\n"
     )
-    done = run_process(code, *arguments, cwd=captures)
-    assert (done.returncode, done.stderr) == (EXIT_INTERRUPTED, "interrupted\n")
-    assert ".partial" in done.stdout
-    assert sorted(captures.rglob("*")) == before
 
 
 @pytest.mark.parametrize("exists", [False, True])
