@@ -139,3 +139,13 @@ def test_auto_takes_the_engine_that_is_quicker(name: str, engine: str, tmp_path:
     chosen = Stage.of(scene(name, "single", "auto"), tmp_path).engine
     assert chosen.name == engine
     assert ("curved wall" if engine == "virtual_lights" else "a mesh that sees itself") in chosen.reason
+
+
+@pytest.mark.parametrize("engine", ["auto", "virtual_lights"])
+def test_a_needle_is_not_cut_into_millions_of_patches(engine: str) -> None:
+    """The cells of a tube of 1 micrometre are as long as it is wide: 76 million in 1.5 m, more than memory holds."""
+    config = flat_wall(sensors=(3, 2), scan="confocal", max_bounces=4, engine=engine, spp=None)
+    config["scene"]["relay_wall"] = {"type": "cylinder", "radius": 1e-6, "height": 1.5, "bsdf": diffuse(0.7)}
+    chosen = Stage.of(config).engine
+    assert chosen.name == "path"
+    assert "so narrow" in chosen.reason

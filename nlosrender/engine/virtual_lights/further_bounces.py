@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import drjit as dr
 import mitsuba as mi
@@ -61,7 +62,7 @@ class FurtherBounces:
         self.paths, self.clearances = paths, clearances
         self.built, self.options = paths.built, paths.options
         built, capture, time_axis = paths.built, paths.capture, paths.time_axis
-        self.sampler = SiteSampler(tessellator, paths.horizon)
+        self.tessellator = tessellator
         tried = spread(capture.laser_grid, TRIED_PER_AXIS)
         points = laser_points(built, capture, time_axis, np.array(tried.indices, dtype=np.uint32))
         self.tried = TriedLasers(points, tried.size, tried.size == capture.n_lasers)
@@ -73,6 +74,11 @@ class FurtherBounces:
         lasers = capture.n_lasers if capture.scan_type == "exhaustive" else 1
         self.sites_per_round = min(SITES_PER_ROUND, max(64, MOST_VALUES // (self.impulses_per_site * lasers)))
         self.walks = int(min(max(pairs / 32, fewest), most))
+
+    @cached_property
+    def sampler(self) -> SiteSampler:
+        """What draws the sites; made when it is needed, for it holds all cells."""
+        return SiteSampler(self.tessellator, self.paths.horizon)
 
     def plan(self, replicas: int) -> WalkPlan:
         """Return the numbers of a round of ``replicas`` independent sets of sites."""

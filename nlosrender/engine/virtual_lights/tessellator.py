@@ -131,6 +131,11 @@ class Tessellator:
         centres = self.cells.corners[self._is_hidden].mean(axis=1)
         return min([float(lasers(centres).min(initial=np.inf)) if len(centres) else math.inf, *on_round])
 
+    @property
+    def n_round_cells(self) -> int:
+        """Cells of all round shapes: a needle has as many as it is longer than it is wide."""
+        return sum(shape.count(self._allowed_on(shape, 1.0)) for shape in self.round_shapes)
+
     def round_cells(self) -> list[tuple[RoundShape, Patches]]:
         """Return every round shape, and its cells, whose corners lie on it."""
         return [(shape, shape.patches(self._allowed_on(shape, 1.0))) for shape in self.round_shapes]
