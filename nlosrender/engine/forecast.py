@@ -61,7 +61,8 @@ def estimate_render_time(engine: Engine, plan: Plan, budget: Budget, lanes: int)
         Rendering alone: no start, no compilation, no writing.
     """
     limit = budget.time_limit_s
-    if limit is not None and budget.spp is None and budget.target_error is None and traces_paths(engine):
+    samples = traces_paths(engine) or (isinstance(engine, VirtualLightEngine) and engine.further is not None)
+    if limit is not None and budget.spp is None and budget.target_error is None and samples:
         return TimeEstimate(limit, "render.time_limit_s")
     pilot = pilot_batch(engine, plan)
     if isinstance(engine, VirtualLightEngine) and _deposits_per_sensor(engine, pilot) > MOST_PILOTS * PILOT_DEPOSITS:

@@ -146,6 +146,15 @@ def test_warnings_are_in_the_report_of_a_render_even_when_it_is_quiet():
     assert ["turns its back" in text for text in json.loads(result.stdout)["warnings"]] == [True, False]
 
 
+@pytest.mark.parametrize(("bounces", "takes_all"), [("5", True), ("3", False)])
+def test_walks_take_all_the_time_there_is(bounces: str, takes_all: bool) -> None:
+    """A time limit alone: patches of the third bounce are done early, walks go on until the end."""
+    changes = ["--set", "render.spp=null", "--set", "render.time_limit_s=1000"]
+    plan = planned(write_config(), *changes, "--set", f"render.max_bounces={bounces}")
+    assert plan["engine"] == "virtual_lights"
+    assert (plan["seconds_estimate"] >= 1000) == takes_all  # the start counts, too
+
+
 def test_impossible_sizes_end_in_an_error():
     """Nothing is allocated for a grid that no machine holds; the configuration is to blame, and the place is told."""
     with pytest.raises(ConfigError, match=r"^--set .*: capture\.sensor_grid: 1000000 x 1000000 points take") as caught:
