@@ -47,43 +47,13 @@ def connect_to_lasers(
     in_spot = mi.Vector3f(0)
     if dr.hint(settings.finds_spot, mode="scalar"):
         in_spot = _on_disc(generator, active) * settings.spot_radius
+    vertex = si, active, opl, throughput, origin, leg
     if dr.hint(transport.lasers_per_lane == 1, mode="scalar"):
-        first = mi.UInt32(0)
-        _connect(
-            settings,
-            transport,
-            histogram,
-            in_spot,
-            lane,
-            first,
-            slot,
-            si,
-            active,
-            opl,
-            throughput,
-            origin,
-            leg,
-            coherent,
-        )
+        _connect(settings, transport, histogram, in_spot, lane, mi.UInt32(0), slot, *vertex, coherent)
     else:
         laser = mi.UInt32(0)
-        while dr.hint(laser < transport.n_lasers, exclude=[settings, transport, histogram]):
-            _connect(
-                settings,
-                transport,
-                histogram,
-                in_spot,
-                lane,
-                laser,
-                slot,
-                si,
-                active,
-                opl,
-                throughput,
-                origin,
-                leg,
-                coherent,
-            )
+        while dr.hint(laser < transport.n_lasers, exclude=[settings, transport, histogram, vertex]):
+            _connect(settings, transport, histogram, in_spot, lane, laser, slot, *vertex, coherent)
             laser += 1
 
 

@@ -20,7 +20,7 @@ from nlosrender.engine.engines import Engine, SamplingEngine
 from nlosrender.engine.histogram import Histogram, relative_l2_error
 from nlosrender.engine.memory import n_pairs
 from nlosrender.engine.sampling import DEFAULT_TARGET, FIRST_SAMPLES, Budget
-from nlosrender.engine.skipped import traces_paths
+from nlosrender.engine.skipped import makes_walks, traces_paths
 from nlosrender.engine.virtual_lights.engine import VirtualLightEngine
 from nlosrender.engine.virtual_lights.third_bounce import FIRST_COARSENESS, REFINEMENT
 
@@ -61,8 +61,8 @@ def estimate_render_time(engine: Engine, plan: Plan, budget: Budget, lanes: int)
         Rendering alone: no start, no compilation, no writing.
     """
     limit = budget.time_limit_s
-    samples = traces_paths(engine) or (isinstance(engine, VirtualLightEngine) and engine.further is not None)
-    if limit is not None and budget.spp is None and budget.target_error is None and samples:
+    goes_on = traces_paths(engine) or makes_walks(engine)  # as long as there is time
+    if limit is not None and budget.spp is None and budget.target_error is None and goes_on:
         return TimeEstimate(limit, "render.time_limit_s")
     pilot = pilot_batch(engine, plan)
     if isinstance(engine, VirtualLightEngine) and _deposits_per_sensor(engine, pilot) > MOST_PILOTS * PILOT_DEPOSITS:

@@ -156,7 +156,7 @@ class PathEngine:
                 f"a batch of {shape.size:.2e} sums is more than 32-bit indices reach; lower render.memory_limit"
             )
         if self._has_bounces:
-            transport = self.transport(batch, shape, self._lane_order(batch), self._further_every(budget))
+            transport = self.transport(batch, shape, self.lane_order(batch), self._further_every(budget))
             schedule = Schedule(budget, shape.replicas, known_squares)
             mean, variance, per_lane = self._accumulate(batch, shape, transport, schedule, progress)
         else:
@@ -188,7 +188,7 @@ class PathEngine:
         shape = replace(
             self.shape(pilot, self.n_slots), replicas=pilot_replicas(self.options.replicas, pilot.sensors.size)
         )
-        transport = self.transport(pilot, shape, self._lane_order(pilot), self._further_every(budget))
+        transport = self.transport(pilot, shape, self.lane_order(pilot), self._further_every(budget))
 
         def look(schedule: Schedule) -> int:
             return self._accumulate(pilot, shape, transport, schedule, lambda share: None)[2]
@@ -209,7 +209,7 @@ class PathEngine:
     def _accumulate(
         self, batch: Batch | Pilot, shape: HistogramShape, transport: Transport, schedule: Schedule, progress: Progress
     ) -> tuple[np.ndarray, np.ndarray, int]:
-        bounces, points = self.options.bounces, self.sensor_indices(batch)[self._lane_order(batch)]
+        bounces, points = self.options.bounces, self.sensor_indices(batch)[self.lane_order(batch)]
         seed, kernel = self.options.seed, self.kernel
         stage, strata = range(0), Strata.of_stage(range(0), mi.UInt32(0))
 
@@ -284,7 +284,7 @@ class PathEngine:
             further_every=dr.opaque(mi.UInt32, further_every),
         )
 
-    def _lane_order(self, batch: Batch | Pilot) -> NDArray[np.int64]:
+    def lane_order(self, batch: Batch | Pilot) -> NDArray[np.int64]:
         """Return the order in which lanes take a batch's sensor points: rays of a packet start near each other."""
         positions = self.capture.sensor_grid.positions.reshape(-1, 3)[self.sensor_indices(batch)]
         return np.argsort(z_order(positions), kind="stable")
@@ -309,7 +309,7 @@ class PathEngine:
         """Return the variance of H, summed, of a few samples at a few points: in arbitrary units."""
         pilot, nx = pilot_of(self.capture), self.capture.sensor_grid.nx
         replicas = pilot_replicas(self.options.replicas, pilot.sensors.size)
-        shape, order = replace(self.shape(pilot, self.n_slots), replicas=replicas), self._lane_order(pilot)
+        shape, order = replace(self.shape(pilot, self.n_slots), replicas=replicas), self.lane_order(pilot)
         transport, histogram = self.transport(pilot, shape, order, further_every), DeviceHistogram(shape, self.kernel)
         points = self.sensor_indices(pilot)[order]
         turns = first_turns(PILOT_SEED, points, nx, shape.lanes, transport.further_every)

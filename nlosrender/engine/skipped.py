@@ -84,9 +84,7 @@ def _thins_out(engine: VirtualLightEngine | PathEngine, paths: PathEngine) -> bo
     """Return whether paths or walks go on after light can arrive in the window, as far as the bounces tell."""
     if paths.horizon is None:
         return False
-    if isinstance(engine, VirtualLightEngine) and engine.further is not None:
-        return True
-    return traces_paths(engine) and paths.settings.thins_out
+    return makes_walks(engine) or (traces_paths(engine) and paths.settings.thins_out)
 
 
 def _techniques(paths: PathEngine) -> Iterator[Skipped]:
@@ -101,6 +99,11 @@ def _techniques(paths: PathEngine) -> Iterator[Skipped]:
         else:
             why = "hidden geometry surrounds the wall: BSDF sampling alone does better"
         yield Skipped("hidden geometry sampling (MIS)", why)
+
+
+def makes_walks(engine: Engine) -> bool:
+    """Return whether walks give the further bounces."""
+    return isinstance(engine, VirtualLightEngine) and engine.further is not None
 
 
 def traces_paths(engine: Engine) -> bool:

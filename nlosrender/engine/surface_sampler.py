@@ -216,7 +216,7 @@ class SurfaceSampler:
         return mi.Point3f(*(dr.gather(mi.Float, self._corners[3 * k + j], entry, active) for j in range(3)))
 
 
-def _triangles(mesh: mi.Mesh) -> Float64:
+def triangles_of(mesh: mi.Mesh) -> Float64:
     """Return the corners (n, 3, 3) of a mesh's triangles [engine units]."""
     parameters = mi.traverse(mesh)
     vertices = np.asarray(parameters["vertex_positions"], dtype=np.float64).reshape(-1, 3)
@@ -247,7 +247,7 @@ def facing_triangles(built: BuiltScene, mesh: mi.Mesh) -> tuple[Float64, NDArray
 
     Those are left out that turn their dark side to all of the wall. Occlusion by other surfaces is not looked at.
     """
-    triangles = _triangles(mesh)
+    triangles = triangles_of(mesh)
     corners = wall_box(built.wall) / built.unit
     # Shading normals may light a little of a geometric back side.
     one_sided = _is_one_sided(mesh) and not mesh.has_vertex_normals()

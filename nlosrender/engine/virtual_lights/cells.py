@@ -155,10 +155,10 @@ def triangles_of_mesh(built: BuiltScene, index: int, mesh: mi.Mesh) -> Cells:
     return Cells(corners, weights, shading, shapes, primitives, longest_edges(corners), np.zeros(count))
 
 
-def parted(cells: Cells, distance: WallDistance, wall_index: int | None) -> tuple[Cells, Cells]:
+def parted(cells: Cells, distance: WallDistance, wall_index: int | None, least: float = 0.0) -> tuple[Cells, Cells]:
     """Return the cells that ``quartered`` leaves as they are, with their distances, and those that it quarters."""
     distances = _distances(cells, distance, wall_index)
-    large = cells.sizes > distances
+    large = cells.sizes > np.maximum(distances, least)
     return replace(cells, distances=distances).at(~large), cells.at(large)
 
 
@@ -179,18 +179,17 @@ def quartered(cells: Cells, distance: WallDistance, wall_index: int | None, leas
     """
     done: list[Cells] = []
     while len(cells.sizes):
-        distances = _distances(cells, distance, wall_index)
-        large = cells.sizes > np.maximum(distances, least)
-        done.append(replace(cells, distances=distances).at(~large))
-        if not large.any():
+        small, large = parted(cells, distance, wall_index, least)
+        done.append(small)
+        if not len(large.sizes):
             break
-        corners = _quartered(cells.corners[large])
+        corners = _quartered(large.corners)
         cells = Cells(
             corners,
-            _quartered(cells.weights[large]),
-            _quartered(cells.shading[large]),
-            np.tile(cells.shapes[large], 4),
-            np.tile(cells.primitives[large], 4),
+            _quartered(large.weights),
+            _quartered(large.shading),
+            np.tile(large.shapes, 4),
+            np.tile(large.primitives, 4),
             longest_edges(corners),
             np.zeros(len(corners)),
         )

@@ -20,12 +20,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nlosrender.engine.virtual_lights.cells import Cells, middles
-from nlosrender.engine.virtual_lights.grains import Grains, Int64
+from nlosrender.engine.virtual_lights.grains import Grains, Int64, plane_slopes
 from nlosrender.engine.virtual_lights.patches import Patches
 from nlosrender.scene.pose import Float64
 
 STEEPEST = 0.5  # cosine to the lasers, below which members may face away from them
-RIDGE = 1e-6  # of the squared extent: keeps planes through points on a line defined
 PLACE = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])  # in PAIRS
 FINER = 2  # times half the size of the clusters: the grains they are made of
 WORTHWHILE = 4  # cells per grain
@@ -138,9 +137,7 @@ class _Footprint:
         first, second = (upright + 1) % 3, (upright + 2) % 3
         uu, uv, vv = moment(first, first), moment(first, second), moment(second, second)
         uh, vh = moment(first, upright), moment(second, upright)
-        ridge = RIDGE * (uu + vv) + 1e-300
-        determinant = (uu + ridge) * (vv + ridge) - uv**2
-        slopes = np.stack([(vv + ridge) * uh - uv * vh, (uu + ridge) * vh - uv * uh], axis=1) / determinant[:, None]
+        slopes = np.stack(plane_slopes(uu, uv, vv, uh, vh), axis=1)
         return cls(mean, upright, slopes, np.stack([uu, uv, vv], axis=1))
 
     def corners(self) -> Float64:

@@ -141,17 +141,21 @@ class Grains:
 
         u, v, height = (axis - mean(axis) for axis in self.in_box.T)
         uu, uv, vv = mean(u * u), mean(u * v), mean(v * v)
-        ridge = RIDGE * (uu + vv) + 1e-100
-        along_u, along_v = mean(u * height), mean(v * height)
-        determinant = (uu + ridge) * (vv + ridge) - uv**2
-        rise = u * ((vv + ridge) * along_u - uv * along_v) + v * ((uu + ridge) * along_v - uv * along_u)
-        return height - rise / determinant
+        slope_u, slope_v = plane_slopes(uu, uv, vv, mean(u * height), mean(v * height))
+        return height - u * slope_u - v * slope_v
 
     def _slope_variance(self, number: Int64) -> Float64:
         """Return the variance (m,) of the slopes, by area, of the grains in each box that ``number`` (n,) names."""
         total = np.bincount(number, self.areas)
         squares = np.bincount(number, self.areas * np.square(self.slopes).sum(axis=1)) / total
         return squares - sum(np.square(np.bincount(number, self.areas * slope) / total) for slope in self.slopes.T)
+
+
+def plane_slopes(uu: Float64, uv: Float64, vv: Float64, uh: Float64, vh: Float64) -> tuple[Float64, Float64]:
+    """Return the slopes of the best planes through points, from their second moments along u, v and upright."""
+    ridge = RIDGE * (uu + vv) + 1e-100
+    determinant = (uu + ridge) * (vv + ridge) - uv**2
+    return ((vv + ridge) * uh - uv * vh) / determinant, ((uu + ridge) * vh - uv * uh) / determinant
 
 
 def covered_boxes(normals: Float64, areas: Float64, allowed: Float64) -> Float64:

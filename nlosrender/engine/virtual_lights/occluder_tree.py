@@ -9,11 +9,12 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-from numpy.typing import NDArray
 
 from nlosrender.engine.device_arrays import on_device
 from nlosrender.engine.space_filling import z_order
+from nlosrender.engine.surface_sampler import triangles_of
 from nlosrender.engine.virtual_lights.cells import middles, normals_and_areas
+from nlosrender.scene.pose import Float64
 
 LEAF = 8  # triangles
 BOX = 8  # numbers, the last two empty
@@ -43,9 +44,9 @@ class OccluderTree:
         order = np.argsort(z_order(middles(triangles)), kind="stable")
         order = np.append(order, np.repeat(order[-1], max(0, LEAF - len(order))))
         packed = np.empty((len(order), 3, 4), np.float32)
-        packed[:, :, :3] = triangles[order]
+        packed[:, :, :3] = triangles = triangles[order]
         # float64: in float32 the normals of slivers are off by more than what they hide, and those of no area NaN
-        packed[:, :, 3] = normals_and_areas(packed[:, :, :3].astype(np.float64))[0]
+        packed[:, :, 3] = normals_and_areas(triangles)[0]
         n_leaves = 2 ** math.ceil(math.log2(len(order) / LEAF))
         first = np.arange(n_leaves) * len(order) // n_leaves
         a, b, c = (packed[:, k, :3] for k in range(3))
@@ -81,12 +82,10 @@ class OccluderTree:
         return dr.select(up == 1, 0, up)
 
 
-def _triangles(shape: mi.Shape) -> NDArray[np.float32]:
+def _triangles(shape: mi.Shape) -> Float64:
     """Return the triangles (n, 3, 3) of a mesh, or of the box around another shape."""
     if shape.is_mesh():
-        parameters = mi.traverse(shape)
-        vertices = np.asarray(parameters["vertex_positions"], dtype=np.float32).reshape(-1, 3)
-        return vertices[np.asarray(parameters["faces"]).reshape(-1, 3)]
+        return triangles_of(shape)
     box = shape.bbox()
-    corners = np.array([np.ravel(np.asarray(box.corner(k), dtype=np.float32)) for k in range(8)])
+    corners = np.array([np.ravel(np.asarray(box.corner(k), dtype=np.float64)) for k in range(8)])
     return corners[FACES_OF_BOX]

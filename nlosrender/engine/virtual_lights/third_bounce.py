@@ -15,7 +15,6 @@ from nlosrender.engine.device_arrays import on_device
 from nlosrender.engine.histogram import HistogramShape, relative_l2_error
 from nlosrender.engine.path_engine import PathEngine
 from nlosrender.engine.pilot import Pilot
-from nlosrender.engine.space_filling import z_order
 from nlosrender.engine.transport import Transport
 from nlosrender.engine.virtual_lights.block_histogram import BlockHistogram
 from nlosrender.engine.virtual_lights.clearance import Clearances, Outlook, count_sensors
@@ -248,8 +247,7 @@ class ThirdBounce:
 
     def _lanes(self, batch: Batch | Pilot, shape: HistogramShape, lasers: NDArray[np.int64] | None = None) -> _Lanes:
         transport = self.paths.transport(batch, replace(shape, replicas=1))
-        indices = self.paths.sensor_indices(batch)
-        order = np.argsort(z_order(self.paths.capture.sensor_grid.positions.reshape(-1, 3)[indices]), kind="stable")
+        indices, order = self.paths.sensor_indices(batch), self.paths.lane_order(batch)
         lane = dr.arange(mi.UInt32, shape.lanes)
         transport = transport.of_lanes(dr.gather(mi.UInt32, on_device(mi.UInt32, order), lane % shape.sensors))
         replica = lane // shape.sensors
