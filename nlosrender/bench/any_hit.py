@@ -47,9 +47,9 @@ def trace_any_hit(loaded: LoadedScene, lit: LitPatches, *, only_asked: bool = Fa
     built, n_sensors = loaded.built, loaded.capture.n_sensors
     points = loaded.capture.sensor_grid.positions.reshape(-1, 3) / built.unit
     order = np.argsort(z_order(points), kind="stable")
-    sensors, tiles = _device_points(mi, points[order]), on_device(mi.UInt32, lit.tiles[order])
+    sensors, tiles = _device_points(mi, points[order]), on_device(mi.UInt64, lit.tiles[order])
     centres, normals = _device_points(mi, lit.positions), _device_points(mi, lit.normals)
-    clearance = on_device(mi.UInt32, lit.clearance if only_asked else np.zeros_like(lit.clearance))
+    clearance = on_device(mi.UInt64, lit.clearance if only_asked else np.zeros_like(lit.clearance))
     step = max(1, RAYS_PER_LAUNCH // n_sensors)
     dr.eval(sensors, centres, normals)
 
@@ -60,8 +60,8 @@ def trace_any_hit(loaded: LoadedScene, lit: LitPatches, *, only_asked: bool = Fa
         origin = dr.gather(mi.Point3f, sensors, index % n_sensors) + mi.Vector3f(0, 0, WALL_OFFSET)
         towards = dr.gather(mi.Point3f, centres, patch) - origin
         turned = (dr.dot(mi.Vector3f(dr.gather(mi.Point3f, normals, patch)), towards) < 0) & (towards.z > 0)
-        known = dr.gather(mi.UInt32, clearance, patch)
-        turned &= (known & dr.gather(mi.UInt32, tiles, index % n_sensors)) == 0
+        known = dr.gather(mi.UInt64, clearance, patch)
+        turned &= (known & dr.gather(mi.UInt64, tiles, index % n_sensors)) == 0
         ray = mi.Ray3f(origin, towards, mi.Float(1 - SHORT), mi.Float(0), [])
         hit = built.scene.ray_test(ray, coherent=False, active=turned)
         # sums inside the kernel: nothing of the size of the rays is written

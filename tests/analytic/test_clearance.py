@@ -144,9 +144,9 @@ def assert_sound(
     triangles: Array,
     points: Array,
     normals: Array,
-    clearance: NDArray[np.uint32],
+    clearance: NDArray[np.uint64],
     ends: Array,
-    bits: NDArray[np.uint32],
+    bits: NDArray[np.uint64],
 ) -> tuple[int, int]:
     """Check what clearances (n,) say of the ways from ``ends`` (n, m, 3), whose tiles have ``bits``, to the points.
 
@@ -312,14 +312,15 @@ def test_a_sphere_counts_by_its_box() -> None:
 @pytest.mark.usefixtures("eager")
 def test_a_screen_leaves_the_tiles_beside_its_shadow_open() -> None:
     """A screen over the left half of the way hides the point from the left tiles of the wall only."""
-    from nlosrender.engine.virtual_lights.clearance import OF_COLUMN, Outlook
+    from nlosrender.engine.virtual_lights.clearance import OF_COLUMN, TILES, Outlook
 
     # from (0, 0, 1) the screen at half the height, from x = -0.3 to -0.02, hides x from -0.6 to -0.04
     screen = np.array([[[-0.3, -0.5, 0.5], [-0.02, -0.5, 0.5], [-0.02, 0.5, 0.5]]])
     screen = np.concatenate([screen, [[[-0.3, -0.5, 0.5], [-0.02, 0.5, 0.5], [-0.3, 0.5, 0.5]]]])
     down = np.array([[0.0, 0, -1]])
     outlook = Outlook.around([np.array([[-0.5, -0.4, 0], [0.5, 0.4, 0]])], MANY)
-    assert cleared(screen, np.array([[0.0, 0, 1]]), down, down, outlook)[0] == (OF_COLUMN << 2) | (OF_COLUMN << 3)
+    beside = sum(OF_COLUMN << column for column in range(TILES // 2, TILES))
+    assert cleared(screen, np.array([[0.0, 0, 1]]), down, down, outlook)[0] == beside
 
 
 def test_before_a_curved_wall_and_to_few_points_nothing_is_known() -> None:

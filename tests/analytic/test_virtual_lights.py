@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from agreement import assert_agrees, relative_l2
+from numpy.typing import NDArray
 from quadrature import (
     Setup,
     clear_of_rectangle,
@@ -242,40 +243,81 @@ def test_patches_cover_every_surface_once(coarseness: float) -> None:
     assert on_ball.any()
 
 
-@pytest.mark.parametrize(
-    "delays",
-    [(3.2, 3.4, 3.9), (2.0, 2.0, 6.5), (0.7, 5.1, 5.1), (4.25, 4.25, 4.25), (0.1, 2.9, 7.3), (1.5, 9.0, 26.5)],
-)
 # whole blocks of bins, a part of one, more than one; windows that begin after the light or end before it
-@pytest.mark.parametrize(("n_bins", "whole"), [(8, 0), (11, 2), (40, 9), (13, -3), (5, -2), (7, -40), (6, 50)])
-def test_a_triangle_is_spread_over_its_bins_by_area(
-    delays: tuple[float, float, float], n_bins: int, whole: int
-) -> None:
-    """The share of each bin is the part of the triangle whose (linear) delay falls into it; the rest is outside."""
+WINDOWS = [(8, 0), (11, 2), (40, 9), (13, -3), (5, -2), (7, -40), (6, 50)]
+STEPS = 2000  # midpoints of n^2 equal parts: strips along an edge misplace at most 1 / n of the area
+
+
+def spread_shares(delays: tuple[float, ...], is_cluster: bool | None, n_bins: int, whole: int) -> NDArray[np.float64]:
+    """Return the shares of the bins, and what is outside, of a patch with ``delays`` at its corners, times 2."""
     start_backend("llvm")
     import drjit as dr
     import mitsuba as mi
 
     from nlosrender.engine.histogram import HistogramShape
     from nlosrender.engine.virtual_lights.block_histogram import BlockHistogram
-    from nlosrender.engine.virtual_lights.spread import spread_triangle
+    from nlosrender.engine.virtual_lights.spread import Delays, spread_patch
 
     histogram = BlockHistogram(HistogramShape(1, 1, 1, 1, 1, n_bins), np.zeros(1, np.int64))
     # opaque: one kernel per window serves all
-    corners = [dr.opaque(mi.Float, delay) for delay in (delays[1], delays[0], delays[2])]
+    corners = [dr.opaque(mi.Float, delay) for delay in delays]
+    if is_cluster is None:
+        covered = Delays.of_triangle(*corners)
+    else:
+        covered = Delays.of_either(dr.opaque(mi.Bool, is_cluster), mi.Vector4f(*corners))
     zero = mi.UInt32(0)
-    spread_triangle(
-        histogram, zero, zero, mi.Vector3f(*corners), dr.opaque(mi.Int32, whole), mi.Spectrum(2.0), mi.Bool(True)
-    )
-    shares = histogram.on_host().ravel()
-    # midpoints of n^2 equal parts: strips along an edge misplace at most 1 / n of the area
-    n = 2000
-    i, j = np.meshgrid(np.arange(n), np.arange(n))
-    keep = i + j < n
-    u, v = (i[keep] + 1 / 3) / n, (j[keep] + 1 / 3) / n
+    spread_patch(histogram, zero, zero, covered, dr.opaque(mi.Int32, whole), mi.Spectrum(2.0), mi.Bool(True))
+    return histogram.on_host().ravel()
+
+
+@pytest.mark.parametrize("among_clusters", [False, True])
+@pytest.mark.parametrize(
+    "delays",
+    [(3.2, 3.4, 3.9), (2.0, 2.0, 6.5), (0.7, 5.1, 5.1), (4.25, 4.25, 4.25), (0.1, 2.9, 7.3), (1.5, 9.0, 26.5)],
+)
+@pytest.mark.parametrize(("n_bins", "whole"), WINDOWS)
+def test_a_triangle_is_spread_over_its_bins_by_area(
+    delays: tuple[float, float, float], n_bins: int, whole: int, among_clusters: bool
+) -> None:
+    """The share of each bin is the part of the triangle whose (linear) delay falls into it; the rest is outside."""
+    corners = (delays[1], delays[0], delays[2])
+    if among_clusters:
+        shares = spread_shares((*corners, 99.0), False, n_bins, whole)
+    else:
+        shares = spread_shares(corners, None, n_bins, whole)
+    i, j = np.meshgrid(np.arange(STEPS), np.arange(STEPS))
+    keep = i + j < STEPS
+    u, v = (i[keep] + 1 / 3) / STEPS, (j[keep] + 1 / 3) / STEPS
     delay = delays[0] + u * (delays[1] - delays[0]) + v * (delays[2] - delays[0])
     expected = np.histogram(delay + whole, bins=np.arange(n_bins + 1.0))[0] / keep.sum()
-    assert shares[:-1] == pytest.approx(2 * expected, abs=4 / n)
+    assert shares[:-1] == pytest.approx(2 * expected, abs=4 / STEPS)
+    assert shares.sum() == pytest.approx(2.0, rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    "delays",
+    [
+        (3.2, 3.4, 3.9, 3.7),
+        (2.0, 6.5, 6.5, 2.0),  # the delay varies along one side only
+        (4.25, 4.25, 4.25, 4.25),
+        (9.5, 1.5, 18.5, 26.5),
+        (5.0, 2.0, 5.0, 8.0),  # both sides alike: no flat part
+        (1.0, 3.1, 8.0, 5.0),  # not linear: the best linear function is
+    ],
+)
+@pytest.mark.parametrize(("n_bins", "whole"), WINDOWS)
+def test_a_parallelogram_is_spread_over_its_bins_by_area(
+    delays: tuple[float, float, float, float], n_bins: int, whole: int
+) -> None:
+    """The share of each bin is the part whose delay falls into it: the linear one nearest to the corners' delays."""
+    shares = spread_shares(delays, True, n_bins, whole)
+    at = np.array([[1, 0, 0], [1, 1, 0], [1, 1, 1], [1, 0, 1]])
+    base, along, across = np.linalg.lstsq(at, np.array(delays), rcond=None)[0]
+    u, v = np.meshgrid(*[(np.arange(STEPS) + 0.5) / STEPS] * 2)
+    delay = (base + along * u + across * v).ravel()
+    # rounded: equal delays of many points on a bin's edge are on one side of it
+    expected = np.histogram(np.round(delay, 9) + whole, bins=np.arange(n_bins + 1.0))[0] / STEPS**2
+    assert shares[:-1] == pytest.approx(2 * expected, abs=4 / STEPS)
     assert shares.sum() == pytest.approx(2.0, rel=1e-6)
 
 

@@ -22,14 +22,12 @@ import mitsuba as mi
 import numpy as np
 
 from nlosrender.capture.grids import Capture
-from nlosrender.capture.plan import Batch
 from nlosrender.engine.device_arrays import on_device
-from nlosrender.engine.pilot import Pilot
 from nlosrender.engine.virtual_lights.occluder_tree import LEAF, OccluderTree
 from nlosrender.scene.build import BuiltScene
 from nlosrender.scene.pose import Float64
 
-TILES = 4  # along each side of a rectangle: one bit each, row by row
+TILES = 8  # along each side of a rectangle: one bit each, row by row
 OF_ALL = 2**TILES**2 - 1  # the bits
 OF_COLUMN = sum(1 << TILES * row for row in range(TILES))  # the bits of one column
 RISE = 1e-5  # of a point's height over the wall: how far a triangle may rise over the point's plane; rays end before
@@ -54,7 +52,9 @@ class Outlook:
     """Rectangles of a planar wall that points are seen from, each in ``TILES`` x ``TILES`` tiles."""
 
     packed: mi.Float  # four a rectangle: least x and y, width and height of a tile [engine units]
-    n_points: int  # look at each point from a rectangle: whether it is worth while to leave out rays
+    # of the capture that look at each point from a rectangle: whether it is worth while to leave out rays. Not those of
+    # a batch, whose size must not show.
+    n_points: int
 
     @classmethod
     def around(cls, groups: Sequence[Float64], n_points: int) -> Outlook:
@@ -64,27 +64,22 @@ class Outlook:
         return cls(on_device(mi.Float, np.concatenate([least - MARGIN, sizes], axis=1).ravel()), n_points)
 
     @classmethod
-    def of(cls, built: BuiltScene, capture: Capture, batch: Batch | Pilot, *, with_lasers: bool = False) -> Outlook:
+    def of(cls, built: BuiltScene, capture: Capture, *, with_lasers: bool = False) -> Outlook:
         """Return the rectangle around all sensor points, and all laser points if asked for."""
         grids = [capture.sensor_grid, *([capture.laser_grid] if with_lasers else [])]
         points = np.concatenate([grid.positions.reshape(-1, 3) / built.unit for grid in grids])
-        return cls.around([points], count_sensors(capture, batch))
+        return cls.around([points], capture.n_sensors)
 
     def tiles(self, index: mi.UInt32) -> mi.Vector4f:
         """Return least x and y of a rectangle, and width and height of its tiles."""
         return dr.gather(mi.Vector4f, self.packed, index)
 
-    def tile_bit(self, index: mi.UInt32, point: mi.Point3f) -> mi.UInt32:
+    def tile_bit(self, index: mi.UInt32, point: mi.Point3f) -> mi.UInt64:
         """Return the bit of the tile that a point of the wall lies in."""
         left, bottom, width, height = self.tiles(index)
         places = (point.x - left) / width, (point.y - bottom) / height
         column, row = (mi.UInt32(dr.clip(place, 0, TILES - 1)) for place in places)
-        return mi.UInt32(1) << (row * TILES + column)
-
-
-def count_sensors(capture: Capture, batch: Batch | Pilot) -> int:
-    """Return how many sensor points look: those of the capture, not the batch, whose size must not show."""
-    return batch.sensors.size if isinstance(batch, Pilot) else capture.n_sensors
+        return mi.UInt64(1) << mi.UInt64(row * TILES + column)
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,7 +111,7 @@ class Clearances:
         """Return whether anything is known of what ``n_points`` wall points look at."""
         return self.built.wall.is_planar and n_points >= LEAST_POINTS
 
-    def of(self, surface: Surface, outlook: Outlook, where: mi.UInt32, active: mi.Bool) -> mi.UInt32:
+    def of(self, surface: Surface, outlook: Outlook, where: mi.UInt32, active: mi.Bool) -> mi.UInt64:
         """Return the bits of the tiles that each point is open to.
 
         Parameters
@@ -129,22 +124,22 @@ class Clearances:
             The others have none.
         """
         if not self.are_worthwhile(outlook.n_points):
-            return dr.zeros(mi.UInt32, dr.width(surface.points))
+            return dr.zeros(mi.UInt64, dr.width(surface.points))
         active = active & (surface.points.z > 0)
         for shape in self.built.hidden_shapes:
             if not shape.is_mesh():  # a point in its box may be hidden by the shape itself, however near
                 box = shape.bbox()
                 active = active & ~mi.BoundingBox3f(mi.Point3f(box.min), mi.Point3f(box.max)).contains(surface.points)
         view = _View(surface, outlook.tiles(where))
-        clear = dr.select(active, mi.UInt32(OF_ALL) & ~_hidden_tiles(self._tree, view, active), 0)
+        clear = dr.select(active, mi.UInt64(OF_ALL) & ~_hidden_tiles(self._tree, view, active), 0)
         dr.eval(clear)
         return clear
 
 
 @dr.syntax
-def _hidden_tiles(tree: OccluderTree, view: _View, active: mi.Bool) -> mi.UInt32:
+def _hidden_tiles(tree: OccluderTree, view: _View, active: mi.Bool) -> mi.UInt64:
     """Return the bits of the tiles from which some triangle may hide each point."""
-    hidden = mi.UInt32(0)
+    hidden = mi.UInt64(0)
     node = dr.select(active, mi.UInt32(1), 0)
     while dr.hint(node > 0, exclude=[tree, view]):
         # on to the next leaf: points that walked through leaves on their own would wait for one another at each
@@ -180,7 +175,7 @@ class _View:
         self.seen = ~self._tiles_beside(self.points, surface.normals)[1]
         self.before_others = self._tiles_beside(self.points, surface.others)[0]
 
-    def tiles_hidden_by_box(self, low: mi.Point3f, high: mi.Point3f) -> mi.UInt32:
+    def tiles_hidden_by_box(self, low: mi.Point3f, high: mi.Point3f) -> mi.UInt64:
         """Return the bits of the tiles from which triangles in boxes may hide the points."""
         highest = [
             dr.dot(plane, dr.select(plane > 0, high, low) - self.points) for plane in (self.normals, self.others)
@@ -189,7 +184,7 @@ class _View:
         tiles = self._tiles_in(self._shadow_of_box(low, high))
         return dr.select(is_between, self._without_low(tiles, highest[1]), 0)
 
-    def tiles_in_shadow(self, corners: list[mi.Point3f]) -> mi.UInt32:
+    def tiles_in_shadow(self, corners: list[mi.Point3f]) -> mi.UInt64:
         """Return the bits of the tiles from which triangles may hide the points; their own planes are not looked at."""
         ways = [corner - self.points for corner in corners]
         depths = [-way.z for way in ways]
@@ -198,7 +193,7 @@ class _View:
         tiles = self._tiles_in(self._shadow_of_triangle(ways, depths))
         return dr.select(is_between, self._without_low(tiles, highest[1]), 0)
 
-    def _without_low(self, tiles: mi.UInt32, highest: mi.Float) -> mi.UInt32:
+    def _without_low(self, tiles: mi.UInt64, highest: mi.Float) -> mi.UInt64:
         """Return ``tiles`` without those before the points' other planes, for what does not rise over these."""
         return dr.select(highest > self.rise, tiles, tiles & ~self.before_others)
 
@@ -231,13 +226,14 @@ class _View:
             )
         return Rectangle(least + self.feet, most + self.feet)
 
-    def tiles_parted(self, corner: mi.Point3f, normal: mi.Vector3f) -> mi.UInt32:
+    def tiles_parted(self, corner: mi.Point3f, normal: mi.Vector3f) -> mi.UInt64:
         """Return the bits of the tiles that lie on the same side of planes as the points; of all for those in them."""
         height, (before, behind) = dr.dot(normal, self.points - corner), self._tiles_beside(corner, normal)
         parted = dr.select(height > 0, before, behind)
-        return dr.select(dr.abs(height) <= self.rise, OF_ALL, parted)  # no ray crosses a plane that it begins in
+        # no ray crosses a plane that it begins in
+        return dr.select(dr.abs(height) <= self.rise, mi.UInt64(OF_ALL), parted)
 
-    def _tiles_beside(self, point: mi.Point3f, normal: mi.Vector3f) -> tuple[mi.UInt32, mi.UInt32]:
+    def _tiles_beside(self, point: mi.Point3f, normal: mi.Vector3f) -> tuple[mi.UInt64, mi.UInt64]:
         """Return the bits of the tiles that lie before planes, and behind them."""
         edges = [
             [normal[axis] * (self.least[axis] + self.step[axis] * k) for k in range(TILES + 1)] for axis in range(2)
@@ -245,21 +241,21 @@ class _View:
         least, most = (
             [[of(*pair) for pair in pairwise(heights)] for heights in edges] for of in (dr.minimum, dr.maximum)
         )
-        base, before, behind = dr.dot(normal, point), mi.UInt32(0), mi.UInt32(0)
+        base, before, behind = dr.dot(normal, point), mi.UInt64(0), mi.UInt64(0)
         for row, column in np.ndindex(TILES, TILES):
-            bit = mi.UInt32(1 << row * TILES + column)
+            bit = mi.UInt64(1 << row * TILES + column)
             before |= dr.select(least[0][column] + least[1][row] >= base, bit, 0)
             behind |= dr.select(most[0][column] + most[1][row] <= base, bit, 0)
         return before, behind
 
-    def _tiles_in(self, rectangle: Rectangle) -> mi.UInt32:
+    def _tiles_in(self, rectangle: Rectangle) -> mi.UInt64:
         """Return the bits of the tiles that touch a rectangle."""
         least, most = ((end - self.least) / self.step for end in rectangle)
         first = dr.clip(dr.floor(least - SLACK), 0, TILES)
         last = dr.maximum(dr.clip(dr.floor(most + SLACK) + 1, 0, TILES), first)
-        one = mi.UInt32(1)
+        one = mi.UInt64(1)
         columns, rows = (
-            (one << (mi.UInt32(last[axis]) * stride)) - (one << (mi.UInt32(first[axis]) * stride))
+            (one << (mi.UInt64(last[axis]) * stride)) - (one << (mi.UInt64(first[axis]) * stride))
             for axis, stride in enumerate((1, TILES))
         )
         return (columns * OF_COLUMN) & rows & self.seen

@@ -26,7 +26,7 @@ from nlosrender.scene.pose import Float64
 
 STEEPEST = 0.5  # cosine to the lasers, below which members may face away from them
 PLACE = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])  # in PAIRS
-FINER = 2  # times half the size of the clusters: the grains they are made of
+FINER = 1  # times half the size of the clusters: the grains they are made of
 WORTHWHILE = 4  # cells per grain
 
 

@@ -20,28 +20,28 @@ from nlosrender.scene.pose import Float64
 
 
 @dataclass(frozen=True, eq=False)
-class Parts:
-    """Parts of the patches, each gathered by lanes of its own: slices of those of a region, or of all.
-
-    A patch's number within its region decides its slice, so what one laser sends does not depend on the batch's other
-    lasers, whose patches may be others.
-    """
+class Places:
+    """Where patches belong: which region they are of, and their numbers in it."""
 
     regions: NDArray[np.int64]  # (n,) region of each patch, ascending
     numbers: NDArray[np.int64]  # (n,) of each patch within its region
-    slices: int  # lanes that share the patches of a sensor point
 
     @classmethod
-    def of(cls, counts: Sequence[int], slices: int) -> Parts:
-        """Return the parts of ``counts`` patches per region, region after region."""
+    def of(cls, counts: Sequence[int]) -> Places:
+        """Return the places of ``counts`` patches per region, region after region."""
         regions = np.repeat(np.arange(len(counts)), counts)
-        return cls(regions, np.concatenate([np.arange(count) for count in counts]), slices)
+        return cls(regions, np.concatenate([np.arange(count) for count in counts]))
 
-    def sorted(self, patch: NDArray[np.integer]) -> tuple[NDArray[np.integer], NDArray[np.integer]]:
-        """Sort patches by part, within it by number; return them and where each part begins, and the last one ends."""
-        part = (self.regions * self.slices + self.numbers % self.slices)[patch]
+    def in_parts(self, patch: NDArray[np.integer], slices: int) -> tuple[NDArray[np.integer], NDArray[np.integer]]:
+        """Sort patches by part, within it by number; return them and where each part begins, and the last one ends.
+
+        Parts are gathered by lanes of their own: each is one of so many slices of a region. A patch's number within
+        its region decides its slice, so what one laser sends does not depend on the batch's other lasers, whose
+        patches may be others.
+        """
+        part = (self.regions * slices + self.numbers % slices)[patch]
         order = np.lexsort((patch, part))
-        n_parts = (int(self.regions[-1]) + 1) * self.slices
+        n_parts = (int(self.regions[-1]) + 1) * slices
         return patch[order], np.searchsorted(part[order], np.arange(n_parts + 1))
 
 
@@ -49,7 +49,7 @@ class Parts:
 class DevicePatches:
     """Patches on the device, engine units; one lane per patch."""
 
-    parts: Parts
+    places: Places
     number: mi.UInt32  # within its region: with the start, what decides the points its light is asked for
     start: mi.Vector2u  # of the low-discrepancy sequence of these points
     remainder: mi.Vector3f  # of the centre, what float32 rounds off: close to the wall it is more than the distance
@@ -79,14 +79,14 @@ class DevicePatches:
         return Surface(mi.Point3f(interaction.p + points), mi.Vector3f(interaction.n), others)
 
 
-def upload_patches(built: BuiltScene, patches: Patches, parts: Parts, seed: int, is_near: bool) -> DevicePatches:
+def upload_patches(built: BuiltScene, patches: Patches, places: Places, seed: int, is_near: bool) -> DevicePatches:
     """Bring patches to the device, neighbours together, and evaluate their reflectance and shading frames.
 
     Parameters
     ----------
     built, patches
         The scene and what it was cut into, region after region.
-    parts
+    places
         Region of each patch, and its number there.
     seed
         Of the points that stand for their patches where visibility is asked for. A point at random makes a partly
@@ -94,7 +94,7 @@ def upload_patches(built: BuiltScene, patches: Patches, parts: Parts, seed: int,
     is_near
         Whether some patch is so near to a laser or sensor point that float32 positions do not do.
     """
-    patches = patches.at(np.lexsort((z_order(patches.centres), parts.regions)))
+    patches = patches.at(np.lexsort((z_order(patches.centres), places.regions)))
     interaction = surface_at(
         built, patches.centres, patches.normals, patches.shapes, patches.primitives, patches.barycentric
     )
@@ -110,13 +110,13 @@ def upload_patches(built: BuiltScene, patches: Patches, parts: Parts, seed: int,
     # a cluster's members have normals of their own: it is lit and seen by their mean
     frame, own = interaction.sh_frame, mi.Frame3f(mi.Normal3f(interaction.n))
     interaction.sh_frame = dr.select(members.w > 0, own, frame)
-    number, start = on_device(mi.UInt32, parts.numbers), mi.Vector2u(*mi.sample_tea_32(mi.UInt32(seed), mi.UInt32(0)))
+    number, start = on_device(mi.UInt32, places.numbers), mi.Vector2u(*mi.sample_tea_32(mi.UInt32(seed), mi.UInt32(0)))
     dr.make_opaque(start)
     member_normals = mi.Vector3f(to_points(patches.member_normals))
     dr.eval(interaction, reflectance, remainder, corners, areas, lift, members, member_normals)
     has_clusters = bool(patches.is_cluster.any())
     return DevicePatches(
-        parts,
+        places,
         number,
         start,
         remainder,

@@ -41,7 +41,7 @@ class SiteTable:
 
     packed: mi.Float  # eight a site: position, first impulse; normal times area, end of the impulses
     shading: mi.Normal3f
-    clearance: mi.UInt32  # see ``Clearances.of``
+    clearance: mi.UInt64  # see ``Clearances.of``
     first: mi.UInt32  # per replica: its sites are first[r] to first[r + 1]
 
 
@@ -129,7 +129,7 @@ class FurtherBounces:
         impulses = walk_back(plan, transport, sites, self.tried, int(state[1]))
         if not impulses.count:
             return
-        outlook = Outlook.of(self.built, self.paths.capture, batch)
+        outlook = Outlook.of(self.built, self.paths.capture)
         table = self._table(plan, sites, impulses, outlook)
         lowest = mi.UInt32(THIRD_BOUNCE + 1)
         slots = dr.minimum(impulses.bounces - lowest, shape.slots - 1) if self.options.bounces.split else lowest * 0
@@ -150,7 +150,7 @@ class FurtherBounces:
         rows[:, 0:3], rows[:, 3] = sites.positions[used], as_float[0]
         rows[:, 4:7], rows[:, 7] = sites.normals[used] * sites.areas[used, None], as_float[1]
         shading = mi.Normal3f(to_points(sites.normals[used]))
-        clearance = mi.UInt32(0)
+        clearance = mi.UInt64(0)
         if self.clearances is not None:
             surface = Surface(to_points(sites.positions[used]), mi.Vector3f(shading), mi.Vector3f(shading))
             where, active = dr.zeros(mi.UInt32, len(used)), dr.full(mi.Bool, True, len(used))
@@ -199,7 +199,7 @@ def _gather_impulses(
         weight *= dr.maximum(-dr.dot(areas, direction), 0) / distance2
         active = dr.any(weight > 0)
         if dr.hint(needs_visibility, mode="scalar"):
-            clearance = dr.gather(mi.UInt32, table.clearance, site)
+            clearance = dr.gather(mi.UInt64, table.clearance, site)
             active = is_visible(built, sensor, to_site, active, clearance, tile)
 
         # ---- Deposit its impulses ------------------------------------------------------------------------------------

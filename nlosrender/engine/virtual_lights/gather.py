@@ -15,7 +15,7 @@ from nlosrender.engine.device_arrays import WallPoints
 from nlosrender.engine.transport import Transport
 from nlosrender.engine.virtual_lights.block_histogram import BlockHistogram
 from nlosrender.engine.virtual_lights.lights import ROWS, GatherSettings, Lights, four_corners, is_visible
-from nlosrender.engine.virtual_lights.spread import spread_triangle
+from nlosrender.engine.virtual_lights.spread import Delays, spread_patch
 
 
 @dr.syntax
@@ -26,7 +26,7 @@ def gather_third_bounce(
     histogram: BlockHistogram,
     lane: mi.UInt32,
     part: mi.UInt32,
-    tile: mi.UInt32,
+    tile: mi.UInt64,
 ) -> None:
     """Deposit the third bounce: lane by lane over the patches of its part.
 
@@ -96,7 +96,7 @@ def gather_third_bounce(
         if dr.hint(settings.needs_visibility, mode="scalar"):
             # in front of the plane through the point that is looked at, not through the centre
             way = from_sensor + shown
-            clearance = dr.select(dr.dot(areas, way) < 0, mi.UInt32(rows[4].w), 0)
+            clearance = dr.select(dr.dot(areas, way) < 0, dr.gather(mi.UInt64, lights.clearance, patch), 0)
             active = is_visible(built, sensor, way, active, clearance, tile)
 
         # ---- Reflect towards the lasers and deposit ----------------------------------------------------------------
@@ -179,14 +179,12 @@ def _spread(
     is_cluster: mi.Bool | None,
     active: mi.Bool,
 ) -> None:
-    """Deposit a patch: one triangle, or the two halves of a cluster's parallelogram."""
-    a, b, c, d = delays
+    """Deposit a patch: a triangle, or a cluster's parallelogram."""
     if is_cluster is None:
-        spread_triangle(histogram, lane, laser, mi.Vector3f(a, b, c), whole, value, active)
-        return
-    value = value * dr.select(is_cluster, mi.Float(0.5), 1)
-    spread_triangle(histogram, lane, laser, mi.Vector3f(a, b, c), whole, value, active)
-    spread_triangle(histogram, lane, laser, mi.Vector3f(a, c, d), whole, value, active & is_cluster)
+        covered = Delays.of_triangle(delays.x, delays.y, delays.z)
+    else:
+        covered = Delays.of_either(is_cluster, delays)
+    spread_patch(histogram, lane, laser, covered, whole, value, active)
 
 
 def _remainder(lights: Lights, patch: mi.UInt32) -> mi.Vector3f:

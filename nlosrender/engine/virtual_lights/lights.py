@@ -30,14 +30,20 @@ class GatherSettings:
     needs_visibility: bool  # something may lie between wall and patches
     has_one_laser: bool  # in the whole capture, however it is cut
 
+    @property
+    def lights_once(self) -> bool:
+        """Whether the patches of all batches send on the same light."""
+        return self.has_one_laser or self.is_confocal
+
 
 @dataclass(frozen=True, eq=False)
 class Lights:
     """What the gather's loop reads: patches that are lit, packed so that one load brings four numbers."""
 
     # 20 a patch: three corners, each with one component of normal times area; the centre, and 1 for a cluster; from it
-    # to where rays from sensor points end, and its clearance, see ``Clearances.of``
+    # to where rays from sensor points end, and 0
     packed: mi.Float
+    clearance: mi.UInt64  # there, see ``Clearances.of``
     remainder: mi.Float | None  # four a patch: what float32 rounds off the centre; None where that does not count
     shading: mi.Normal3f  # shading normals
     interaction: mi.SurfaceInteraction3f  # at the centres; not read for Lambertian patches
@@ -57,16 +63,27 @@ class Clearing:
     clearances: Clearances
     outlook: Outlook  # a rectangle per region of the patches
 
-    def of(self, patches: DevicePatches, seen_at: mi.Vector3f, active: mi.Bool) -> mi.UInt32:
+    def of(self, patches: DevicePatches, seen_at: mi.Vector3f, active: mi.Bool) -> mi.UInt64:
         """Return the clearance of patches where rays end, see ``Clearances.of``."""
-        where = on_device(mi.UInt32, patches.parts.regions)
+        where = on_device(mi.UInt32, patches.places.regions)
         return self.clearances.of(patches.surface(seen_at), self.outlook, where, active)
 
 
-def light_patches(
+@dataclass(frozen=True, eq=False)
+class Illuminated:
+    """Patches and what the lasers of a batch send them; those of confocal captures are lit as they are gathered."""
+
+    patches: DevicePatches
+    arriving: mi.Spectrum  # index = laser * n_patches + patch; see ``Lights``
+    is_lit: mi.Bool  # by any of the lasers
+    seen_at: mi.Vector3f  # from the centres to where sensor points look at them
+    clearance: mi.UInt64  # there, see ``Clearances.of``
+
+
+def illuminate(
     settings: GatherSettings, transport: Transport, patches: DevicePatches, clearing: Clearing, n_lasers: int
-) -> Lights:
-    """Return the patches that some laser of the batch lights; confocal captures keep all and light them as they go.
+) -> Illuminated:
+    """Light patches.
 
     Parameters
     ----------
@@ -80,20 +97,28 @@ def light_patches(
         Lasers of the batch.
     """
     count = dr.width(patches.areas)
-    lit = dr.arange(mi.UInt32, count)
-    arriving, delays, seen_at = mi.Spectrum(0), mi.Float(0), patches.points(patches.number)
+    arriving, seen_at = mi.Spectrum(0), patches.points(patches.number)
     dr.eval(seen_at)
-    clearance, is_lit = dr.zeros(mi.UInt32, count), dr.full(mi.Bool, True, count)
+    clearance, is_lit = dr.zeros(mi.UInt64, count), dr.full(mi.Bool, True, count)
     if settings.needs_visibility and not settings.has_one_laser:
         clearance = clearing.of(patches, seen_at, is_lit)
     if not settings.is_confocal:
         arriving, is_lit, seen_at = _illuminate(settings, transport, patches, clearing, seen_at, clearance, n_lasers)
-        lit = dr.compress(is_lit)
-        if not dr.width(lit):
-            lit = mi.UInt32(0)  # all is dark: one dark patch, since arrays of no length cannot be read
     if settings.needs_visibility and settings.has_one_laser:
         clearance = clearing.of(patches, seen_at, is_lit)
-    lit, first = (on_device(mi.UInt32, values) for values in patches.parts.sorted(np.array(lit.numpy())))
+    return Illuminated(patches, arriving, is_lit, seen_at, clearance)
+
+
+def lights_of(
+    settings: GatherSettings, transport: Transport, illuminated: Illuminated, slices: int, n_lasers: int
+) -> Lights:
+    """Return what the gather reads: the patches that are lit, in as many parts per region as there are ``slices``."""
+    patches, arriving, delays = illuminated.patches, illuminated.arriving, mi.Float(0)
+    count = dr.width(patches.areas)
+    lit = dr.compress(illuminated.is_lit)
+    if not dr.width(lit):
+        lit = mi.UInt32(0)  # all is dark: one dark patch, since arrays of no length cannot be read
+    lit, first = (on_device(mi.UInt32, values) for values in patches.places.in_parts(np.array(lit.numpy()), slices))
     if not settings.is_confocal:
         index = dr.arange(mi.UInt32, dr.width(lit) * n_lasers)
         n_lit = dr.opaque(mi.UInt32, dr.width(lit))  # as a constant it would be part of the kernel
@@ -108,9 +133,9 @@ def light_patches(
         dr.gather(mi.SurfaceInteraction3f, patches.interaction, lit),
     )
     is_cluster = dr.gather(mi.Vector4f, patches.members, lit).w
-    shown = dr.gather(mi.Vector3f, seen_at, lit)
-    clear = mi.Float(dr.gather(mi.UInt32, clearance, lit))
-    rows = [(a, areas.x), (b, areas.y), (c, areas.z), (interaction.p, is_cluster), (shown, clear)]
+    shown = dr.gather(mi.Vector3f, illuminated.seen_at, lit)
+    clearance = dr.gather(mi.UInt64, illuminated.clearance, lit)
+    rows = [(a, areas.x), (b, areas.y), (c, areas.z), (interaction.p, is_cluster), (shown, mi.Float(0))]
     packed = dr.zeros(mi.Float, 4 * ROWS * dr.width(lit))
     lane = dr.arange(mi.UInt32, dr.width(lit))
     for k, (point, fourth) in enumerate(rows):
@@ -120,9 +145,10 @@ def light_patches(
         rest = dr.gather(mi.Vector3f, patches.remainder, lit)
         remainder = dr.ravel(mi.Vector4f(rest.x, rest.y, rest.z, 0))
     reflectance = dr.gather(mi.Spectrum, patches.reflectance, lit) * dr.inv_pi
-    dr.eval(packed, remainder, arriving, delays, interaction, reflectance)
+    dr.eval(packed, clearance, remainder, arriving, delays, interaction, reflectance)
     return Lights(
         packed,
+        clearance,
         remainder,
         interaction.sh_frame.n,
         interaction,
@@ -141,7 +167,7 @@ def _illuminate(
     patches: DevicePatches,
     clearing: Clearing,
     seen_at: mi.Vector3f,
-    clearance: mi.UInt32,
+    clearance: mi.UInt64,
     n_lasers: int,
 ) -> tuple[mi.Spectrum, mi.Bool, mi.Vector3f]:
     """Light every patch by every laser: emission, distance, and the share of the patch that is not in shadow.
@@ -182,7 +208,7 @@ def _illuminate(
         way = to_rounded + dr.gather(mi.Vector3f, seen_at, patch)
         tile = clearing.outlook.tile_bit(mi.UInt32(0), lit.p)
         is_before = dr.dot(dr.gather(mi.Vector3f, patches.areas, patch), way) < 0  # the plane through that point
-        clear = dr.select(is_before, dr.gather(mi.UInt32, clearance, patch), 0)
+        clear = dr.select(is_before, dr.gather(mi.UInt64, clearance, patch), 0)
         seen = dr.select(is_visible(built, lit, way, active, clear, tile), mi.Float(1), 0)
     arriving = dr.select(active, arriving * seen, 0)
     brightest = dr.zeros(mi.Float, n_patches)
@@ -221,8 +247,8 @@ def is_visible(
     wall_point: mi.SurfaceInteraction3f,
     way: mi.Vector3f,
     active: mi.Bool,
-    clearance: mi.UInt32 | None = None,
-    tile: mi.UInt32 | None = None,
+    clearance: mi.UInt64 | None = None,
+    tile: mi.UInt64 | None = None,
 ) -> mi.Bool:
     """Return whether nothing lies on the way from a point of the wall to a point of a hidden surface.
 

@@ -69,7 +69,7 @@ class Tessellator:
         self.regions = regions_of(capture, built.unit, self.distance, joined, whole) if may_divide else None
         self.shared = whole if self.regions is None else self.regions.shared
         self._is_hidden = whole.is_hidden
-        self._kept = lru_cache(maxsize=4)(self._make)
+        self._kept = lru_cache(maxsize=2)(self._make)
 
     def patches(self, coarseness: float) -> Patches:
         """Return patches whose error is of order ``coarseness`` squared; those of the last calls are kept if few.

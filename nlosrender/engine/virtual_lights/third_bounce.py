@@ -17,12 +17,20 @@ from nlosrender.engine.path_engine import PathEngine
 from nlosrender.engine.pilot import Pilot
 from nlosrender.engine.transport import Transport
 from nlosrender.engine.virtual_lights.block_histogram import BlockHistogram
-from nlosrender.engine.virtual_lights.clearance import Clearances, Outlook, count_sensors
-from nlosrender.engine.virtual_lights.device_patches import Parts, upload_patches
+from nlosrender.engine.virtual_lights.clearance import Clearances, Outlook
+from nlosrender.engine.virtual_lights.device_patches import Places, upload_patches
 from nlosrender.engine.virtual_lights.gather import gather_third_bounce
-from nlosrender.engine.virtual_lights.lights import ROWS, Clearing, GatherSettings, Lights, light_patches
+from nlosrender.engine.virtual_lights.lights import (
+    ROWS,
+    Clearing,
+    GatherSettings,
+    Illuminated,
+    Lights,
+    illuminate,
+    lights_of,
+)
 from nlosrender.engine.virtual_lights.patches import Patches
-from nlosrender.engine.virtual_lights.tessellator import MAX_PATCHES, Tessellator
+from nlosrender.engine.virtual_lights.tessellator import MAX_PATCHES, MOST_KEPT, Tessellator
 
 FIRST_COARSENESS = 1.0
 NEAR = 1e-3  # engine units: the centres of nearer patches are rounded by more than 1e-4 of their distance
@@ -55,8 +63,8 @@ class LitPatches:
 
     positions: NDArray[np.float64]  # (n, 3) where rays from sensor points end
     normals: NDArray[np.float64]  # (n, 3)
-    clearance: NDArray[np.uint32]  # (n,) see ``Clearances.of``
-    tiles: NDArray[np.uint32]  # (sensors,) bit of the tile that each sensor point lies in, numbered as in the batch
+    clearance: NDArray[np.uint64]  # (n,) see ``Clearances.of``
+    tiles: NDArray[np.uint64]  # (sensors,) bit of the tile that each sensor point lies in, numbered as in the batch
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,6 +107,7 @@ class ThirdBounce:
         self.paths, self.tessellator, self.settings, self.lanes = paths, tessellator, settings, lanes
         self.is_reciprocal = is_reciprocal
         self.clearances = Clearances(paths.built)
+        self._kept: dict[float, Illuminated] = {}  # per coarseness
 
     def gather(self, batch: Batch | Pilot, coarseness: float) -> Gathered:
         """Gather a batch at one resolution."""
@@ -139,19 +148,20 @@ class ThirdBounce:
         lanes = self._lanes(batch, shape, lasers)
         histogram = BlockHistogram(shape, lanes.order)
         if len(patches):
-            outlook = self._outlook(batch)
-            lights = self._lights(lanes.transport, shape, patches, Parts.of([len(patches)], shape.replicas), outlook)
+            outlook = self._outlook()
+            lights = self._shared_lights(lanes.transport, shape, coarseness, patches)
             tile = outlook.tile_bit(mi.UInt32(0), lanes.transport.sensors.interaction.p)
             gather_third_bounce(self.settings, lanes.transport, lights, histogram, lanes.index, lanes.replica, tile)
         for labels, near in self.tessellator.regional_patches(coarseness, np.unique(lanes.regions).tolist()):
-            parts = Parts.of([len(one) for one in near], shape.replicas)
-            if not len(parts.numbers):  # nothing is close to the wall there
+            places = Places.of([len(one) for one in near])
+            if not len(places.numbers):  # nothing is close to the wall there
                 continue
             chosen = np.flatnonzero(np.isin(lanes.regions, labels))
             part = np.searchsorted(labels, lanes.regions[chosen]) * shape.replicas + chosen // shape.sensors
             index = on_device(mi.UInt32, chosen)
-            some, outlook = lanes.transport.of_lanes(index), self._outlook(batch, labels)
-            lights = self._lights(some, shape, Patches.joined(near), parts, outlook)
+            some, outlook = lanes.transport.of_lanes(index), self._outlook(labels)
+            illuminated = self._illuminate(some, shape, Patches.joined(near), places, outlook)
+            lights = lights_of(self.settings, some, illuminated, shape.replicas, shape.lasers)
             tile = outlook.tile_bit(on_device(mi.UInt32, part // shape.replicas), some.sensors.interaction.p)
             gather_third_bounce(self.settings, some, lights, histogram, index, on_device(mi.UInt32, part), tile)
         return histogram
@@ -159,32 +169,43 @@ class ThirdBounce:
     def lit_patches(self, batch: Batch | Pilot, coarseness: float) -> LitPatches:
         """Return the patches that the gather of a batch goes through, in its order; those all sensor points share."""
         shape = self.shape(batch)
-        lanes, patches = self._lanes(batch, shape), self.tessellator.patches(coarseness)
-        parts, outlook = Parts.of([len(patches)], shape.replicas), self._outlook(batch)
-        lights = self._lights(lanes.transport, shape, patches, parts, outlook)
+        lanes, patches, outlook = self._lanes(batch, shape), self.tessellator.patches(coarseness), self._outlook()
+        lights = self._shared_lights(lanes.transport, shape, coarseness, patches)
         rows = np.array(lights.packed, np.float32).reshape(-1, ROWS, 4)
         ends, normals = (rows[:, ROWS - 2] + rows[:, ROWS - 1])[:, :3], np.array(lights.interaction.n, np.float64).T
-        tiles = np.empty(shape.sensors, np.uint32)
+        tiles = np.empty(shape.sensors, np.uint64)
         bits = np.array(outlook.tile_bit(mi.UInt32(0), lanes.transport.sensors.interaction.p))
         tiles[lanes.order] = bits[: shape.sensors]
-        return LitPatches(ends.astype(np.float64), normals, rows[:, ROWS - 1, 3].astype(np.uint32), tiles)
+        return LitPatches(ends.astype(np.float64), normals, np.array(lights.clearance), tiles)
 
-    def _lights(
-        self, transport: Transport, shape: HistogramShape, patches: Patches, parts: Parts, outlook: Outlook
+    def _shared_lights(
+        self, transport: Transport, shape: HistogramShape, coarseness: float, patches: Patches
     ) -> Lights:
-        is_near = self.tessellator.nearest < NEAR
-        on_device = upload_patches(self.paths.built, patches, parts, self.paths.options.seed, is_near)
-        return light_patches(self.settings, transport, on_device, Clearing(self.clearances, outlook), shape.lasers)
+        """Return what all sensor points gather; patches are kept lit where that serves other batches, too."""
+        illuminated = self._kept.get(coarseness)
+        if illuminated is None:
+            illuminated = self._illuminate(transport, shape, patches, Places.of([len(patches)]), self._outlook())
+            if self.settings.lights_once and len(patches) <= MOST_KEPT:
+                # a batch looks at two resolutions
+                self._kept = dict([*self._kept.items(), (coarseness, illuminated)][-2:])
+        return lights_of(self.settings, transport, illuminated, shape.replicas, shape.lasers)
 
-    def _outlook(self, batch: Batch | Pilot, regions: list[int] | None = None) -> Outlook:
+    def _illuminate(
+        self, transport: Transport, shape: HistogramShape, patches: Patches, places: Places, outlook: Outlook
+    ) -> Illuminated:
+        is_near = self.tessellator.nearest < NEAR
+        on_device = upload_patches(self.paths.built, patches, places, self.paths.options.seed, is_near)
+        return illuminate(self.settings, transport, on_device, Clearing(self.clearances, outlook), shape.lasers)
+
+    def _outlook(self, regions: list[int] | None = None) -> Outlook:
         """Return what patches are seen from: all points, or the sensor points of some regions."""
         built, capture = self.paths.built, self.paths.capture
         if regions is None or self.tessellator.regions is None:
-            return Outlook.of(built, capture, batch, with_lasers=not self.settings.has_one_laser)
+            return Outlook.of(built, capture, with_lasers=not self.settings.has_one_laser)
         labels = self.tessellator.regions.labels
         points = capture.sensor_grid.positions.reshape(-1, 3) / built.unit
         groups = [points[labels == label] for label in regions]
-        return Outlook.around(groups, count_sensors(capture, batch) // len(self.tessellator.regions.near))
+        return Outlook.around(groups, capture.n_sensors // len(self.tessellator.regions.near))
 
     def pair(self, batch: Batch | Pilot, fineness: float) -> tuple[Gathered, Gathered]:
         """Gather a batch at ``fineness`` and at the coarser resolution it is compared with."""

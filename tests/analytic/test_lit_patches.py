@@ -1,0 +1,101 @@
+"""Patches are lit once for all batches that send them the same light, and for no others."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from rendering import flat_wall
+from varied_scenes import Stage
+
+from nlosrender.capture.plan import Batch, Tile
+from nlosrender.engine.backend import start_backend
+
+DIFFUSE = {"type": "diffuse", "reflectance": 0.6}
+PLATE = {
+    "type": "rectangle",
+    "width": 0.8,
+    "height": 0.6,
+    "center": [-0.3, 0, 1],
+    "normal": [0, 0, -1],
+    "bsdf": DIFFUSE,
+}
+BACK = PLATE | {"center": [-0.3, 0, 1]}
+SCREEN = PLATE | {"width": 0.2, "height": 0.2, "center": [0.1, 0, 0.5]}
+GRIDS = {"sensors": (6, 4), "lasers": (3, 2)}
+LEFT, RIGHT = Tile(0, 4, 0, 3), Tile(0, 4, 3, 6)
+ONE = Tile(0, 1, 0, 1)
+# of each scan: batches of a capture
+BATCHES = {
+    "single": (Batch(LEFT, ONE), Batch(RIGHT, ONE)),
+    "confocal": (Batch(LEFT, LEFT), Batch(RIGHT, RIGHT)),
+    "exhaustive": (Batch(LEFT, Tile(0, 2, 0, 1)), Batch(LEFT, Tile(0, 2, 1, 3)), Batch(RIGHT, Tile(0, 2, 0, 3))),
+}
+
+
+def gather_of(scan: str) -> Any:
+    """Return the gather of a new engine before a plate and a screen that hides a part of it."""
+    return Stage.of(flat_wall(BACK, SCREEN, scan=scan, engine="virtual_lights", spp=None, **GRIDS)).engine.third
+
+
+@pytest.fixture
+def lighting(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """Return the list that the number of patches is added to whenever some are lit."""
+    start_backend("llvm")
+    from nlosrender.engine.virtual_lights import third_bounce
+
+    lit: list[int] = []
+    illuminate: Callable[..., Any] = third_bounce.illuminate
+
+    def counted(*arguments: Any) -> Any:
+        illuminated = illuminate(*arguments)
+        lit.append(len(np.array(illuminated.is_lit)))
+        return illuminated
+
+    monkeypatch.setattr(third_bounce, "illuminate", counted)
+    return lit
+
+
+@pytest.mark.parametrize("scan", BATCHES)
+def test_a_batch_after_others_says_what_it_says_alone(scan: str) -> None:
+    """Bit for bit, whatever an engine has gathered before: shards of a capture are engines of their own."""
+    one = gather_of(scan)
+    for batch in BATCHES[scan]:
+        for coarseness in (0.8, 0.5):
+            values = one.gather(batch, coarseness).values
+            np.testing.assert_array_equal(values, gather_of(scan).gather(batch, coarseness).values)
+            assert values.any()
+
+
+@pytest.mark.parametrize("scan", ["single", "confocal"])
+def test_one_laser_lights_each_resolution_once(scan: str, lighting: list[int]) -> None:
+    """Two resolutions are gathered of every batch, the pilot has gathered some before."""
+    from nlosrender.engine.pilot import pilot_of
+
+    third = gather_of(scan)
+    for batch in (pilot_of(third.paths.capture), *BATCHES[scan]):
+        for coarseness in (0.8, 0.5):
+            third.gather(batch, coarseness)
+    assert len(lighting) == len(set(lighting)) == 2
+
+
+def test_other_lasers_light_patches_anew(lighting: list[int]) -> None:
+    """What patches send on is the light of the batch's own lasers."""
+    third = gather_of("exhaustive")
+    for batch in BATCHES["exhaustive"]:
+        third.gather(batch, 0.5)
+    assert len(lighting) == len(BATCHES["exhaustive"])
+
+
+def test_many_patches_are_not_kept(monkeypatch: pytest.MonkeyPatch, lighting: list[int]) -> None:
+    """They would take more memory than the plan counts."""
+    from nlosrender.engine.virtual_lights import third_bounce
+
+    monkeypatch.setattr(third_bounce, "MOST_KEPT", 10)
+    third = gather_of("single")
+    for batch in BATCHES["single"]:
+        third.gather(batch, 0.5)
+    assert len(lighting) == 2
+    assert min(lighting) > 10
