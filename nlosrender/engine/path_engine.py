@@ -97,24 +97,7 @@ class PathEngine:
         self.reason = reason
         self.built, self.capture, self.time_axis, self.options = built, capture, time_axis, options
         self.sampler = SurfaceSampler(built)
-        self.hidden_fraction = 0.0
-        if options.hidden_fraction is not None:
-            self.hidden_fraction = options.hidden_fraction
-        elif options.hidden_geometry_sampling:
-            self.hidden_fraction = best_hidden_fraction(built, self.sampler, capture, time_axis)
-        flags = [shape.bsdf().flags() for shape in built.hidden_shapes]
-        self.settings = PathSettings(
-            bounces=options.bounces,
-            first_bounce=first_bounce,
-            hidden_fraction=self.hidden_fraction,
-            laser_sampling=options.laser_sampling,
-            russian_roulette=options.russian_roulette,
-            spot_radius=capture.laser_spot_radius / built.unit,
-            needs_visibility=not self._sees_everything(),
-            has_transmission=any(bool(flag & mi.BSDFFlags.Transmission) for flag in flags),
-            only_normals_matter=only_normals_matter(built),
-        )
-        self.integrator = load_path_integrator(self.settings)
+        self.first_bounce = first_bounce
         # Throughput is per (engine unit)^2: H falls with the square of a scene's size.
         self.scale = capture.laser_energy / built.unit**2
         self.kernel = TemporalKernel(options.temporal_kernel_bins) if options.temporal_kernel_bins > 0 else None
@@ -122,6 +105,38 @@ class PathEngine:
         thins_out = options.late_roulette and light_leaves_window(built, capture, time_axis, options.bounces)
         self.horizon = Horizon.of(built, capture, time_axis) if thins_out else None
         self.compile_seconds = 0.0
+
+    # Made when they are needed: an engine that only lends its points to a gather samples no surfaces.
+
+    @cached_property
+    def hidden_fraction(self) -> float:
+        """Share of hidden geometry sampling at a vertex of the wall."""
+        if self.options.hidden_fraction is not None:
+            return self.options.hidden_fraction
+        if not self.options.hidden_geometry_sampling:
+            return 0.0
+        return best_hidden_fraction(self.built, self.sampler, self.capture, self.time_axis)
+
+    @cached_property
+    def settings(self) -> PathSettings:
+        """What the integrator computes, and how."""
+        flags = [shape.bsdf().flags() for shape in self.built.hidden_shapes]
+        return PathSettings(
+            bounces=self.options.bounces,
+            first_bounce=self.first_bounce,
+            hidden_fraction=self.hidden_fraction,
+            laser_sampling=self.options.laser_sampling,
+            russian_roulette=self.options.russian_roulette,
+            spot_radius=self.capture.laser_spot_radius / self.built.unit,
+            needs_visibility=not self._sees_everything(),
+            has_transmission=any(bool(flag & mi.BSDFFlags.Transmission) for flag in flags),
+            only_normals_matter=only_normals_matter(self.built),
+        )
+
+    @cached_property
+    def integrator(self) -> mi.Integrator:
+        """Mitsuba's plugin that traces the paths."""
+        return load_path_integrator(self.settings)
 
     def render(
         self,
@@ -204,7 +219,7 @@ class PathEngine:
     @property
     def _has_bounces(self) -> bool:
         highest = self.options.bounces.max_bounces
-        return highest is None or highest >= self.settings.first_bounce
+        return highest is None or highest >= self.first_bounce
 
     def _accumulate(
         self, batch: Batch | Pilot, shape: HistogramShape, transport: Transport, schedule: Schedule, progress: Progress

@@ -7,6 +7,7 @@ cumulative distribution picks an entry and hands its remainder on, so that low-d
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import drjit as dr
 import mitsuba as mi
@@ -47,57 +48,35 @@ class SurfaceSampler:
     """
 
     def __init__(self, built: BuiltScene):
-        shapes = built.scene.shapes()
-        corners: list[Float64] = []
-        owners: list[NDArray[np.uint32]] = []
-        primitives: list[NDArray[np.uint32]] = []
-        analytic: list[tuple[int, float]] = []
-        self.covers_everything = True
-        self.dark_behind = True  # no surface reflects at points whose geometric normal points away
-        for index, shape in enumerate(shapes):
-            if shape.id() == WALL_ID:
-                continue
-            # Shading normals may light a little of a geometric back side.
-            self.dark_behind &= _is_one_sided(shape) and not (shape.is_mesh() and shape.has_vertex_normals())
-            if shape.is_mesh():
-                triangles, kept = facing_triangles(built, shape)
-                # neighbours in the table are neighbours in space: so are points with near first coordinates
-                order = np.argsort(z_order(triangles.mean(axis=1)), kind="stable")
-                triangles, kept = triangles[order], kept[order]
-                corners.append(triangles)
-                owners.append(np.full(len(kept), index, np.uint32))
-                primitives.append(kept)
-            elif shape.class_name() in SAMPLEABLE_PLUGINS:
-                analytic.append((index, float(np.ravel(shape.surface_area())[0])))
-            else:
-                self.covers_everything = False
-        triangles = np.concatenate(corners) if corners else np.zeros((0, 3, 3))
-        areas = (
-            np.linalg.norm(np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]), axis=-1) / 2
+        self._built = built
+        hidden = [shape for shape in built.scene.shapes() if shape.id() != WALL_ID]
+        self._analytic = [shape for shape in hidden if not shape.is_mesh() and shape.class_name() in SAMPLEABLE_PLUGINS]
+        self.has_analytic = bool(self._analytic)
+        self.covers_everything = all(shape.is_mesh() or shape.class_name() in SAMPLEABLE_PLUGINS for shape in hidden)
+        # No surface reflects at points whose geometric normal points away. Shading normals may light a little there.
+        self.dark_behind = all(
+            _is_one_sided(shape) and not (shape.is_mesh() and shape.has_vertex_normals()) for shape in hidden
         )
-        self.n_triangles = len(triangles)
-        self.has_analytic = bool(analytic)
-        self._analytic = [shapes[index] for index, _ in analytic]
-        owner = np.concatenate([*owners, np.array([index for index, _ in analytic], np.uint32)]).astype(np.uint32)
-        areas = np.concatenate([areas, [area for _, area in analytic]])
-        self.area = float(areas.sum())  # engine units squared
-        self.is_empty = self.area <= 0
-        if self.is_empty:
-            return
-        cumulative = np.minimum(np.rint(np.cumsum(areas) / self.area * _FULL), _FULL - 1)
-        # entry i covers the integers [edges[i], edges[i + 1]); the last one also takes 2^32 - 1
-        self._edges = mi.UInt32(np.concatenate([[0], cumulative]).astype(np.uint32))
-        # a guide for the search (Chen & Asau 1974): the entry at the start of each of 2^k equal parts of the integers
-        self._guide_bits = min(max((len(areas) - 1).bit_length() + 1, 1), MOST_GUIDE_BITS)
-        parts = np.arange(2**self._guide_bits, dtype=np.uint64) << np.uint64(32 - self._guide_bits)
-        guide = np.append(np.searchsorted(cumulative[:-1], parts, side="right"), len(areas) - 1)
-        self._guide = on_device(mi.UInt32, guide)
-        self._owner = mi.UInt32(owner)
-        if self.n_triangles:
-            self._primitive = mi.UInt32(np.concatenate(primitives))
-            self._corners = [mi.Float(triangles[:, i, j].astype(np.float32)) for i in range(3) for j in range(3)]
-        self._shapes = built.scene.shapes_dr()
-        dr.eval(self._edges, self._owner)
+
+    @cached_property
+    def _table(self) -> _Table:
+        """Made when it is needed: a gather alone has no use for it, and it takes a second per million triangles."""
+        return _Table.of(self._built)
+
+    @property
+    def n_triangles(self) -> int:
+        """Triangles that are sampled."""
+        return self._table.n_triangles
+
+    @property
+    def area(self) -> float:
+        """Area of all surfaces that are sampled [engine units squared]."""
+        return self._table.area
+
+    @property
+    def is_empty(self) -> bool:
+        """Whether there is nothing to sample."""
+        return self.area <= 0
 
     def sample(self, bits: mi.UInt32, v: mi.Float, active: mi.Bool) -> SurfaceSample:
         """Sample a point with density 1 / ``area`` over the sampled surfaces.
@@ -111,13 +90,15 @@ class SurfaceSampler:
         active
             Lanes that need a sample.
         """
-        entry = self._entry(bits, active)
-        low = dr.gather(mi.UInt32, self._edges, entry, active)
-        high = dr.gather(mi.UInt32, self._edges, entry + 1, active)
+        table, entry = self._table, self._entry(bits, active)
+        low = dr.gather(mi.UInt32, table.edges, entry, active)
+        high = dr.gather(mi.UInt32, table.edges, entry + 1, active)
         u = dr.minimum(
             (mi.Float(bits - low) + 0.5) / dr.maximum(mi.Float(high - low), 1.0), dr.one_minus_epsilon(mi.Float)
         )
-        shape = dr.gather(mi.ShapePtr, self._shapes, dr.gather(mi.UInt32, self._owner, entry, active), active)
+        shape = dr.gather(
+            mi.ShapePtr, self._built.scene.shapes_dr(), dr.gather(mi.UInt32, self._table.owner, entry, active), active
+        )
         is_triangle = entry < self.n_triangles
         point, normal, primitive = mi.Point3f(0), mi.Normal3f(0), mi.UInt32(ANALYTIC)
         within = mi.Point2f(0)
@@ -128,7 +109,9 @@ class SurfaceSampler:
             within = mi.Point2f(root * (1 - v), root * v)
             point = a + (b - a) * within.x + (c - a) * within.y
             normal = mi.Normal3f(dr.cross(b - a, c - a))
-            primitive = dr.select(on_triangle, dr.gather(mi.UInt32, self._primitive, entry, on_triangle), ANALYTIC)
+            primitive = dr.select(
+                on_triangle, dr.gather(mi.UInt32, self._table.primitive, entry, on_triangle), ANALYTIC
+            )
         if self.has_analytic:
             on_analytic = active & ~is_triangle
             at, facing = self._on_analytic(shape, entry, mi.Point2f(u, v), on_analytic)
@@ -138,12 +121,12 @@ class SurfaceSampler:
     @dr.syntax
     def _entry(self, bits: mi.UInt32, active: mi.Bool) -> mi.UInt32:
         """Return the entry that covers the integers ``bits``: few steps, for the guide says where it may be."""
-        part = bits >> (32 - self._guide_bits)
-        low = dr.gather(mi.UInt32, self._guide, part, active)
-        high = dr.gather(mi.UInt32, self._guide, part + 1, active)
+        part = bits >> (32 - self._table.guide_bits)
+        low = dr.gather(mi.UInt32, self._table.guide, part, active)
+        high = dr.gather(mi.UInt32, self._table.guide, part + 1, active)
         while dr.hint(active & (low < high), exclude=[self, bits, active]):
             middle = (low + high) >> 1
-            is_beyond = dr.gather(mi.UInt32, self._edges, middle + 1, active) <= bits
+            is_beyond = dr.gather(mi.UInt32, self._table.edges, middle + 1, active) <= bits
             low = dr.select(is_beyond, middle + 1, low)
             high = dr.select(is_beyond, high, middle)
         return low
@@ -213,7 +196,61 @@ class SurfaceSampler:
         return point, normal
 
     def _corner(self, k: int, entry: mi.UInt32, active: mi.Bool) -> mi.Point3f:
-        return mi.Point3f(*(dr.gather(mi.Float, self._corners[3 * k + j], entry, active) for j in range(3)))
+        return mi.Point3f(*(dr.gather(mi.Float, self._table.corners[3 * k + j], entry, active) for j in range(3)))
+
+
+@dataclass(frozen=True, eq=False)
+class _Table:
+    """Entries of what is sampled: triangles, then analytic shapes; the arrays are made for entries only."""
+
+    n_triangles: int
+    area: float  # engine units squared
+    edges: mi.UInt32  # entry i covers the integers [edges[i], edges[i + 1]); the last one also takes 2^32 - 1
+    guide_bits: int
+    guide: mi.UInt32  # entry at the start of each of 2^guide_bits equal parts of the integers (Chen & Asau 1974)
+    owner: mi.UInt32  # shape of each entry
+    primitive: mi.UInt32  # of each triangle within its shape
+    corners: list[mi.Float]  # nine, of the triangles
+
+    @classmethod
+    def of(cls, built: BuiltScene) -> _Table:
+        """Return the table of a scene."""
+        corners = [np.zeros((0, 3, 3))]
+        owners, primitives, analytic_areas = [np.zeros(0, np.uint32)], [np.zeros(0, np.uint32)], [np.zeros(0)]
+        analytic_owners: list[int] = []
+        for index, shape in enumerate(built.scene.shapes()):
+            if shape.id() == WALL_ID:
+                continue
+            if shape.is_mesh():
+                triangles, kept = facing_triangles(built, shape)
+                # neighbours in the table are neighbours in space: so are points with near first coordinates
+                order = np.argsort(z_order(triangles.mean(axis=1)), kind="stable")
+                corners.append(triangles[order])
+                owners.append(np.full(len(kept), index, np.uint32))
+                primitives.append(kept[order])
+            elif shape.class_name() in SAMPLEABLE_PLUGINS:
+                analytic_owners.append(index)
+                analytic_areas.append(np.ravel(shape.surface_area())[:1].astype(np.float64))
+        triangles = np.concatenate(corners)
+        areas = np.linalg.norm(np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]), axis=-1)
+        areas = np.concatenate([areas / 2, *analytic_areas])
+        area = float(areas.sum())
+        cumulative = np.minimum(np.rint(np.cumsum(areas) / max(area, 1e-300) * _FULL), _FULL - 1)
+        guide_bits = min(max((len(areas) - 1).bit_length() + 1, 1), MOST_GUIDE_BITS)
+        parts = np.arange(2**guide_bits, dtype=np.uint64) << np.uint64(32 - guide_bits)
+        guide = np.append(np.searchsorted(cumulative[:-1], parts, side="right"), len(areas) - 1)
+        table = cls(
+            len(triangles),
+            area,
+            mi.UInt32(np.concatenate([[0], cumulative]).astype(np.uint32)),
+            guide_bits,
+            on_device(mi.UInt32, guide),
+            mi.UInt32(np.concatenate([*owners, np.array(analytic_owners, np.uint32)])),
+            mi.UInt32(np.concatenate(primitives)),
+            [mi.Float(triangles[:, i, j].astype(np.float32)) for i in range(3) for j in range(3)],
+        )
+        dr.eval(table.edges, table.owner)
+        return table
 
 
 def triangles_of(mesh: mi.Mesh) -> Float64:
@@ -237,9 +274,10 @@ def _visible_from(
         visible &= triangles[:, :, 2].max(axis=1) > 0  # nothing behind the wall's plane is lit or seen
     if not one_sided:
         return visible
-    # A plane has the whole box behind it when it has every corner of the box behind it.
-    height = np.einsum("ckj,kj->ck", wall_corners[:, None, :] - triangles[None, :, 0, :], normals)
-    return visible & (height.max(axis=0) > 0)
+    # A plane has the whole box behind it when it has the box's corner farthest along its normal behind it.
+    low, high = wall_corners.min(axis=0), wall_corners.max(axis=0)
+    farthest = np.where(normals > 0, high, low) - triangles[:, 0]
+    return visible & (np.einsum("nx,nx->n", farthest, normals) > 0)
 
 
 def facing_triangles(built: BuiltScene, mesh: mi.Mesh) -> tuple[Float64, NDArray[np.uint32]]:

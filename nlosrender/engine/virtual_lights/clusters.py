@@ -20,12 +20,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nlosrender.engine.virtual_lights.cells import Cells, middles
-from nlosrender.engine.virtual_lights.grains import Grains, Int64, plane_slopes
+from nlosrender.engine.virtual_lights.grains import BoxPlane, Grains, Int64
 from nlosrender.engine.virtual_lights.patches import Patches
 from nlosrender.scene.pose import Float64
 
 STEEPEST = 0.5  # cosine to the lasers, below which members may face away from them
-PLACE = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])  # in PAIRS
 FINER = 1  # times half the size of the clusters: the grains they are made of
 WORTHWHILE = 4  # cells per grain
 
@@ -117,28 +116,21 @@ def _as_one(merged: Grains, towards: Float64) -> tuple[Float64, Float64]:
 
 @dataclass(frozen=True, eq=False)
 class _Footprint:
-    """Where clusters lie: middles, steepness, and second moments across the axes their boxes stand on."""
+    """Where clusters lie: across the axes their boxes stand on, and on the best planes through their members."""
 
-    mean: Float64  # (n, 3)
-    upright: Int64  # (n,) that axis
-    slopes: Float64  # (n, 2) of the best plane through the members, along the two axes that follow
-    moments: Float64  # (n, 3) about the middle: of the first of them, mixed, of the second
+    upright: Int64  # (n,) these axes
+    plane: BoxPlane
 
     @classmethod
     def of(cls, merged: Grains) -> _Footprint:
         """Return where the members lie."""
-        sums = merged.places[:, 1:] / np.maximum(merged.areas, 1e-300)[:, None]
-        mean, upright, rows = sums[:, :3], merged.facing // 2, np.arange(len(merged))
+        upright = merged.facing // 2
+        return cls(upright, BoxPlane.of(merged.places, upright))
 
-        def moment(one: Int64, other: Int64) -> Float64:
-            """Return the second moments along two axes about the middles."""
-            return sums[rows, 3 + PLACE[one, other]] - mean[rows, one] * mean[rows, other]
-
-        first, second = (upright + 1) % 3, (upright + 2) % 3
-        uu, uv, vv = moment(first, first), moment(first, second), moment(second, second)
-        uh, vh = moment(first, upright), moment(second, upright)
-        slopes = np.stack(plane_slopes(uu, uv, vv, uh, vh), axis=1)
-        return cls(mean, upright, slopes, np.stack([uu, uv, vv], axis=1))
+    @property
+    def mean(self) -> Float64:
+        """Middles (n, 3)."""
+        return self._from_box(self.plane.mean)
 
     def corners(self) -> Float64:
         """Return three corners (n, 3, 3) in a row of parallelograms with these moments.
@@ -146,19 +138,25 @@ class _Footprint:
         The moments of one spanned by 2 p and 2 q are (p p^T + q q^T) / 3, so p and q are the columns of a Cholesky
         factor of 3 times the moments: a rectangle stays that rectangle.
         """
-        uu, uv, vv = 3 * self.moments.T
+        uu, uv, vv = 3 * self.plane.moments.T
         first = np.sqrt(np.maximum(uu, 0))
         shear = uv / np.maximum(first, 1e-300)
         second = np.sqrt(np.maximum(vv - shear**2, 0))
         p, q = self._on_plane(first, shear), self._on_plane(np.zeros_like(second), second)
-        return np.stack([self.mean - p - q, self.mean + p - q, self.mean + p + q], axis=1)
+        mean = self.mean
+        return np.stack([mean - p - q, mean + p - q, mean + p + q], axis=1)
 
     def _on_plane(self, one: Float64, other: Float64) -> Float64:
         """Return steps (n, 3) in the planes, of given components along the two axes after ``upright``."""
-        rows, steps = np.arange(len(one)), np.empty_like(self.mean)
-        steps[rows, (self.upright + 1) % 3], steps[rows, (self.upright + 2) % 3] = one, other
-        steps[rows, self.upright] = one * self.slopes[:, 0] + other * self.slopes[:, 1]
-        return steps
+        up = one * self.plane.slopes[:, 0] + other * self.plane.slopes[:, 1]
+        return self._from_box(np.stack([one, other, up], axis=1))
+
+    def _from_box(self, vectors: Float64) -> Float64:
+        """Return vectors (n, 3) given along the two axes after ``upright``, and along it."""
+        rows, result = np.arange(len(vectors)), np.empty_like(vectors)
+        for turn, component in zip((1, 2, 0), vectors.T, strict=True):
+            result[rows, (self.upright + turn) % 3] = component
+        return result
 
 
 def _unit(vectors: Float64) -> Float64:

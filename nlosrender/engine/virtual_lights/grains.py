@@ -17,6 +17,7 @@ SLOPES = 3.0  # width of the classes that slopes within a box are sorted into wh
 RIDGE = 1e-6  # of the squared extent: keeps planes through points on a line defined
 SLIVER = 0.3  # of a box: less than that joins the box beside it
 PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))  # axes of the second moments
+PLACE = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])  # in PAIRS
 
 # what a step in each of the keys of a box adds to its code; any odd numbers without a pattern do
 STEPS = np.array(
@@ -134,15 +135,12 @@ class Grains:
 
     def _off_plane(self, number: Int64) -> Float64:
         """Return the heights (n,) of grains over the best plane through all in the box that ``number`` (n,) names."""
-        total = np.maximum(np.bincount(number, self.areas), 1e-300)
-
-        def mean(values: Float64) -> Float64:
-            return (np.bincount(number, self.areas * values) / total)[number]
-
-        u, v, height = (axis - mean(axis) for axis in self.in_box.T)
-        uu, uv, vv = mean(u * u), mean(u * v), mean(v * v)
-        slope_u, slope_v = plane_slopes(uu, uv, vv, mean(u * height), mean(v * height))
-        return height - u * slope_u - v * slope_v
+        places: Float64 = np.stack([np.bincount(number, column) for column in self.places.T], axis=1)
+        upright = np.empty(len(places), np.int64)
+        upright[number] = self.facing // 2
+        plane = BoxPlane.of(places, upright)
+        u, v, height = (self.in_box - plane.mean[number]).T
+        return height - u * plane.slopes[number, 0] - v * plane.slopes[number, 1]
 
     def _slope_variance(self, number: Int64) -> Float64:
         """Return the variance (m,) of the slopes, by area, of the grains in each box that ``number`` (n,) names."""
@@ -151,11 +149,30 @@ class Grains:
         return squares - sum(np.square(np.bincount(number, self.areas * slope) / total) for slope in self.slopes.T)
 
 
-def plane_slopes(uu: Float64, uv: Float64, vv: Float64, uh: Float64, vh: Float64) -> tuple[Float64, Float64]:
-    """Return the slopes of the best planes through points, from their second moments along u, v and upright."""
-    ridge = RIDGE * (uu + vv) + 1e-100
-    determinant = (uu + ridge) * (vv + ridge) - uv**2
-    return ((vv + ridge) * uh - uv * vh) / determinant, ((uu + ridge) * vh - uv * uh) / determinant
+@dataclass(frozen=True, eq=False)
+class BoxPlane:
+    """The best planes through what lies in boxes, as far as it reaches, and its second moments."""
+
+    mean: Float64  # (n, 3) middles: across in two directions, and upright
+    slopes: Float64  # (n, 2) along these two directions
+    moments: Float64  # (n, 3) about the middles: of the first direction, mixed, of the second
+
+    @classmethod
+    def of(cls, places: Float64, upright: Int64) -> BoxPlane:
+        """Return the planes of sums (n, 10) as ``Grains.places``, with the axes (n,) that the boxes stand on."""
+        sums, rows = places[:, 1:] / np.maximum(places[:, :1], 1e-300), np.arange(len(places))
+        axes = [(upright + 1) % 3, (upright + 2) % 3, upright]
+        mean = np.stack([sums[rows, axis] for axis in axes], axis=1)
+
+        def moment(one: int, other: int) -> Float64:
+            """Return the second moments along two axes about the middles."""
+            return sums[rows, 3 + PLACE[axes[one], axes[other]]] - mean[:, one] * mean[:, other]
+
+        uu, uv, vv, uh, vh = moment(0, 0), moment(0, 1), moment(1, 1), moment(0, 2), moment(1, 2)
+        ridge = RIDGE * (uu + vv) + 1e-100
+        determinant = (uu + ridge) * (vv + ridge) - uv**2
+        slopes = ((vv + ridge) * uh - uv * vh) / determinant, ((uu + ridge) * vh - uv * uh) / determinant
+        return cls(mean, np.stack(slopes, axis=1), np.stack([uu, uv, vv], axis=1))
 
 
 def covered_boxes(normals: Float64, areas: Float64, allowed: Float64) -> Float64:
