@@ -9,6 +9,7 @@ from typing import Any
 from nlosrender.errors import FileError
 
 FAR = "never"
+NOTABLE = 0.1  # of the CPU time: setting up the engine is shown apart
 
 
 def write_json(path: Path, report: dict[str, Any]) -> None:
@@ -46,6 +47,10 @@ def table(report: dict[str, Any]) -> str:
         steps = ", ".join(f"{n:g}: {s:.3g}" for n, s in zip(scaling["sizes"], scaling["seconds"], strict=True))
         exponent = "" if scaling["exponent"] is None else f"  ~ size^{scaling['exponent']:.2f} over the last sizes"
         lines.append(f"  {scaling['quantity']} ({scaling['setting']}): {steps}{exponent}")
+        parts = list(zip(scaling["sizes"], scaling["cpu_seconds"], scaling["setup_seconds"], strict=True))
+        if any(setup > NOTABLE * cpu for _, cpu, setup in parts):
+            split = ", ".join(f"{n:g}: {cpu - setup:.3g} + {setup:.3g}" for n, cpu, setup in parts)
+            lines.append(f"    CPU seconds, the second number for setting up the engine: {split}")
     if report["rates"]:
         lines += ["", "gather against Embree's any-hit queries on the same pairs of sensor point and patch"]
     for rate in report["rates"]:

@@ -49,6 +49,7 @@ class Run:
     """One render: what came out and what it cost.
 
     ``seconds`` and ``cpu_seconds`` (all threads) cover setting up the engine and rendering, not loading the scene.
+    ``setup_seconds`` are CPU seconds, too: of what grows with the scene and is done once whatever the error asked for.
     """
 
     values: Float64  # (laser, row, column, bin) H summed over bounces
@@ -57,6 +58,7 @@ class Run:
     estimate: float | None = None  # the engine's own estimate of its relative L2 error
     samples: int = 0  # paths per sensor point
     engine: str = ""
+    setup_seconds: float = 0.0
 
 
 @dataclass
@@ -121,6 +123,7 @@ def render(loaded: LoadedScene, budget: Budget, seed: int = 0, options: Mapping[
         The result is not finite, or does not fit the memory.
     """
     from nlosrender.engine.histogram import relative_l2_error
+    from nlosrender.engine.virtual_lights.engine import VirtualLightEngine
 
     config = loaded.scene.config(split_bounces=False, seed=seed, **(options or {}))
     values = np.zeros(loaded.shape)
@@ -128,6 +131,9 @@ def render(loaded: LoadedScene, budget: Budget, seed: int = 0, options: Mapping[
     samples: list[int] = []
     timer = Timer()
     plan, engine = pipeline.prepare(config, loaded.backend, loaded.built, loaded.capture, loaded.time_axis)
+    if isinstance(engine, VirtualLightEngine):
+        engine.set_up()
+    _, setup_seconds = timer.read()
     for batch in plan.batches:
         histogram = engine.render(batch, budget)
         sensors = np.s_[batch.sensors.y0 : batch.sensors.y1, batch.sensors.x0 : batch.sensors.x1]
@@ -140,7 +146,7 @@ def render(loaded: LoadedScene, budget: Budget, seed: int = 0, options: Mapping[
         samples.append(histogram.samples)
     seconds, cpu_seconds = timer.read()
     estimate = relative_l2_error(noise, squares)
-    return Run(values, seconds, cpu_seconds, estimate, min(samples), engine.name)
+    return Run(values, seconds, cpu_seconds, estimate, min(samples), engine.name, setup_seconds)
 
 
 def chosen_engine(loaded: LoadedScene) -> str:

@@ -32,6 +32,8 @@ class Scaling:
     setting: str
     sizes: tuple[float, ...]
     seconds: tuple[float, ...]
+    cpu_seconds: tuple[float, ...]  # of all threads
+    setup_seconds: tuple[float, ...]  # CPU seconds of these, see ``Run``
     engines: tuple[str, ...]
 
     @property
@@ -65,7 +67,7 @@ def _axes(folder: Path) -> list[tuple[str, str, Sequence[float], Callable[[int],
         return wavy_sheet(mesh)
 
     return [
-        ("triangles", "32 x 32 sensor points, 700 bins", (200, 1800, 16200, 64800, 259200), sheet),
+        ("triangles", "32 x 32 sensor points, 700 bins", (200, 1000, 5000, 50_000, 500_000), sheet),
         ("sensor points", "plate, 320 bins", (256, 1024, 4096, 16384), lambda n: plate(round(n**0.5))),
         ("lasers", "plate, 16 x 16 sensor points", (1, 4, 16, 64), lambda n: many_lasers(round(n**0.5))),
         ("bins", "plate, 64 x 64 sensor points, same window", (160, 320, 640, 1280), lambda n: plate(n_bins=n)),
@@ -82,7 +84,7 @@ def _measure(
     quantity: str, setting: str, sizes: Sequence[float], scene_of: Callable[[int], BenchScene], seconds: float
 ) -> Scaling:
     begun = Timer()
-    measured: list[tuple[float, float, str]] = []
+    measured: list[tuple[float, float, float, float, str]] = []
     for size in sizes:
         if len(measured) >= 2:
             growth = measured[-1][1] / measured[-2][1]
@@ -95,7 +97,11 @@ def _measure(
         runs = [render(loaded, Budget(target_error=TARGET), seed, {"engine": "auto"}) for seed in range(2)]
         if runs[1].seconds < SHORT:  # the first run compiles; long runs are not repeated
             runs += [render(loaded, Budget(target_error=TARGET), 2 + k, {"engine": "auto"}) for k in range(REPEATS - 1)]
-        measured.append((size, statistics.median(run.seconds for run in runs[1:]), runs[0].engine))
+        median = [
+            statistics.median(getattr(run, name) for run in runs[1:])
+            for name in ("seconds", "cpu_seconds", "setup_seconds")
+        ]
+        measured.append((size, *median, runs[0].engine))
     return Scaling(quantity, setting, *(tuple(column) for column in zip(*measured, strict=True)))
 
 

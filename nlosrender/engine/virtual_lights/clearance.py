@@ -107,6 +107,10 @@ class Clearances:
     def _tree(self) -> OccluderTree:
         return OccluderTree.of(self.built.hidden_shapes)
 
+    def set_up(self) -> None:
+        """Make the tree."""
+        _ = self._tree
+
     def are_worthwhile(self, n_points: int) -> bool:
         """Return whether anything is known of what ``n_points`` wall points look at."""
         return self.built.wall.is_planar and n_points >= LEAST_POINTS

@@ -57,6 +57,10 @@ class Merger:
         """How many clusters the cells (n,) are at coarseness 1; their number goes with coarseness^-2."""
         return self._cells.boxes
 
+    def set_up(self) -> None:
+        """Sum up the cells at all resolutions at which that leaves far fewer."""
+        self._grains_of(2.0**-FINER)
+
     def clusters(self, chosen: NDArray[np.bool_], coarseness: float, seed: int = 0) -> Patches:
         """Return the clusters of the cells that are ``chosen``.
 

@@ -85,6 +85,15 @@ class VirtualLightEngine:
         self.reason = f"Lambertian surfaces before a {'planar' if built.wall.is_planar else 'curved'} wall"
         self._settled: dict[Budget, Budget] = {}
 
+    def set_up(self) -> None:
+        """Make what all resolutions and batches share, else made when it is first needed: it grows with the triangles.
+
+        Sums over small cells, and the tree of what may hide something.
+        """
+        self.tessellator.set_up()
+        if self.settings.needs_visibility and self.third.clearances.are_worthwhile(self.capture.n_sensors):
+            self.third.clearances.set_up()
+
     @property
     def has_further_bounces(self) -> bool:
         """Whether bounces above the third are asked for."""

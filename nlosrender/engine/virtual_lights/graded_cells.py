@@ -53,6 +53,11 @@ class GradedCells:
         wall = grading.wall_index
         self.is_hidden = np.ones(len(cells.shapes), bool) if wall is None else cells.shapes != wall
 
+    @property
+    def has_small_cells(self) -> bool:
+        """Whether some cells are merged at coarseness 1, the coarsest resolution there is."""
+        return bool((self._ratios < MERGED).any())
+
     def patches(self, coarseness: float) -> list[Patches]:
         """Return patches whose error is of order ``coarseness`` squared, in parts."""
         is_small = self._ratios < MERGED * coarseness

@@ -71,6 +71,11 @@ class Tessellator:
         self._is_hidden = whole.is_hidden
         self._kept = lru_cache(maxsize=2)(self._make)
 
+    def set_up(self) -> None:
+        """Sum up the cells that are merged at any resolution, if there are any."""
+        if self.shared.has_small_cells:
+            self.shared.merger.set_up()
+
     def patches(self, coarseness: float) -> Patches:
         """Return patches whose error is of order ``coarseness`` squared; those of the last calls are kept if few.
 
