@@ -69,6 +69,7 @@ def gather_rate(loaded: LoadedScene) -> GatherRate:
     fineness = engine.settle(Budget(target_error=GATHER_TARGET)).fineness or 1.0
     spent = []
     for _ in range(REPEATS + 1):  # the first run compiles
+        engine.third.forget()  # lighting is a part of it
         timer = Timer()
         for batch in plan.batches:
             engine.third.gather(batch, fineness)

@@ -76,6 +76,7 @@ def _of_gather(loaded: LoadedScene) -> Iterator[Saving]:
     fineness = engine.settle(Budget(target_error=GATHER_TARGET)).fineness or 1.0
 
     def gather() -> Float64:
+        engine.third.forget()  # visibility is a part of lighting, too
         return np.concatenate([engine.third.gather(batch, fineness).values for batch in plan.batches], axis=3)
 
     if not engine.settings.needs_visibility:
@@ -159,6 +160,12 @@ def _of_paths(loaded: LoadedScene) -> Iterator[Saving]:
         tracing = engine_with()
         tracing.integrator = load_path_integrator(replace(engine.settings, needs_visibility=True))
         yield _saving("rays of paths where nothing can lie between", loaded, render(engine), render(tracing))
+    by_bsdf = engine_with(hidden_geometry_sampling=False)
+    if by_bsdf.hidden_box is not None:
+        tracing = engine_with(hidden_geometry_sampling=False)
+        tracing.hidden_box = None
+        what = "rays of paths that pass the hidden geometry by (BSDF sampling)"
+        yield _saving(what, loaded, render(by_bsdf), render(tracing))
     if engine.hidden_fraction in (0.0, 1.0):
         kept = "hidden geometry" if engine.hidden_fraction else "BSDF"
         mixed = engine_with(hidden_fraction=MIXTURE)

@@ -12,11 +12,14 @@ from nlosrender.capture.grids import Capture
 from nlosrender.capture.time_axis import TimeAxis
 from nlosrender.engine.connections import offset_origin
 from nlosrender.engine.device_arrays import sensor_points
+from nlosrender.engine.hidden_box import HiddenBox
 from nlosrender.engine.surface_sampler import SurfaceSampler
 from nlosrender.scene.build import BuiltScene
 
 NEAR_RATIO = 4.0  # hidden area over pi times (its distance from the wall)^2 above which its density is too peaked
 SURROUNDED = 0.75  # share of the hemisphere above which BSDF sampling alone does better
+OFTEN = 0.2  # of the rays from the wall miss the box: asking it costs less than it saves
+BOX_MARGIN = 1e-5  # of the largest coordinate: float32 places of surfaces are within it
 
 
 def best_hidden_fraction(built: BuiltScene, sampler: SurfaceSampler, capture: Capture, time_axis: TimeAxis) -> float:
@@ -34,6 +37,23 @@ def best_hidden_fraction(built: BuiltScene, sampler: SurfaceSampler, capture: Ca
 
 def surrounded_share(built: BuiltScene, capture: Capture, time_axis: TimeAxis) -> float:
     """Return the cosine-weighted share of directions from the sensor points that meet hidden geometry."""
+    is_met = built.scene.ray_test(_rays_from_sensors(built, capture, time_axis))
+    return float(dr.mean(dr.select(is_met, mi.Float(1), 0))[0])
+
+
+def box_often_missed(built: BuiltScene, capture: Capture, time_axis: TimeAxis) -> HiddenBox | None:
+    """Return the box around the hidden geometry, or None where few rays from the wall miss it."""
+    if not built.wall.is_planar or built.hidden_bounds is None:
+        return None
+    least, most = (np.asarray(corner, dtype=np.float64) / built.unit for corner in built.hidden_bounds)
+    margin = BOX_MARGIN * (1 + max(np.abs(least).max(), np.abs(most).max()))
+    box = HiddenBox.of(least - margin, most + margin)
+    is_missed = box.is_missed(_rays_from_sensors(built, capture, time_axis))
+    return box if float(dr.mean(dr.select(is_missed, mi.Float(1), 0))[0]) > OFTEN else None
+
+
+def _rays_from_sensors(built: BuiltScene, capture: Capture, time_axis: TimeAxis) -> mi.Ray3f:
+    """Return 64 rays, stratified by the cosine, from each of at most 64 sensor points."""
     grid = capture.sensor_grid
     n_points = grid.positions.shape[0] * grid.positions.shape[1]
     index = np.linspace(0, n_points - 1, min(n_points, 64)).astype(np.uint32)
@@ -43,5 +63,4 @@ def surrounded_share(built: BuiltScene, capture: Capture, time_axis: TimeAxis) -
     k = lanes % 64
     stratified = mi.Point2f((mi.Float(k % 8) + 0.5) / 8, (mi.Float(k // 8) + 0.5) / 8)
     direction = si.to_world(mi.warp.square_to_cosine_hemisphere(stratified))
-    ray = mi.Ray3f(offset_origin(built, si, direction), direction)
-    return float(dr.mean(dr.select(built.scene.ray_test(ray), mi.Float(1), 0))[0])
+    return mi.Ray3f(offset_origin(built, si, direction), direction)

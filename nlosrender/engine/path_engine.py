@@ -26,7 +26,8 @@ from nlosrender.engine.further_paths import (
     best_every,
     first_turns,
 )
-from nlosrender.engine.hidden_share import best_hidden_fraction
+from nlosrender.engine.hidden_box import HiddenBox
+from nlosrender.engine.hidden_share import best_hidden_fraction, box_often_missed
 from nlosrender.engine.histogram import DeviceHistogram, Histogram, HistogramShape
 from nlosrender.engine.path_integrator import load_path_integrator
 from nlosrender.engine.pilot import Pilot, pilot_of
@@ -134,6 +135,13 @@ class PathEngine:
         )
 
     @cached_property
+    def hidden_box(self) -> HiddenBox | None:
+        """Box around the hidden geometry; None where few rays from the wall miss it, or all are sent to points."""
+        if self.hidden_fraction > 0:
+            return None
+        return box_often_missed(self.built, self.capture, self.time_axis)
+
+    @cached_property
     def integrator(self) -> mi.Integrator:
         """Mitsuba's plugin that traces the paths."""
         return load_path_integrator(self.settings)
@@ -171,7 +179,7 @@ class PathEngine:
                 f"a batch of {shape.size:.2e} sums is more than 32-bit indices reach; lower render.memory_limit"
             )
         if self._has_bounces:
-            transport = self.transport(batch, shape, self.lane_order(batch), self._further_every(budget))
+            transport = self._of_paths(batch, shape, self._further_every(budget))
             schedule = Schedule(budget, shape.replicas, known_squares)
             mean, variance, per_lane = self._accumulate(batch, shape, transport, schedule, progress)
         else:
@@ -203,7 +211,7 @@ class PathEngine:
         shape = replace(
             self.shape(pilot, self.n_slots), replicas=pilot_replicas(self.options.replicas, pilot.sensors.size)
         )
-        transport = self.transport(pilot, shape, self.lane_order(pilot), self._further_every(budget))
+        transport = self._of_paths(pilot, shape, self._further_every(budget))
 
         def look(schedule: Schedule) -> int:
             return self._accumulate(pilot, shape, transport, schedule, lambda share: None)[2]
@@ -257,9 +265,8 @@ class PathEngine:
         batch: Batch | Pilot,
         shape: HistogramShape,
         order: NDArray[np.int64] | None = None,
-        further_every: int = 1,
     ) -> Transport:
-        """Return what the lanes of a batch read.
+        """Return what the lanes of a batch read, whether they trace paths or not.
 
         Parameters
         ----------
@@ -267,8 +274,6 @@ class PathEngine:
             What is rendered, and the shape of its histogram.
         order
             (n,) the batch's sensor points in the order in which lanes take them; None: as they are.
-        further_every
-            Of so many paths one goes on beyond the third bounce.
         """
         index, horizon = self.sensor_indices(batch), self.horizon
         sensors = sensor_points(self.built, self.capture, self.time_axis, index)
@@ -295,9 +300,15 @@ class PathEngine:
             n_lasers=dr.opaque(mi.UInt32, shape.lasers),
             bins_per_unit=dr.opaque(mi.Float, self.built.unit / self.time_axis.bin_width_opl),
             deadline=deadline,
+            hidden_box=None,
             owner=owner,
-            further_every=dr.opaque(mi.UInt32, further_every),
+            further_every=dr.opaque(mi.UInt32, 1),
         )
+
+    def _of_paths(self, batch: Batch | Pilot, shape: HistogramShape, further_every: int) -> Transport:
+        """Return what the lanes of a batch read that trace paths, neighbours together; see ``Transport``."""
+        transport = self.transport(batch, shape, self.lane_order(batch))
+        return replace(transport, hidden_box=self.hidden_box, further_every=dr.opaque(mi.UInt32, further_every))
 
     def lane_order(self, batch: Batch | Pilot) -> NDArray[np.int64]:
         """Return the order in which lanes take a batch's sensor points: rays of a packet start near each other."""
@@ -325,7 +336,7 @@ class PathEngine:
         pilot, nx = pilot_of(self.capture), self.capture.sensor_grid.nx
         replicas = pilot_replicas(self.options.replicas, pilot.sensors.size)
         shape, order = replace(self.shape(pilot, self.n_slots), replicas=replicas), self.lane_order(pilot)
-        transport, histogram = self.transport(pilot, shape, order, further_every), DeviceHistogram(shape, self.kernel)
+        transport, histogram = self._of_paths(pilot, shape, further_every), DeviceHistogram(shape, self.kernel)
         points = self.sensor_indices(pilot)[order]
         turns = first_turns(PILOT_SEED, points, nx, shape.lanes, transport.further_every)
         random = replace(lane_randomness(shape, points, PILOT_SEED), turn=turns)

@@ -21,11 +21,20 @@ from nlosrender.engine.deadline import thinned_out
 from nlosrender.engine.direct_paths import are_direct, trace_direct_paths
 from nlosrender.engine.histogram import DeviceHistogram
 from nlosrender.engine.low_discrepancy import recurrence_steps
-from nlosrender.engine.path_steps import Departure, DirectionNumbers, arrive, leave, turns_away, unit_interval
+from nlosrender.engine.path_steps import (
+    Departure,
+    DirectionNumbers,
+    arrive,
+    leave,
+    misses_hidden,
+    turns_away,
+    unit_interval,
+)
 from nlosrender.engine.strata import Strata, first_coordinate
 from nlosrender.engine.transport import LaneRandomness, PathSettings, Transport
 
 PLUGIN_NAME = "nlos_path"
+MOST_TRIES = 4  # of a lane whose paths miss everything, before the others of its packet go on
 
 
 @dr.syntax
@@ -165,6 +174,25 @@ def trace_paths(
         way, survival, eta = leave(
             settings, transport, generator, vertex, on_wall, numbers, sample, by_bsdf, has_target
         )
+        if dr.hint(transport.hidden_box is not None, mode="scalar"):
+            # before a planar wall all surfaces lie in the box: the next path starts at once
+            misses, tries = start & by_bsdf & misses_hidden(transport, way.ray), mi.UInt32(0)
+            while dr.hint(
+                misses & (started < n_samples) & (tries < MOST_TRIES),
+                exclude=[settings, transport, sensors, on_wall, start],
+            ):
+                started += 1
+                tries += 1
+                following = DirectionNumbers(first_coordinate(at), unit_interval(seq_v))
+                at += stride
+                seq_v += steps[0]
+                seq_t += steps[1]
+                point, nowhere = sensors.interaction, mi.Bool(False)
+                way, survival, eta = leave(
+                    settings, transport, generator, point, on_wall, following, None, misses, nowhere
+                )
+                misses &= misses_hidden(transport, way.ray)
+            alive &= ~misses
         medium *= eta
 
         # ---- Stop ----------------------------------------------------------------------------------------------------

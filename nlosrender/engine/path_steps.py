@@ -180,3 +180,10 @@ def turns_away(transport: Transport, sample: SurfaceSample, origin: mi.Point3f) 
     if not transport.sampler.dark_behind:
         return mi.Bool(False)
     return dr.dot(sample.n, sample.p - origin) >= 0
+
+
+def misses_hidden(transport: Transport, ray: mi.Ray3f) -> mi.Bool:
+    """Return whether a ray from a planar wall passes the hidden geometry by: such a path ends without a ray."""
+    if transport.hidden_box is None:
+        return mi.Bool(False)
+    return transport.hidden_box.is_missed(ray)

@@ -60,6 +60,9 @@ def skipped_work(engine: Engine, *, scene_is_colored: bool) -> tuple[Skipped, ..
         many = round(1 / LATE_SURVIVAL)
         why = f"one in {many} goes on, with {many} times the weight: the light outside the window is not biased"
         skipped.append(Skipped("most paths on which light can only arrive after the time window", why))
+    if traces_paths(engine) and paths.hidden_box is not None:
+        why = "such a path ends where it began"
+        skipped.append(Skipped("rays from the wall that miss the box around all hidden geometry", why))
     skipped += _colour(options.channels, scene_is_colored)
     return (*skipped, *(_techniques(paths) if traces_paths(engine) else ()))
 

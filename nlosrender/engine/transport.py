@@ -10,6 +10,7 @@ import mitsuba as mi
 from nlosrender.capture.bounces import FIRST_BOUNCE, THIRD_BOUNCE, BounceAxis
 from nlosrender.engine.deadline import Deadline
 from nlosrender.engine.device_arrays import WallPoints
+from nlosrender.engine.hidden_box import HiddenBox
 from nlosrender.engine.surface_sampler import SurfaceSampler
 from nlosrender.scene.build import BuiltScene
 
@@ -71,6 +72,7 @@ class Transport:
     n_lasers: mi.UInt32  # opaque copy of ``lasers_per_lane``: its value is not part of the kernel
     bins_per_unit: mi.Float  # engine unit / bin width, opaque
     deadline: Deadline | None  # None: all light arrives before the end of the window
+    hidden_box: HiddenBox | None  # None: few rays from the wall miss it
     owner: mi.UInt32  # per lane: which lane's rows of the histogram it adds to
     further_every: mi.UInt32  # of so many paths one goes on beyond the third bounce, with the light of all; opaque
 

@@ -75,12 +75,11 @@ def sheet(folder: Path, n: int, height: float, waves: float, **place: Any) -> It
 def both(stage: Stage, monkeypatch: pytest.MonkeyPatch, coarseness: float) -> list[NDArray[np.float64]]:
     """Return the third bounce with clearances, and with rays all the way to every patch."""
     from nlosrender.engine.virtual_lights import clearance
-    from nlosrender.engine.virtual_lights.third_bounce import ThirdBounce
 
-    results, own = [], stage.engine.third
+    results, third = [], stage.engine.third
     for least in (0, NEVER):
         monkeypatch.setattr(clearance, "LEAST_POINTS", least)
-        third = ThirdBounce(own.paths, own.tessellator, own.settings, own.lanes, own.is_reciprocal)
+        third.forget()
         results.append(third.gather(stage.batch, coarseness).values)
         known = third.lit_patches(stage.batch, coarseness).clearance
         assert known.any() == (least == 0)

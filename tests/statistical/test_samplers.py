@@ -183,7 +183,7 @@ def test_the_guide_leads_to_the_entry_that_covers_a_number() -> None:
     from nlosrender.engine.surface_sampler import SurfaceSampler
 
     sampler = SurfaceSampler(pipeline.load_scene(config))
-    edges = np.array(sampler._edges).astype(np.int64)
+    edges = np.array(sampler._table.edges).astype(np.int64)
     assert len(np.unique(edges)) > 10
     wanted = np.concatenate([edges, edges - 1, edges + 1, np.random.default_rng(2).integers(0, 2**32, 5000)])
     bits = np.clip(wanted, 0, 2**32 - 1)

@@ -190,6 +190,16 @@ TUBE = {"type": "cylinder", "center": [0, 0, 0], "axis": [0, 1, 0], "radius": 1.
             ((PLATE,), {"max_bounces": 4, "engine": "path"}),
             ((PLATE,), {"max_bounces": 4}),
         ),
+        (
+            "rays from the wall that miss the box around all hidden geometry",
+            ((PLATE,), {"hidden_geometry_sampling": False}),
+            ((ROOM,), {"hidden_geometry_sampling": False}),
+        ),
+        (
+            "rays from the wall that miss the box around all hidden geometry",
+            ((BALL,), {"hidden_geometry_sampling": False}),
+            ((PLATE,), {"engine": "path"}),
+        ),
         ("hidden geometry sampling (MIS)", ((ROOM,), {"engine": "path"}), ((PLATE,), {"engine": "path"})),
         (
             "hidden geometry sampling (MIS)",

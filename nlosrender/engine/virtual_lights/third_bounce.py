@@ -121,6 +121,10 @@ class ThirdBounce:
         count = len(patches) if self.tessellator.regions is None else self.tessellator.count(coarseness)
         return Gathered(values, max(count, 1), coarseness, merged)  # 1: nothing may face the wall
 
+    def forget(self) -> None:
+        """Light patches anew from now on, as an engine would that has gathered nothing yet."""
+        self._kept = {}
+
     def _by_reciprocity(self, batch: Batch, coarseness: float, patches: Patches) -> NDArray[np.float64]:
         """Gather from every two points once: the one with the higher index stands for the sensor point.
 
