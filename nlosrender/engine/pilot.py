@@ -39,9 +39,9 @@ class Pilot:
     lasers: Selection
 
 
-def pilot_of(capture: Capture) -> Pilot:
-    """Return at most 16 x 16 sensor points and, of exhaustive captures, at most 3 x 3 laser points."""
-    sensors = spread(capture.sensor_grid, SENSORS_PER_AXIS)
+def pilot_of(capture: Capture, sensors_per_axis: int = SENSORS_PER_AXIS) -> Pilot:
+    """Return a grid of at most so many sensor points and, of exhaustive captures, at most 3 x 3 laser points."""
+    sensors = spread(capture.sensor_grid, sensors_per_axis)
     if capture.scan_type == "confocal":
         return Pilot(sensors, sensors)
     return Pilot(sensors, spread(capture.laser_grid, LASERS_PER_AXIS))

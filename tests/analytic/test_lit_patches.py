@@ -99,3 +99,19 @@ def test_many_patches_are_not_kept(monkeypatch: pytest.MonkeyPatch, lighting: li
         third.gather(batch, 0.5)
     assert len(lighting) == 2
     assert min(lighting) > 10
+
+
+def test_what_was_lit_for_a_few_points_is_cleared_for_many(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A pilot asks rays for everything; the capture after it leaves out those that it would leave out by itself."""
+    start_backend("llvm")
+    from nlosrender.engine.pilot import pilot_of
+    from nlosrender.engine.virtual_lights import clearance
+
+    monkeypatch.setattr(clearance, "LEAST_POINTS", 20)
+    third, batch = gather_of("single"), BATCHES["single"][0]
+    pilot = pilot_of(third.paths.capture, 3)
+    third.gather(pilot, 0.5)
+    assert not third.lit_patches(pilot, 0.5).clearance.any()
+    known = third.lit_patches(batch, 0.5).clearance
+    np.testing.assert_array_equal(known, gather_of("single").lit_patches(batch, 0.5).clearance)
+    assert known.any()

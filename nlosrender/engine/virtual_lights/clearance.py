@@ -22,7 +22,9 @@ import mitsuba as mi
 import numpy as np
 
 from nlosrender.capture.grids import Capture
+from nlosrender.capture.plan import Batch
 from nlosrender.engine.device_arrays import on_device
+from nlosrender.engine.pilot import Pilot
 from nlosrender.engine.virtual_lights.occluder_tree import LEAF, OccluderTree
 from nlosrender.scene.build import BuiltScene
 from nlosrender.scene.pose import Float64
@@ -52,9 +54,7 @@ class Outlook:
     """Rectangles of a planar wall that points are seen from, each in ``TILES`` x ``TILES`` tiles."""
 
     packed: mi.Float  # four a rectangle: least x and y, width and height of a tile [engine units]
-    # of the capture that look at each point from a rectangle: whether it is worth while to leave out rays. Not those of
-    # a batch, whose size must not show.
-    n_points: int
+    n_points: int  # look at each point from a rectangle: whether it is worth while to leave out rays
 
     @classmethod
     def around(cls, groups: Sequence[Float64], n_points: int) -> Outlook:
@@ -64,11 +64,11 @@ class Outlook:
         return cls(on_device(mi.Float, np.concatenate([least - MARGIN, sizes], axis=1).ravel()), n_points)
 
     @classmethod
-    def of(cls, built: BuiltScene, capture: Capture, *, with_lasers: bool = False) -> Outlook:
+    def of(cls, built: BuiltScene, capture: Capture, batch: Batch | Pilot, *, with_lasers: bool = False) -> Outlook:
         """Return the rectangle around all sensor points, and all laser points if asked for."""
         grids = [capture.sensor_grid, *([capture.laser_grid] if with_lasers else [])]
         points = np.concatenate([grid.positions.reshape(-1, 3) / built.unit for grid in grids])
-        return cls.around([points], capture.n_sensors)
+        return cls.around([points], count_sensors(capture, batch))
 
     def tiles(self, index: mi.UInt32) -> mi.Vector4f:
         """Return least x and y of a rectangle, and width and height of its tiles."""
@@ -80,6 +80,11 @@ class Outlook:
         places = (point.x - left) / width, (point.y - bottom) / height
         column, row = (mi.UInt32(dr.clip(place, 0, TILES - 1)) for place in places)
         return mi.UInt64(1) << mi.UInt64(row * TILES + column)
+
+
+def count_sensors(capture: Capture, batch: Batch | Pilot) -> int:
+    """Return how many sensor points look: those of the capture, not the batch, whose size must not show."""
+    return batch.sensors.size if isinstance(batch, Pilot) else capture.n_sensors
 
 
 @dataclass(frozen=True, eq=False)

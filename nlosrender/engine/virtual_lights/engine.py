@@ -17,7 +17,7 @@ from nlosrender.capture.plan import Batch
 from nlosrender.capture.time_axis import TimeAxis
 from nlosrender.engine.histogram import Histogram
 from nlosrender.engine.path_engine import PathEngine, PathOptions
-from nlosrender.engine.pilot import pilot_of
+from nlosrender.engine.pilot import Pilot, pilot_of
 from nlosrender.engine.sampling import DEFAULT_TARGET, Budget, Progress
 from nlosrender.engine.virtual_lights.further_bounces import (
     SHARES_OF_THIRD,
@@ -46,6 +46,7 @@ THIRD_OF_MANY, REST_OF_MANY = 0.35, 0.88  # patches are cheaper than walks
 PILOT_ERROR = 4.0  # times the target: when a pilot has seen enough to say how many rounds are needed
 MOST_PILOT_ROUNDS = 16
 PILOT_LANES = 2048
+SENSORS_FOR_PATCHES = 8  # along each side of the pilot's grid: the error of patches has no noise
 MISSED = 3.0  # times the light that is found of bounce 5: one of the four legs that may lead past the laser point is
 RARE = 1e-4  # share of walks or paths: rarer light is not found by renders of common lengths, or by too few
 
@@ -127,7 +128,7 @@ class VirtualLightEngine:
         if budget not in self._settled:
             settled = self.settle_lights(budget)
             if self.has_further_bounces and self.further is None:
-                squares = self.third.gather(pilot_of(self.capture), settled.fineness or FIRST_COARSENESS).squares
+                squares = self._known_squares(pilot_of(self.capture))
                 goal = REST_OF_MANY * (budget.target_error or DEFAULT_TARGET)
                 paths = self.paths.settle(replace(budget, target_error=goal), known_squares=squares)
                 settled = replace(settled, spp=paths.spp)
@@ -143,22 +144,27 @@ class VirtualLightEngine:
             return replace(budget, fineness=self._fineness_in_time(budget, share * target))
         if self.further is not None:
             share = SHARES_OF_THIRD[0]
-        fineness, third = self.third.settle(pilot, share * target)
+        few = pilot_of(self.capture, SENSORS_FOR_PATCHES)
+        fineness, n_patches = self.third.settle(few, share * target)
         if self.further is None:
             return replace(budget, fineness=fineness)
-        goal = REST_OF_MANY * target
+        goal, squares = REST_OF_MANY * target, self._known_squares(pilot)
         replicas = max(2, PILOT_LANES // pilot.sensors.size // 2 * 2)
         histogram = self.further.histogram(pilot, replicas)
         done, error = 0, math.inf
         while done < MOST_PILOT_ROUNDS and error > PILOT_ERROR * goal:
             self.further.accumulate(pilot, histogram, done)
             done += 1
-            error = histogram.relative_error(done, third.squares)
-        share = self.further.share_of_third(third.n_patches, error * math.sqrt(done) / target)
+            error = histogram.relative_error(done, squares)
+        share = self.further.share_of_third(n_patches, error * math.sqrt(done) / target)
         if share < SHARES_OF_THIRD[0]:
-            fineness, _ = self.third.settle(pilot, share * target)
+            fineness, _ = self.third.settle(few, share * target)
         rounds = rounds_needed(error, done, math.sqrt(SQUARES - share**2) * target)
         return replace(budget, fineness=fineness, rounds=rounds)
+
+    def _known_squares(self, pilot: Pilot) -> float:
+        """Return the squares of a pilot's third bounce, about: what the error of further bounces is relative to."""
+        return self.third.gather(pilot, FIRST_COARSENESS).squares
 
     def render(self, batch: Batch, budget: Budget, progress: Progress = lambda fraction: None) -> Histogram:
         """Render one batch; as ``PathEngine.render``, whose errors it raises.

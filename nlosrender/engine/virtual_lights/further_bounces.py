@@ -129,7 +129,7 @@ class FurtherBounces:
         impulses = walk_back(plan, transport, sites, self.tried, int(state[1]))
         if not impulses.count:
             return
-        outlook = Outlook.of(self.built, self.paths.capture)
+        outlook = Outlook.of(self.built, self.paths.capture, batch)
         table = self._table(plan, sites, impulses, outlook)
         lowest = mi.UInt32(THIRD_BOUNCE + 1)
         slots = dr.minimum(impulses.bounces - lowest, shape.slots - 1) if self.options.bounces.split else lowest * 0

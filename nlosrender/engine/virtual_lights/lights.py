@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
@@ -63,6 +63,11 @@ class Clearing:
     clearances: Clearances
     outlook: Outlook  # a rectangle per region of the patches
 
+    @property
+    def is_worthwhile(self) -> bool:
+        """Whether enough points look."""
+        return self.clearances.are_worthwhile(self.outlook.n_points)
+
     def of(self, patches: DevicePatches, seen_at: mi.Vector3f, active: mi.Bool) -> mi.UInt64:
         """Return the clearance of patches where rays end, see ``Clearances.of``."""
         where = on_device(mi.UInt32, patches.places.regions)
@@ -78,6 +83,13 @@ class Illuminated:
     is_lit: mi.Bool  # by any of the lasers
     seen_at: mi.Vector3f  # from the centres to where sensor points look at them
     clearance: mi.UInt64  # there, see ``Clearances.of``
+    is_cleared: bool  # it has been asked for: enough points look
+
+    def cleared(self, clearing: Clearing) -> Illuminated:
+        """Return the same with clearances, if enough points look."""
+        if not clearing.is_worthwhile:
+            return self
+        return replace(self, clearance=clearing.of(self.patches, self.seen_at, self.is_lit), is_cleared=True)
 
 
 def illuminate(
@@ -97,16 +109,16 @@ def illuminate(
         Lasers of the batch.
     """
     count = dr.width(patches.areas)
-    arriving, seen_at = mi.Spectrum(0), patches.points(patches.number)
+    seen_at, all_lit = patches.points(patches.number), dr.full(mi.Bool, True, count)
     dr.eval(seen_at)
-    clearance, is_lit = dr.zeros(mi.UInt64, count), dr.full(mi.Bool, True, count)
+    lit = Illuminated(patches, mi.Spectrum(0), all_lit, seen_at, dr.zeros(mi.UInt64, count), is_cleared=False)
     if settings.needs_visibility and not settings.has_one_laser:
-        clearance = clearing.of(patches, seen_at, is_lit)
+        lit = lit.cleared(clearing)
     if not settings.is_confocal:
-        arriving, is_lit, seen_at = _illuminate(settings, transport, patches, clearing, seen_at, clearance, n_lasers)
+        lit = _illuminate(settings, transport, lit, clearing, n_lasers)
     if settings.needs_visibility and settings.has_one_laser:
-        clearance = clearing.of(patches, seen_at, is_lit)
-    return Illuminated(patches, arriving, is_lit, seen_at, clearance)
+        lit = lit.cleared(clearing)
+    return lit
 
 
 def lights_of(
@@ -162,24 +174,13 @@ def lights_of(
 
 
 def _illuminate(
-    settings: GatherSettings,
-    transport: Transport,
-    patches: DevicePatches,
-    clearing: Clearing,
-    seen_at: mi.Vector3f,
-    clearance: mi.UInt64,
-    n_lasers: int,
-) -> tuple[mi.Spectrum, mi.Bool, mi.Vector3f]:
+    settings: GatherSettings, transport: Transport, dark: Illuminated, clearing: Clearing, n_lasers: int
+) -> Illuminated:
     """Light every patch by every laser: emission, distance, and the share of the patch that is not in shadow.
 
-    Sensor points look at ``seen_at``, or at a point that the only laser lights.
-
-    Returns
-    -------
-    tuple
-        What arrives (of Lambertian patches: leaves), index = laser * n_patches + patch; whether anything does, per
-        patch; and from the patches' centres to where sensor points look at them.
+    Sensor points look where they did, or at a point that the only laser lights. Lambertian patches send light on.
     """
+    patches, seen_at, clearance = dark.patches, dark.seen_at, dark.clearance
     built = transport.built
     n_patches = dr.width(patches.areas)
     index = dr.arange(mi.UInt32, n_patches * n_lasers)
@@ -215,7 +216,7 @@ def _illuminate(
     dr.scatter_reduce(dr.ReduceOp.Max, brightest, dr.max(arriving), patch)
     is_lit = brightest > 0
     dr.eval(arriving, is_lit, seen_at)
-    return arriving, is_lit, seen_at
+    return replace(dark, arriving=arriving, is_lit=is_lit, seen_at=seen_at)
 
 
 def _share_in_light(

@@ -17,7 +17,7 @@ from nlosrender.engine.path_engine import PathEngine
 from nlosrender.engine.pilot import Pilot
 from nlosrender.engine.transport import Transport
 from nlosrender.engine.virtual_lights.block_histogram import BlockHistogram
-from nlosrender.engine.virtual_lights.clearance import Clearances, Outlook
+from nlosrender.engine.virtual_lights.clearance import Clearances, Outlook, count_sensors
 from nlosrender.engine.virtual_lights.device_patches import Places, upload_patches
 from nlosrender.engine.virtual_lights.gather import gather_third_bounce
 from nlosrender.engine.virtual_lights.lights import (
@@ -36,7 +36,7 @@ FIRST_COARSENESS = 1.0
 NEAR = 1e-3  # engine units: the centres of nearer patches are rounded by more than 1e-4 of their distance
 REFINEMENT = 3.0  # at least so many times more patches between the two resolutions that are compared
 APART = 2.5  # at least so many times fewer patches has what a resolution is compared with, where there is any
-SAME = 0.05  # relative difference in coarseness of resolutions that are as good as one another
+SAME = 0.1  # relative difference in coarseness of resolutions that are as good as one another
 STUCK = 0.9  # of the error before, with twice the patches: refining further is in vain
 ROUGH = 0.2  # an error beyond which the law of its decrease does not hold yet
 MARGIN = 1.1  # on the patches that an extrapolated error asks for
@@ -152,8 +152,8 @@ class ThirdBounce:
         lanes = self._lanes(batch, shape, lasers)
         histogram = BlockHistogram(shape, lanes.order)
         if len(patches):
-            outlook = self._outlook()
-            lights = self._shared_lights(lanes.transport, shape, coarseness, patches)
+            outlook = self._outlook(batch)
+            lights = self._shared_lights(lanes.transport, shape, coarseness, patches, outlook)
             tile = outlook.tile_bit(mi.UInt32(0), lanes.transport.sensors.interaction.p)
             gather_third_bounce(self.settings, lanes.transport, lights, histogram, lanes.index, lanes.replica, tile)
         for labels, near in self.tessellator.regional_patches(coarseness, np.unique(lanes.regions).tolist()):
@@ -163,7 +163,7 @@ class ThirdBounce:
             chosen = np.flatnonzero(np.isin(lanes.regions, labels))
             part = np.searchsorted(labels, lanes.regions[chosen]) * shape.replicas + chosen // shape.sensors
             index = on_device(mi.UInt32, chosen)
-            some, outlook = lanes.transport.of_lanes(index), self._outlook(labels)
+            some, outlook = lanes.transport.of_lanes(index), self._outlook(batch, labels)
             illuminated = self._illuminate(some, shape, Patches.joined(near), places, outlook)
             lights = lights_of(self.settings, some, illuminated, shape.replicas, shape.lasers)
             tile = outlook.tile_bit(on_device(mi.UInt32, part // shape.replicas), some.sensors.interaction.p)
@@ -173,8 +173,8 @@ class ThirdBounce:
     def lit_patches(self, batch: Batch | Pilot, coarseness: float) -> LitPatches:
         """Return the patches that the gather of a batch goes through, in its order; those all sensor points share."""
         shape = self.shape(batch)
-        lanes, patches, outlook = self._lanes(batch, shape), self.tessellator.patches(coarseness), self._outlook()
-        lights = self._shared_lights(lanes.transport, shape, coarseness, patches)
+        lanes, patches, outlook = self._lanes(batch, shape), self.tessellator.patches(coarseness), self._outlook(batch)
+        lights = self._shared_lights(lanes.transport, shape, coarseness, patches, outlook)
         rows = np.array(lights.packed, np.float32).reshape(-1, ROWS, 4)
         ends, normals = (rows[:, ROWS - 2] + rows[:, ROWS - 1])[:, :3], np.array(lights.interaction.n, np.float64).T
         tiles = np.empty(shape.sensors, np.uint64)
@@ -183,15 +183,18 @@ class ThirdBounce:
         return LitPatches(ends.astype(np.float64), normals, np.array(lights.clearance), tiles)
 
     def _shared_lights(
-        self, transport: Transport, shape: HistogramShape, coarseness: float, patches: Patches
+        self, transport: Transport, shape: HistogramShape, coarseness: float, patches: Patches, outlook: Outlook
     ) -> Lights:
         """Return what all sensor points gather; patches are kept lit where that serves other batches, too."""
         illuminated = self._kept.get(coarseness)
         if illuminated is None:
-            illuminated = self._illuminate(transport, shape, patches, Places.of([len(patches)]), self._outlook())
-            if self.settings.lights_once and len(patches) <= MOST_KEPT:
-                # a batch looks at two resolutions
-                self._kept = dict([*self._kept.items(), (coarseness, illuminated)][-2:])
+            illuminated = self._illuminate(transport, shape, patches, Places.of([len(patches)]), outlook)
+        elif self.settings.needs_visibility and not illuminated.is_cleared:  # so far few points have looked
+            illuminated = illuminated.cleared(Clearing(self.clearances, outlook))
+        if self.settings.lights_once and len(patches) <= MOST_KEPT:
+            # a batch looks at two resolutions
+            others = [(other, lit) for other, lit in self._kept.items() if other != coarseness]
+            self._kept = dict([*others, (coarseness, illuminated)][-2:])
         return lights_of(self.settings, transport, illuminated, shape.replicas, shape.lasers)
 
     def _illuminate(
@@ -201,22 +204,22 @@ class ThirdBounce:
         on_device = upload_patches(self.paths.built, patches, places, self.paths.options.seed, is_near)
         return illuminate(self.settings, transport, on_device, Clearing(self.clearances, outlook), shape.lasers)
 
-    def _outlook(self, regions: list[int] | None = None) -> Outlook:
+    def _outlook(self, batch: Batch | Pilot, regions: list[int] | None = None) -> Outlook:
         """Return what patches are seen from: all points, or the sensor points of some regions."""
         built, capture = self.paths.built, self.paths.capture
         if regions is None or self.tessellator.regions is None:
-            return Outlook.of(built, capture, with_lasers=not self.settings.has_one_laser)
+            return Outlook.of(built, capture, batch, with_lasers=not self.settings.has_one_laser)
         labels = self.tessellator.regions.labels
         points = capture.sensor_grid.positions.reshape(-1, 3) / built.unit
         groups = [points[labels == label] for label in regions]
-        return Outlook.around(groups, capture.n_sensors // len(self.tessellator.regions.near))
+        return Outlook.around(groups, count_sensors(capture, batch) // len(self.tessellator.regions.near))
 
     def pair(self, batch: Batch | Pilot, fineness: float) -> tuple[Gathered, Gathered]:
         """Gather a batch at ``fineness`` and at the coarser resolution it is compared with."""
         return self.gather(batch, self.coarser(fineness)), self.gather(batch, fineness)
 
-    def settle(self, pilot: Pilot, target: float) -> tuple[float, Gathered]:
-        """Return the fineness whose estimated error is at most ``target``, and the pilot's third bounce at it."""
+    def settle(self, pilot: Pilot, target: float) -> tuple[float, int]:
+        """Return the fineness whose estimated error is at most ``target``, and its number of patches."""
         tried = [(self.gather(pilot, FIRST_COARSENESS), math.inf)]  # and its error, coarse to fine
         fineness = self.finer(FIRST_COARSENESS, REFINEMENT)
         while True:
@@ -235,7 +238,7 @@ class ThirdBounce:
             is_stuck = STUCK * earlier < error < ROUGH and fine.n_patches > 2 * coarse.n_patches
             in_vain = is_stuck or (error < ROUGH and needed > MAX_PATCHES)
             if error <= target or in_vain or 2 * fine.n_patches > MAX_PATCHES:
-                return fineness, fine
+                return fineness, fine.n_patches
             tried.append((fine, error))
             fineness = self.finer(fineness, min(max(MARGIN * error / target, 1.25), REFINEMENT))
 
