@@ -280,7 +280,8 @@ def prepare(
     render = config.render
     bounces = bounce_axis(config)
     channels = config.n_channels
-    memory, rows = batch_memory(sharing.memory_limit(render.memory_limit_bytes)), bounces.n_slots * channels
+    limit, rows = sharing.memory_limit(render.memory_limit_bytes), bounces.n_slots * channels
+    memory = batch_memory(limit, built.n_triangles)
     refuse_impossible_samples(config.capture, rows_per_pair=rows, n_bins=time_axis.n_bins, memory_limit=memory)
     _, *storage_tile = sensor_tile(time_axis.n_bins, capture.sensor_grid.ny, capture.sensor_grid.nx)
     plan = plan_capture(

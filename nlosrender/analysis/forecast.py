@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from nlosrender.capture.arrivals import filled_shares
 from nlosrender.capture.plan import Plan
 from nlosrender.config.document import Config
-from nlosrender.engine.backend import Backend
+from nlosrender.engine.backend import Backend, scene_memory
 from nlosrender.files.capture_file import CaptureHeader
 from nlosrender.files.size import FileSize, forecast_size
 
@@ -36,6 +36,7 @@ class Forecast:
     window_opl: tuple[float, float]  # m
     batches: int
     bytes_per_batch: int  # of the largest
+    scene_bytes: int  # that the triangles take, about
     output: Path
     file: FileSize
     seconds_estimate: float | None  # from scene to file, kernels compiled; None: the pilot saw nothing but noise
@@ -97,6 +98,7 @@ def forecast_render(
         window_opl=(time_axis.start_opl, time_axis.end_opl),
         batches=len(plan.batches),
         bytes_per_batch=n_bytes,
+        scene_bytes=scene_memory(engine.built.n_triangles),
         output=Path(config.output.path),
         file=size,
         seconds_estimate=None if rendering.seconds is None else rendering.seconds + around,

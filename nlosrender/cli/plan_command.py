@@ -13,6 +13,8 @@ from nlosrender.capture.bounces import LINE_OF_SIGHT
 if TYPE_CHECKING:
     from nlosrender.analysis.forecast import Forecast
 
+NOTABLE_BYTES = 50e6  # of a scene's triangles
+
 
 def register(app: typer.Typer) -> None:
     """Add ``plan`` to ``app``."""
@@ -70,7 +72,10 @@ def _lines(forecast: Forecast) -> Iterator[str]:
     start, end = forecast.window_opl
     yield f"time     {forecast.n_bins} bins of {forecast.bin_width_opl:g} m, from {start:.6g} to {end:.6g} m"
     plural = "" if forecast.batches == 1 else "es"
-    yield f"memory   {forecast.batches} batch{plural} of up to {readable_size(forecast.bytes_per_batch)}"
+    beside = ""
+    if forecast.scene_bytes >= NOTABLE_BYTES:
+        beside = f", and about {readable_size(forecast.scene_bytes)} for the triangles"
+    yield f"memory   {forecast.batches} batch{plural} of up to {readable_size(forecast.bytes_per_batch)}{beside}"
     size = forecast.file
     yield (
         f"file     {forecast.output}: {readable_size(size.logical_bytes)} for a reader, about "

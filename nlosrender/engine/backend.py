@@ -126,7 +126,8 @@ def _loaded_library() -> str:
     return named or f"LLVM {major}, found by Dr.Jit"
 
 
-PROCESS_BYTES = 400e6  # Python, Mitsuba, LLVM and a scene, before any histogram
+PROCESS_BYTES = 400e6  # Python, Mitsuba, LLVM and a small scene, before any histogram
+TRIANGLE_BYTES = 700.0  # at most at one time: read, put into trees, cut, merged and lit
 
 
 def physical_memory() -> int:
@@ -134,19 +135,33 @@ def physical_memory() -> int:
     return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") if hasattr(os, "sysconf") else 8 << 30
 
 
-def batch_memory(limit: int | None) -> int:
-    """Return the bytes one batch may take, from the user's limit for the process; None: a quarter of the machine's.
+def batch_memory(limit: int | None, n_triangles: int = 0) -> int:
+    """Return the bytes one batch may take.
+
+    Parameters
+    ----------
+    limit
+        The user's for the process; None: a quarter of the machine's memory, beside what the scene takes.
+    n_triangles
+        Of the scene. However many, an eighth of what the program leaves is for batches.
 
     Raises
     ------
     RenderError
         The limit is below what the program itself needs.
     """
+    scene = scene_memory(n_triangles)
     if limit is None:
-        limit = physical_memory() // 4
+        limit = physical_memory() // 4 + scene
     if limit <= PROCESS_BYTES:
         raise RenderError(
             f"render.memory_limit: got {limit / 1e6:.0f} MB, need more than {PROCESS_BYTES / 1e6:.0f} MB, "
             "which the program takes before any histogram"
         )
-    return int(limit - PROCESS_BYTES)
+    left = limit - PROCESS_BYTES
+    return int(max(left - scene, left / 8))
+
+
+def scene_memory(n_triangles: int) -> int:
+    """Return the bytes that a scene of so many triangles takes, about."""
+    return round(TRIANGLE_BYTES * n_triangles)

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from nlosrender.capture.bounces import LINE_OF_SIGHT
 from nlosrender.capture.grids import Capture
 from nlosrender.capture.plan import BYTES_PER_SUM, MOST_SUMS, Batch, Plan
-from nlosrender.engine.backend import batch_memory, physical_memory
+from nlosrender.engine.backend import PROCESS_BYTES, batch_memory, physical_memory, scene_memory
 from nlosrender.engine.engines import Engine
 from nlosrender.engine.skipped import traces_paths
 from nlosrender.engine.virtual_lights.block_histogram import BlockHistogram
@@ -59,13 +59,19 @@ def memory_warnings(engine: Engine, plan: Plan, memory_limit: int | None, lanes:
         As ``batch_bytes``.
     """
     taken, physical = batch_bytes(engine, plan), physical_memory()
+    available, scene = batch_memory(memory_limit, engine.built.n_triangles), scene_memory(engine.built.n_triangles)
     if isinstance(engine, VirtualLightEngine):
-        _refuse_patches(engine, batch_memory(memory_limit))
+        _refuse_patches(engine, available)
+    if memory_limit is not None and scene + PROCESS_BYTES > memory_limit:
+        yield (
+            f"render.memory_limit: {engine.built.n_triangles} triangles take about {_size(scene)} beside the program's "
+            f"{_size(PROCESS_BYTES)}, more than {_size(memory_limit)}."
+        )
     if memory_limit is not None and memory_limit > physical:
         yield f"render.memory_limit: {_size(memory_limit)} is more than the machine's {_size(physical)}."
     if taken > physical:
         raise ConfigError(Problem("", *_too_large(engine, taken, physical)))
-    if taken > batch_memory(memory_limit):
+    if taken > available:
         yield (
             f"render.memory_limit: a batch takes {_size(taken)}, more than is left for it: the gather needs rows for "
             "every processor. Use fewer bins or lasers, or render.engine: path."

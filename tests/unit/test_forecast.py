@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tracemalloc
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -289,6 +290,18 @@ def test_bins_finer_than_the_arithmetic_are_said():
     assert any("patches of the hidden geometry are needed" in text for text in said)
 
 
+def test_triangles_that_take_more_than_the_memory_limit_are_said():
+    """A limit is for the process: what a mesh takes is in no batch."""
+    from nlosrender.engine.memory import memory_warnings
+
+    backend, plan, engine = prepared(configured(flat_wall(PLATE)))
+    engine.built = replace(engine.built, n_triangles=10**6)
+    (warning,) = memory_warnings(engine, plan, 10**9, backend.lanes)
+    assert "1000000 triangles take about 0.7 GB beside the program's 0.4 GB, more than 1 GB" in warning
+    assert list(memory_warnings(engine, plan, 2 * 10**9, backend.lanes)) == []
+    assert list(memory_warnings(engine, plan, None, backend.lanes)) == []
+
+
 def test_a_memory_limit_is_checked_against_machine_and_lanes():
     """A limit above the machine's memory, and one that leaves processors idle, are said; a plain one is not."""
     from nlosrender.engine.memory import memory_warnings
@@ -315,7 +328,7 @@ def test_a_batch_larger_than_the_machine_is_the_configurations_fault(monkeypatch
 
     backend, plan, used = prepared(configured(flat_wall(PLATE, engine=engine, spp=None)))
     monkeypatch.setattr(memory, "physical_memory", lambda: 1000)
-    monkeypatch.setattr(memory, "batch_memory", lambda limit: 10**12)
+    monkeypatch.setattr(memory, "batch_memory", lambda limit, n_triangles: 10**12)
     with pytest.raises(ConfigError, match=message):
         list(memory.memory_warnings(used, plan, None, backend.lanes))
 

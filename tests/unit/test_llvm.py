@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from nlosrender.engine import llvm
-from nlosrender.engine.backend import PROCESS_BYTES, batch_memory
+from nlosrender.engine.backend import PROCESS_BYTES, batch_memory, scene_memory
 from nlosrender.errors import RenderError
 
 
@@ -80,6 +80,14 @@ def test_a_memory_limit_below_the_program_itself_is_an_error():
     with pytest.raises(RenderError, match="memory_limit"):
         batch_memory(int(PROCESS_BYTES) - 1)
     assert batch_memory(int(PROCESS_BYTES) + 1000) == 1000
+
+
+def test_a_scene_takes_its_part_of_a_memory_limit():
+    """What triangles take is not left for batches, but an eighth is; without a limit batches do not get less."""
+    limit = int(PROCESS_BYTES) + 10**9
+    assert batch_memory(limit, 500_000) == pytest.approx(10**9 - scene_memory(500_000), abs=1)
+    assert batch_memory(limit, 10**9) == 10**9 // 8
+    assert batch_memory(None, 10**6) == batch_memory(None)
 
 
 def test_a_dr_jit_imported_too_early_is_an_error_not_a_crash(monkeypatch):

@@ -46,7 +46,7 @@ THIRD_OF_MANY, REST_OF_MANY = 0.35, 0.88  # patches are cheaper than walks
 PILOT_ERROR = 4.0  # times the target: when a pilot has seen enough to say how many rounds are needed
 MOST_PILOT_ROUNDS = 16
 PILOT_LANES = 2048
-SENSORS_FOR_PATCHES = 8  # along each side of the pilot's grid: the error of patches has no noise
+FEW_SENSORS = 8  # along each side of a pilot's grid: the error of patches has no noise
 MISSED = 3.0  # times the light that is found of bounce 5: one of the four legs that may lead past the laser point is
 RARE = 1e-4  # share of walks or paths: rarer light is not found by renders of common lengths, or by too few
 
@@ -144,7 +144,9 @@ class VirtualLightEngine:
             return replace(budget, fineness=self._fineness_in_time(budget, share * target))
         if self.further is not None:
             share = SHARES_OF_THIRD[0]
-        few = pilot_of(self.capture, SENSORS_FOR_PATCHES)
+        # surfaces nearer than the points are apart are seen by some of them only
+        is_far = self.tessellator.nearest > 2 * self.tessellator.reach / FEW_SENSORS
+        few = pilot_of(self.capture, FEW_SENSORS) if is_far else pilot
         fineness, n_patches = self.third.settle(few, share * target)
         if self.further is None:
             return replace(budget, fineness=fineness)
