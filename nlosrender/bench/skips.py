@@ -57,10 +57,10 @@ def measure_skips(scenes: Sequence[BenchScene]) -> list[Saving]:
     """
     savings: list[Saving] = []
     for scene in scenes:
-        savings += _of_gather(load(scene))
-        savings += _of_paths(load(scene))
+        savings += of_gather(load(scene))
+        savings += of_paths(load(scene))
     room = closed_room(16)
-    savings += _of_paths(load(room))
+    savings += of_paths(load(room))
     short = {**room.sections["time_axis"], "n_bins": SHORT_WINDOW_BINS}
     savings += _of_late_light(load(replace(room, sections={**room.sections, "time_axis": short})))
     savings += _of_regions(load(closed_room(ROOM_POINTS)))
@@ -68,7 +68,7 @@ def measure_skips(scenes: Sequence[BenchScene]) -> list[Saving]:
     return savings
 
 
-def _of_gather(loaded: LoadedScene) -> Iterator[Saving]:
+def of_gather(loaded: LoadedScene) -> Iterator[Saving]:
     """Yield what the gather leaves out: rays nothing can stop, the dark patches, colour."""
     from nlosrender.engine.path_engine import Budget
 
@@ -137,7 +137,7 @@ def _of_reciprocity(loaded: LoadedScene) -> Iterator[Saving]:
     yield _saving("pairs of points that reciprocity gives", loaded, *ways)
 
 
-def _of_paths(loaded: LoadedScene) -> Iterator[Saving]:
+def of_paths(loaded: LoadedScene) -> Iterator[Saving]:
     """Yield what the path engine leaves out: rays nothing can stop, the technique that is not needed."""
     from nlosrender import pipeline
     from nlosrender.engine.path_engine import PathEngine

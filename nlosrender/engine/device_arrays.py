@@ -19,14 +19,14 @@ from nlosrender.scene.build import WALL_ID, BuiltScene
 from nlosrender.scene.mesh_wall import SAME_FACE, too_fine
 from nlosrender.scene.pose import Float64
 
-KINDS = {"Float": np.float32, "UInt": np.uint32, "Int": np.int32}  # by Dr.Jit's names
+KINDS = {"Float": np.float32, "UInt": np.uint32, "UInt64": np.uint64, "Int": np.int32}  # by Dr.Jit's names
 ALIGNMENT = 64  # bytes, the widest vectors there are
 MESH_LIFT = 1e-4  # engine units: less than any fold of a mesh wall, far more than the rounding of its points
 MESH_NUDGE = 1e-6  # engine units: off the edges of its triangles, where rays may slip through
 
 
 def on_device(kind: Any, values: NDArray[np.generic]) -> Any:
-    """Bring numbers (n,) of 32 bits to the device as an array of type ``kind``.
+    """Bring numbers (n,) to the device as an array of type ``kind``.
 
     Dr.Jit takes numpy's memory as it is, and a kernel knows how its arrays are aligned: numpy aligns by chance, and
     each pattern of chance would be a kernel to compile.

@@ -10,12 +10,15 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from nlosrender.bench import references
+from nlosrender.bench import references, skips
 from nlosrender.bench.curve import Curve, Point, power_law
 from nlosrender.bench.peer import PeerContender, matched
 from nlosrender.bench.race import race
+from nlosrender.bench.rates import gather_rate
 from nlosrender.bench.references import Reference
-from nlosrender.bench.runs import Run
+from nlosrender.bench.runs import Run, load
+from nlosrender.bench.scaling import write_wavy_sheet
+from nlosrender.bench.scenes import wavy_sheet
 from nlosrender.cli.app import app
 
 TRUTH = np.random.default_rng(1).uniform(0.5, 1.5, (1, 10, 12, 400))  # (laser, row, column, bin)
@@ -134,6 +137,25 @@ def test_quadrature_of_the_plate_agrees_with_counting_small_cells():
     row = references._plate_row(cells, laser, sensor, 2.0, 0.01, 90)
     # points per bin 2e6 / 60, those at its two edges 2 * 1500, at random on either side: sqrt(3000) / 3e4 = 0.2 %
     assert np.linalg.norm(row - counted) / np.linalg.norm(counted) < 4e-3
+
+
+def test_the_gather_and_the_rays_it_leaves_out_are_counted_alike(tmp_path):
+    """Rays are fewer than pairs, fewer still where nothing can stop them, and what is left out changes nothing."""
+    write_wavy_sheet(tmp_path / "sheet.ply", 2000)
+    loaded = load(wavy_sheet(tmp_path / "sheet.ply", 16))
+    rate = gather_rate(loaded).report()
+    assert rate["traces_rays"]
+    assert rate["lit_patches"] <= rate["patches"]
+    assert rate["pairs"] == 256 * rate["patches"]
+    assert 0 < rate["asked_rays"] < rate["rays"] <= 256 * rate["lit_patches"]
+    assert rate["rays_left_out"] == 1 - rate["asked_rays"] / rate["pairs"]
+    (saving,) = skips.of_gather(loaded)
+    assert saving.what == "rays that nothing can stop"
+    assert saving.difference < 1e-6
+    box, mixture = skips.of_paths(loaded)
+    assert "pass the hidden geometry by" in box.what
+    assert box.difference == 0
+    assert mixture.difference > 0
 
 
 def test_unknown_names_are_refused_with_what_is_known():
