@@ -308,6 +308,8 @@ class PathEngine:
     def _of_paths(self, batch: Batch | Pilot, shape: HistogramShape, further_every: int) -> Transport:
         """Return what the lanes of a batch read that trace paths, neighbours together; see ``Transport``."""
         transport = self.transport(batch, shape, self.lane_order(batch))
+        if self.hidden_fraction > 0:
+            self.sampler.set_up()
         return replace(transport, hidden_box=self.hidden_box, further_every=dr.opaque(mi.UInt32, further_every))
 
     def lane_order(self, batch: Batch | Pilot) -> NDArray[np.int64]:

@@ -63,6 +63,10 @@ class SurfaceSampler:
         """Made when it is needed: a gather alone has no use for it, and it takes a second per million triangles."""
         return _Table.of(self._built)
 
+    def set_up(self) -> None:
+        """Make the table: what a recorded loop samples has to be there before."""
+        _ = self._table
+
     @property
     def n_triangles(self) -> int:
         """Triangles that are sampled."""

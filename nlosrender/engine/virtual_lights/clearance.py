@@ -262,16 +262,17 @@ class _View:
         least, most = ((end - self.least) / self.step for end in rectangle)
         first = dr.clip(dr.floor(least - SLACK), 0, TILES)
         last = dr.maximum(dr.clip(dr.floor(most + SLACK) + 1, 0, TILES), first)
-        one = mi.UInt64(1)
         columns, rows = (
-            (one << (mi.UInt64(last[axis]) * stride)) - (one << (mi.UInt64(first[axis]) * stride))
+            _bit(mi.UInt64(last[axis]) * stride) - _bit(mi.UInt64(first[axis]) * stride)
             for axis, stride in enumerate((1, TILES))
         )
         return (columns * OF_COLUMN) & rows & self.seen
 
 
-def _least(values: Sequence[T]) -> T:
-    return functools.reduce(dr.minimum, values)
+def _bit(index: mi.UInt64) -> mi.UInt64:
+    """Return the bit of a number, 0 for the one after the last: differences of two are the bits in between."""
+    # shifts by the whole width are not defined
+    return dr.select(index < TILES**2, mi.UInt64(1) << (index & (TILES**2 - 1)), 0)
 
 
 def _most(values: Sequence[T]) -> T:
