@@ -150,16 +150,16 @@ def batch_memory(limit: int | None, n_triangles: int = 0) -> int:
     RenderError
         The limit is below what the program itself needs.
     """
-    scene = scene_memory(n_triangles)
+    beside = 0 if limit is None else scene_memory(n_triangles)
     if limit is None:
-        limit = physical_memory() // 4 + scene
+        limit = physical_memory() // 4
     if limit <= PROCESS_BYTES:
         raise RenderError(
             f"render.memory_limit: got {limit / 1e6:.0f} MB, need more than {PROCESS_BYTES / 1e6:.0f} MB, "
             "which the program takes before any histogram"
         )
     left = limit - PROCESS_BYTES
-    return int(max(left - scene, left / 8))
+    return int(max(left - beside, left / 8))
 
 
 def scene_memory(n_triangles: int) -> int:

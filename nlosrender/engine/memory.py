@@ -62,10 +62,11 @@ def memory_warnings(engine: Engine, plan: Plan, memory_limit: int | None, lanes:
     available, scene = batch_memory(memory_limit, engine.built.n_triangles), scene_memory(engine.built.n_triangles)
     if isinstance(engine, VirtualLightEngine):
         _refuse_patches(engine, available)
-    if memory_limit is not None and scene + PROCESS_BYTES > memory_limit:
+    bound = physical if memory_limit is None else memory_limit
+    if scene + PROCESS_BYTES > bound:
         yield (
             f"render.memory_limit: {engine.built.n_triangles} triangles take about {_size(scene)} beside the program's "
-            f"{_size(PROCESS_BYTES)}, more than {_size(memory_limit)}."
+            f"{_size(PROCESS_BYTES)}, more than {_size(bound)}."
         )
     if memory_limit is not None and memory_limit > physical:
         yield f"render.memory_limit: {_size(memory_limit)} is more than the machine's {_size(physical)}."

@@ -128,7 +128,7 @@ class VirtualLightEngine:
         if budget not in self._settled:
             settled = self.settle_lights(budget)
             if self.has_further_bounces and self.further is None:
-                squares = self._known_squares(pilot_of(self.capture))
+                squares = self.third.gather(pilot_of(self.capture), settled.fineness or FIRST_COARSENESS).squares
                 goal = REST_OF_MANY * (budget.target_error or DEFAULT_TARGET)
                 paths = self.paths.settle(replace(budget, target_error=goal), known_squares=squares)
                 settled = replace(settled, spp=paths.spp)
@@ -144,13 +144,11 @@ class VirtualLightEngine:
             return replace(budget, fineness=self._fineness_in_time(budget, share * target))
         if self.further is not None:
             share = SHARES_OF_THIRD[0]
-        # surfaces nearer than the points are apart are seen by some of them only
-        is_far = self.tessellator.nearest > 2 * self.tessellator.reach / FEW_SENSORS
-        few = pilot_of(self.capture, FEW_SENSORS) if is_far else pilot
-        fineness, n_patches = self.third.settle(few, share * target)
+        few = self._pilot_of_patches(pilot)
+        fineness, third = self.third.settle(few, share * target)
         if self.further is None:
             return replace(budget, fineness=fineness)
-        goal, squares = REST_OF_MANY * target, self._known_squares(pilot)
+        goal, squares = REST_OF_MANY * target, third.squares * (pilot.sensors.size / few.sensors.size)
         replicas = max(2, PILOT_LANES // pilot.sensors.size // 2 * 2)
         histogram = self.further.histogram(pilot, replicas)
         done, error = 0, math.inf
@@ -158,15 +156,22 @@ class VirtualLightEngine:
             self.further.accumulate(pilot, histogram, done)
             done += 1
             error = histogram.relative_error(done, squares)
-        share = self.further.share_of_third(n_patches, error * math.sqrt(done) / target)
+        share = self.further.share_of_third(third.n_patches, error * math.sqrt(done) / target)
         if share < SHARES_OF_THIRD[0]:
             fineness, _ = self.third.settle(few, share * target)
         rounds = rounds_needed(error, done, math.sqrt(SQUARES - share**2) * target)
         return replace(budget, fineness=fineness, rounds=rounds)
 
-    def _known_squares(self, pilot: Pilot) -> float:
-        """Return the squares of a pilot's third bounce, about: what the error of further bounces is relative to."""
-        return self.third.gather(pilot, FIRST_COARSENESS).squares
+    def _pilot_of_patches(self, pilot: Pilot) -> Pilot:
+        """Return the pilot that patches are settled on: few points, unless some surface is nearer than they are apart.
+
+        Only some of the points see such a surface close up, or what lies behind it.
+        """
+        nearest = self.tessellator.nearest
+        if self.built.wall.is_planar and self.built.hidden_bounds is not None:
+            nearest = min(nearest, float(self.built.hidden_bounds[0][2]) / self.built.unit)
+        is_far = nearest > 2 * self.tessellator.reach / FEW_SENSORS
+        return pilot_of(self.capture, FEW_SENSORS) if is_far else pilot
 
     def render(self, batch: Batch, budget: Budget, progress: Progress = lambda fraction: None) -> Histogram:
         """Render one batch; as ``PathEngine.render``, whose errors it raises.

@@ -218,8 +218,8 @@ class ThirdBounce:
         """Gather a batch at ``fineness`` and at the coarser resolution it is compared with."""
         return self.gather(batch, self.coarser(fineness)), self.gather(batch, fineness)
 
-    def settle(self, pilot: Pilot, target: float) -> tuple[float, int]:
-        """Return the fineness whose estimated error is at most ``target``, and its number of patches."""
+    def settle(self, pilot: Pilot, target: float) -> tuple[float, Gathered]:
+        """Return the fineness whose estimated error is at most ``target``, and the pilot's third bounce at it."""
         tried = [(self.gather(pilot, FIRST_COARSENESS), math.inf)]  # and its error, coarse to fine
         fineness = self.finer(FIRST_COARSENESS, REFINEMENT)
         while True:
@@ -238,7 +238,7 @@ class ThirdBounce:
             is_stuck = STUCK * earlier < error < ROUGH and fine.n_patches > 2 * coarse.n_patches
             in_vain = is_stuck or (error < ROUGH and needed > MAX_PATCHES)
             if error <= target or in_vain or 2 * fine.n_patches > MAX_PATCHES:
-                return fineness, fine.n_patches
+                return fineness, fine
             tried.append((fine, error))
             fineness = self.finer(fineness, min(max(MARGIN * error / target, 1.25), REFINEMENT))
 
