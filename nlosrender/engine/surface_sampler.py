@@ -49,7 +49,7 @@ class SurfaceSampler:
 
     def __init__(self, built: BuiltScene):
         self._built = built
-        hidden = [shape for shape in built.scene.shapes() if shape.id() != WALL_ID]
+        hidden = built.hidden_shapes
         self._analytic = [shape for shape in hidden if not shape.is_mesh() and shape.class_name() in SAMPLEABLE_PLUGINS]
         self.has_analytic = bool(self._analytic)
         self.covers_everything = all(shape.is_mesh() or shape.class_name() in SAMPLEABLE_PLUGINS for shape in hidden)
@@ -100,9 +100,8 @@ class SurfaceSampler:
         u = dr.minimum(
             (mi.Float(bits - low) + 0.5) / dr.maximum(mi.Float(high - low), 1.0), dr.one_minus_epsilon(mi.Float)
         )
-        shape = dr.gather(
-            mi.ShapePtr, self._built.scene.shapes_dr(), dr.gather(mi.UInt32, self._table.owner, entry, active), active
-        )
+        owner = dr.gather(mi.UInt32, table.owner, entry, active)
+        shape = dr.gather(mi.ShapePtr, self._built.scene.shapes_dr(), owner, active)
         is_triangle = entry < self.n_triangles
         point, normal, primitive = mi.Point3f(0), mi.Normal3f(0), mi.UInt32(ANALYTIC)
         within = mi.Point2f(0)
@@ -113,9 +112,7 @@ class SurfaceSampler:
             within = mi.Point2f(root * (1 - v), root * v)
             point = a + (b - a) * within.x + (c - a) * within.y
             normal = mi.Normal3f(dr.cross(b - a, c - a))
-            primitive = dr.select(
-                on_triangle, dr.gather(mi.UInt32, self._table.primitive, entry, on_triangle), ANALYTIC
-            )
+            primitive = dr.select(on_triangle, dr.gather(mi.UInt32, table.primitive, entry, on_triangle), ANALYTIC)
         if self.has_analytic:
             on_analytic = active & ~is_triangle
             at, facing = self._on_analytic(shape, entry, mi.Point2f(u, v), on_analytic)
@@ -125,12 +122,13 @@ class SurfaceSampler:
     @dr.syntax
     def _entry(self, bits: mi.UInt32, active: mi.Bool) -> mi.UInt32:
         """Return the entry that covers the integers ``bits``: few steps, for the guide says where it may be."""
-        part = bits >> (32 - self._table.guide_bits)
-        low = dr.gather(mi.UInt32, self._table.guide, part, active)
-        high = dr.gather(mi.UInt32, self._table.guide, part + 1, active)
-        while dr.hint(active & (low < high), exclude=[self, bits, active]):
+        table = self._table
+        part = bits >> (32 - table.guide_bits)
+        low = dr.gather(mi.UInt32, table.guide, part, active)
+        high = dr.gather(mi.UInt32, table.guide, part + 1, active)
+        while dr.hint(active & (low < high), exclude=[table, bits, active]):
             middle = (low + high) >> 1
-            is_beyond = dr.gather(mi.UInt32, self._table.edges, middle + 1, active) <= bits
+            is_beyond = dr.gather(mi.UInt32, table.edges, middle + 1, active) <= bits
             low = dr.select(is_beyond, middle + 1, low)
             high = dr.select(is_beyond, high, middle)
         return low

@@ -168,8 +168,8 @@ class VirtualLightEngine:
         Only some of the points see such a surface close up, or what lies behind it.
         """
         nearest = self.tessellator.nearest
-        if self.built.wall.is_planar and self.built.hidden_bounds is not None:
-            nearest = min(nearest, float(self.built.hidden_bounds[0][2]) / self.built.unit)
+        if self.built.wall.is_planar and self.built.hidden_bounds is not None:  # what faces away from it, too
+            nearest = self.built.hidden_bounds[0][2] / self.built.unit
         is_far = nearest > 2 * self.tessellator.reach / FEW_SENSORS
         return pilot_of(self.capture, FEW_SENSORS) if is_far else pilot
 

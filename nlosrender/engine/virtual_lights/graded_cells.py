@@ -53,10 +53,10 @@ class GradedCells:
         wall = grading.wall_index
         self.is_hidden = np.ones(len(cells.shapes), bool) if wall is None else cells.shapes != wall
 
-    @property
-    def has_small_cells(self) -> bool:
-        """Whether some cells are merged at coarseness 1, the coarsest resolution there is."""
-        return bool((self._ratios < MERGED).any())
+    def set_up(self) -> None:
+        """Sum up the cells if some are merged at coarseness 1, the coarsest resolution there is."""
+        if (self._ratios < MERGED).any():
+            self.merger.set_up()
 
     def patches(self, coarseness: float) -> list[Patches]:
         """Return patches whose error is of order ``coarseness`` squared, in parts."""

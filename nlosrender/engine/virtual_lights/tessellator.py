@@ -73,8 +73,8 @@ class Tessellator:
 
     def set_up(self) -> None:
         """Sum up the cells that are merged at any resolution, if there are any."""
-        if self.shared.has_small_cells:
-            self.shared.merger.set_up()
+        for cells in (self.shared, *(self.regions.near if self.regions else ())):
+            cells.set_up()
 
     def patches(self, coarseness: float) -> Patches:
         """Return patches whose error is of order ``coarseness`` squared; those of the last calls are kept if few.
