@@ -113,6 +113,7 @@ def render_capture(
                 resolved, config_hash(config), engine=engine.name, seed=config.render.seed
             )
             partial.open(header, provenance | identity_attributes(identity), output.compression, output.variance)
+            warnings.say(partial.damage)
             earlier = len(partial.tally.units)
             units = remaining_units(plan, header.confocal, partial.tally.units)
             if cluster is None:

@@ -1,8 +1,9 @@
 """An append-only list of records that survives the process being killed at any byte.
 
 One line per record: CRC-32 of the rest, a space, JSON. A line that was cut off fails its checksum; it and everything
-after it never happened. After a power failure the last records may be gone: those that must not be are ``durable``.
-The file is locked while it is open; the system drops the lock with the process.
+after it never happened. The same holds for a whole line that fails it, which is damage: ``lost_bytes`` tells. After a
+power failure the last records may be gone: those that must not be are ``durable``. The file is locked while it is open;
+the system drops the lock with the process.
 """
 
 from __future__ import annotations
@@ -42,9 +43,11 @@ class Journal:
 
     def __init__(self, path: Path):
         self.path = path
+        self.lost_bytes = 0  # of damaged records and those behind them; what a kill cut off does not count
         self._descriptor = _locked(path)
         try:
             self._end = sum(length for _, length in _lines(path))
+            self.lost_bytes = _up_to_last_line(path, self._end)
             os.ftruncate(self._descriptor, self._end)  # a record that was cut off must not run into the next one
         except BaseException:
             self.close()
@@ -128,6 +131,17 @@ def _locked(path: Path) -> int:
 def _line(record: Mapping[str, Any]) -> bytes:
     text = json.dumps(record, separators=(",", ":"), allow_nan=False).encode()
     return b"%08x %s\n" % (zlib.crc32(text), text)
+
+
+def _up_to_last_line(path: Path, start: int) -> int:
+    """Return how many bytes from ``start`` on belong to lines with an end."""
+    whole = length = 0
+    with path.open("rb") as stream:
+        stream.seek(start)
+        for line in stream:
+            length += len(line)
+            whole = length if line.endswith(b"\n") else whole
+    return whole
 
 
 def _lines(path: Path) -> Iterator[tuple[dict[str, Any], int]]:

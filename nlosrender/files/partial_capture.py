@@ -4,8 +4,9 @@ A folder ``.NAME.partial`` beside the output holds the samples, an HDF5 file, an
 kill: its tables are in memory until it is closed. So nothing is read from them. The journal says for each finished
 unit where the bytes of its chunks lie and what their checksums are; those bytes are written once, before the journal's
 record, and never moved. From them a new HDF5 file is built when the earlier one was not closed properly. A unit is not
-waited for until it has reached the disk: after a power failure its record may be there and its bytes not, or torn, and
-its checksums tell; it is rendered again.
+waited for until it has reached the disk: after a power failure its record may be there and its bytes not, or torn.
+So every render that goes on reads the file first: a unit whose bytes fail their checksums is rendered again, and
+a closed file is opened again only when its other bytes have not changed either.
 """
 
 from __future__ import annotations
@@ -14,8 +15,7 @@ import os
 import shutil
 import socket
 import time
-import zlib
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
@@ -29,8 +29,17 @@ from nlosrender.files.journal import Journal, JournalInUseError
 from nlosrender.files.pieces import Cutter, PackedChunk
 from nlosrender.files.replacement import check_writable, explained_write, partial_folder, publish, synchronise
 from nlosrender.files.sink import CaptureSink, new_capture, sample_names
+from nlosrender.files.stored_bytes import StoredBytes, stored_bytes
 from nlosrender.files.sums import Sums
-from nlosrender.files.unit_log import StoredChunk, Tally, UnfinishedRender, UnitKey, unit_record, units_of
+from nlosrender.files.unit_log import (
+    StoredChunk,
+    Tally,
+    UnfinishedRender,
+    UnitKey,
+    closing_record,
+    unit_record,
+    units_of,
+)
 from nlosrender.interruption import uninterrupted
 
 JOURNAL = "journal"
@@ -47,8 +56,9 @@ class PartialCapture:
 
     def __init__(self, path: Path, target: Path, journal: Journal):
         self.path, self.target, self.folder = path, target, journal.path.parent
+        self.damage: list[str] = []  # what of the earlier render was damaged and is rendered again, in sentences
         self._journal = journal
-        self._state = UnfinishedRender.from_records(journal.records())
+        self._state = self._read_journal()
         self._identity: dict[str, Any] = {}
         self._sink: CaptureSink | None = None
         self._cutter: Cutter | None = None
@@ -140,14 +150,13 @@ class PartialCapture:
                 raise
             return sink
 
-        if self.tally.units and self._state.closed:
+        if self.tally.units and self._state.closed and self._is_whole():
             # on the disk before HDF5 changes its tables: a closed file's are believed
             self._note({"opened": True}, durable=True)
-            with suppress(FileError):  # damaged all the same: it is built anew
-                names = sample_names(store_variance)
-                self._sink = CaptureSink(self._samples(), self.path, names, reserved=root_attributes(header))
-                return
-        elif not self.tally.units:
+            names = sample_names(store_variance)
+            self._sink = CaptureSink(self._samples(), self.path, names, reserved=root_attributes(header))
+            return
+        if not self.tally.units:
             self._note({"identity": self._identity, "process": os.getpid(), "machine": socket.gethostname()})
             self._sink = create()
             return
@@ -223,10 +232,22 @@ class PartialCapture:
     ) -> None:
         self._leave()
 
+    def _read_journal(self) -> UnfinishedRender:
+        if self._journal.lost_bytes:
+            self.damage.append(
+                f"{self._journal.path}: is damaged; the units it told of from there on are rendered again."
+            )
+        try:
+            return UnfinishedRender.from_records(self._journal.records())
+        except ValueError:
+            self.damage = [f"{self._journal.path}: is damaged; everything is rendered again."]
+            return UnfinishedRender()
+
     def _begin(self, identity: dict[str, Any], resume: bool | None) -> None:
         exists = bool(self.tally.units) and self._samples().exists()
         if resume is True and not exists:
             hint = " It is complete: leave out --resume to render it again." if self.target.exists() else ""
+            hint = f" {self._journal.path} is damaged: leave out --resume to begin anew." if self.damage else hint
             raise FileError(f"{self.path}: there is no unfinished render to resume.{hint}")
         if exists and resume is not False:
             self._refuse_other(identity)
@@ -236,6 +257,8 @@ class PartialCapture:
                 for leftover in self.folder.glob("samples.*"):
                     leftover.unlink()
             self._state = UnfinishedRender()
+            if resume is False:
+                self.damage.clear()  # it was thrown away
         self._identity = identity
 
     def _refuse_other(self, identity: dict[str, Any]) -> None:
@@ -248,6 +271,18 @@ class PartialCapture:
                 "Use --overwrite to throw it away and start anew, or name another output."
             )
 
+    def _is_whole(self) -> bool:
+        """Return whether the closed file is, to the last byte, what was written."""
+        chunks = (chunk for _, chunks, _ in self._stored_units() for chunk in chunks)
+        with explained_write(self.path), stored_bytes(self._samples()) as stored:
+            if stored.closing(chunks) != self._state.closed:
+                self.damage.append(f"{self._samples()}: is damaged; it is built anew from the units that are whole.")
+                return False
+            return all(stored.has(chunks) for _, chunks, _ in self._stored_units())
+
+    def _stored_units(self) -> Iterator[tuple[UnitKey, list[StoredChunk], Sums]]:
+        return units_of(self._journal.records(), self._state.generation)
+
     def _rebuild(self, create: Callable[[], CaptureSink]) -> None:
         """Copy the units whose bytes are whole into a new file."""
         old, earlier = self._samples(), self._state
@@ -258,15 +293,14 @@ class PartialCapture:
         self._state = state
         try:
             self._sink = create()
-            with explained_write(self.path):
-                descriptor = os.open(old, os.O_RDONLY)
-            try:
+            with explained_write(self.path), stored_bytes(old) as stored:
                 for unit, chunks, sums in units_of(self._journal.records(), earlier.generation):
-                    if all(zlib.crc32(_bytes(descriptor, chunk)) == chunk.checksum for chunk in chunks):
-                        copies = (PackedChunk(c.dataset, c.at, _bytes(descriptor, c)) for c in chunks)
-                        self.store(unit, copies, sums)
-            finally:
-                os.close(descriptor)
+                    if stored.has(chunks):
+                        self.store(unit, _copies(stored, chunks), sums)
+            lost = len(earlier.tally.units) - len(self.tally.units)
+            if lost:
+                of_all = f"{lost} of {len(earlier.tally.units)} finished units"
+                self.damage.append(f"{old}: {of_all} are damaged on the disk and are rendered again.")
             with explained_write(self.path):
                 synchronise(self._samples())  # before the old file goes: its units would have to be done again
             self._note({"switched_to": state.generation}, durable=True)
@@ -291,11 +325,16 @@ class PartialCapture:
                     self._sink.close()
                     with explained_write(self.path):
                         synchronise(self._samples())
-                    self._note({"closed": True}, durable=True)
+                        self._note(self._closing(), durable=True)
                 except FileError:  # the journal knows enough to build the file anew
                     self._sink.abandon()
                 self._sink = None
             self._journal.close()
+
+    def _closing(self) -> dict[str, Any]:
+        chunks = (chunk for _, chunks, _ in self._stored_units() for chunk in chunks)
+        with stored_bytes(self._samples()) as stored:
+            return closing_record(stored.closing(chunks))
 
     def _note(self, record: Mapping[str, Any], *, durable: bool = False) -> None:
         with uninterrupted(), explained_write(self.path):
@@ -321,5 +360,9 @@ def _journal(path: Path, target: Path) -> Journal:
     raise FileError(f"{path}: cannot be written: its folder {folder} vanishes.")
 
 
-def _bytes(descriptor: int, chunk: StoredChunk) -> bytes:
-    return os.pread(descriptor, chunk.length, chunk.offset)
+def _copies(stored: StoredBytes, chunks: Iterable[StoredChunk]) -> Iterator[PackedChunk]:
+    for chunk in chunks:
+        content = stored.content(chunk)
+        if content is None:
+            raise FileError(f"{chunk.dataset}: changes while it is read. Does another program write it?")
+        yield PackedChunk(chunk.dataset, chunk.at, content)

@@ -25,6 +25,14 @@ class StoredChunk:
     checksum: int  # CRC-32 of the bytes
 
 
+@dataclass(frozen=True)
+class Closing:
+    """What a file of samples was like when HDF5 had closed it properly."""
+
+    size: int  # bytes
+    checksum: int  # CRC-32 of everything but the chunks
+
+
 @dataclass
 class Tally:
     """What is finished."""
@@ -51,26 +59,41 @@ class UnfinishedRender:
     first: Record = field(default_factory=dict)  # the record of how it began
     generation: int = 0  # of the file that holds the samples
     newest: int = 0  # generation that was ever begun
-    closed: bool = False  # whether HDF5 has closed that file properly
+    closed: Closing | None = None  # that file as HDF5 has closed it; None: it has not
     tally: Tally = field(default_factory=Tally)
 
     @classmethod
     def from_records(cls, records: Iterable[Record]) -> UnfinishedRender:
-        """Add up the records of a journal, oldest first."""
+        """Add up the records of a journal, oldest first.
+
+        Raises
+        ------
+        ValueError
+            They are not those of a render.
+        """
         state = cls()
         tallies: dict[int, Tally] = {}
-        for record in records:
-            state.closed = "closed" in record
-            if "identity" in record:
-                state.first = record
-            if "switched_to" in record:
-                state.generation = record["switched_to"]
-            if "unit" in record:
-                state.newest = max(state.newest, record["generation"])
-                tallies.setdefault(record["generation"], Tally()).add(*unit_of(record))
-        state.newest = max(state.newest, state.generation)
+        try:
+            for record in records:
+                closed = record.get("closed")
+                state.closed = Closing(*closed) if isinstance(closed, list) else None
+                if "identity" in record:
+                    state.first = record
+                if "switched_to" in record:
+                    state.generation = record["switched_to"]
+                if "unit" in record:
+                    state.newest = max(state.newest, record["generation"])
+                    tallies.setdefault(record["generation"], Tally()).add(*unit_of(record))
+            state.newest = max(state.newest, state.generation)
+        except (KeyError, TypeError, AttributeError, RecursionError) as error:
+            raise ValueError(f"no record of a render: {error!r}") from error
         state.tally = tallies.get(state.generation, Tally())
         return state
+
+
+def closing_record(closing: Closing) -> dict[str, Any]:
+    """Return the record that the file of samples is closed."""
+    return {"closed": astuple(closing)}
 
 
 def unit_record(generation: int, unit: UnitKey, chunks: Iterable[StoredChunk], sums: Sums) -> dict[str, Any]:

@@ -12,6 +12,7 @@ from nlosrender.capture.bounces import FILE_BOUNCES, LINE_OF_SIGHT, THIRD_BOUNCE
 from nlosrender.capture.bounces import FIRST_BOUNCE as FIRST
 from nlosrender.files import layout
 from nlosrender.files.attributes import get_attributes
+from nlosrender.files.energy_check import wrong_energies
 from nlosrender.files.reader import explained_read, open_hdf5
 from nlosrender.files.stored_header import dataset_in, samples_of, small_numbers, stored_points
 
@@ -45,7 +46,10 @@ def validate_file(path: str | Path) -> list[str]:
         if not found:  # values mean something only where types and shapes are right
             found += _values(file, path, sizes, confocal) + _points(file, path, sizes, confocal)
         found += _attributes(file, samples)
-        found += _finite(samples, layout.DATA)
+        damaged = _finite(samples, layout.DATA)
+        found += damaged or wrong_energies(
+            samples, _stored_parts(samples), get_attributes(file), get_attributes(samples)
+        )
         if layout.VARIANCE in file:
             variance = samples_of(file, path, layout.VARIANCE)
             if variance.shape != samples.shape:
