@@ -54,7 +54,9 @@ class Config(Section):
         filled = {"name": stem, **raw}
         output = filled.get("output", {})
         if isinstance(output, Mapping) and isinstance(filled["name"], str):
-            filled["output"] = {"path": f"{filled['name']}.hdf5", **output}
+            path = output.get("path", "{name}.hdf5")
+            path = path.replace("{name}", filled["name"]) if isinstance(path, str) else path
+            filled["output"] = {**output, "path": path}
         return _film_of_scene(_grids_on_patch(filled), validation)
 
     def rules(self) -> Iterator[Fault]:

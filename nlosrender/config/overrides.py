@@ -6,9 +6,11 @@ from collections.abc import Sequence
 from typing import Any
 
 from nlosrender.config.refusal import KeyPath, shown
+from nlosrender.config.text_keys import takes_text
 from nlosrender.config.yaml_tree import MAX_DEPTH, Document, Place, read_document
 from nlosrender.errors import ConfigError, Problem
 
+_NOTHING = ("", "~", "null", "Null", "NULL")
 _LONGEST_PLACE = 80  # characters of an absurd override that still help
 
 
@@ -20,7 +22,8 @@ def apply_overrides(document: Document, overrides: Sequence[str]) -> None:
     document
         Changed in place; its tree must be a mapping.
     overrides
-        Keys joined by dots, numbers index lists; the value is YAML. Missing mappings are created.
+        Keys joined by dots, numbers index lists; the value is YAML, but as it stands where a key takes text. Missing
+        mappings are created.
     """
     for override in overrides:
         place = f"--set {override}"
@@ -35,14 +38,17 @@ def apply_overrides(document: Document, overrides: Sequence[str]) -> None:
             document.problems.append(Problem(place[:_LONGEST_PLACE], "", message))
             continue
         try:
-            value = _value(document, key, text, place)
+            value = _value(parts, key, text, place)
             put(document, parts, value, Place(place, place))
         except ConfigError as error:
             document.problems.extend(error.problems)
 
 
-def _value(document: Document, key: str, text: str, place: str) -> Any:
+def _value(parts: Sequence[str], key: str, text: str, place: str) -> Any:
     """Read VALUE; where it stands inside the override is not worth telling."""
+    bare = text.strip()
+    if takes_text(parts) and bare not in _NOTHING and bare[:1] not in ("'", '"'):
+        return bare  # "{name}.hdf5", "a: b.ply" and "1e3" are names here: a shell has taken the quotes away
     try:
         read = read_document(text, place)
     except ConfigError as error:

@@ -108,7 +108,7 @@ class OutputConfig(Section):
     """The file that is written."""
 
     path: OutputPath = Path("capture.hdf5")
-    """default <name>.hdf5; relative to the current directory"""
+    """default <name>.hdf5; relative to the current directory; {name} in it is the capture's name"""
     format: Literal["znlos"] = "znlos"
     """znlos: the HDF5 layout of the Z-NLOS dataset"""
     frame: Literal["znlos", "scene"] = "znlos"

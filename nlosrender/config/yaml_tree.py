@@ -18,7 +18,9 @@ from yaml.reader import Reader, ReaderError
 from yaml.resolver import BaseResolver
 from yaml.scanner import Scanner
 
+from nlosrender.config.encodable import joined
 from nlosrender.config.refusal import KeyPath, shown
+from nlosrender.config.yaml_mistakes import syntax_problem
 from nlosrender.errors import ConfigError, Problem
 
 MAX_BYTES = 2**20
@@ -80,6 +82,11 @@ class _Composer(Reader, Scanner, Parser, Composer, BaseResolver):
         self._depth -= 1
         return node
 
+    def compose_scalar_node(self, anchor: Any) -> ScalarNode:
+        node: ScalarNode = super().compose_scalar_node(anchor)
+        node.value = joined(node.value)
+        return node
+
 
 for _name, _pattern, _first in (
     ("null", r"~|null|Null|NULL|", ["~", "n", "N", ""]),
@@ -121,7 +128,7 @@ def read_document(text: str, source: str) -> Document:
         if node is not None:
             _check_growth(node)
     except yaml.MarkedYAMLError as error:
-        raise ConfigError(_syntax_problem(error, source)) from error
+        raise ConfigError(syntax_problem(error, source)) from error
     except ReaderError as error:
         before = text[: error.position]
         place = f"{source}:{before.count(chr(10)) + 1}:{len(before) - before.rfind(chr(10))}"
@@ -132,14 +139,6 @@ def read_document(text: str, source: str) -> Document:
         document.places[()] = Place(_at(node, source), _at(node, source))
         document.tree = _Builder(document).build(node, ())
     return document
-
-
-def _syntax_problem(error: yaml.MarkedYAMLError, source: str) -> Problem:
-    mark = error.problem_mark or error.context_mark
-    place = f"{source}:{mark.line + 1}:{mark.column + 1}" if mark else source
-    context = f" ({error.context})" if error.context else ""
-    hint = " Indent with spaces." if "'\\t'" in str(error.problem) else ""
-    return Problem(place, "", f"not usable as YAML: {error.problem or 'syntax error'}{context}.{hint}")
 
 
 def _check_growth(root: Node) -> None:

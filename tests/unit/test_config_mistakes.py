@@ -254,12 +254,21 @@ MISTAKES = [
     ("spp: 16", "spp: §!!python/object/apply:os.system [ls]", "render.spp", r"tag !!python/.* is not allowed"),
     ("spp: 16", "spp: §!!int x", "render.spp", r"got 'x' \(text\) with the tag !!int, need a number"),
     ("spp: 16", "§3: 16", "render", r"got '3' \(text\) as a key, need text"),
-    ("spp: 16", "spp: [16]§]", "", r"not usable as YAML: expected <block end>"),
-    ("spp: 16", "spp: [16", "", r"not usable as YAML: expected ',' or '\]'.*while parsing a flow sequence"),
-    ("  spp: 16", "§\tspp: 16", "", r"not usable as YAML: .*Indent with spaces"),
-    ("spp: 16", "spp: §*none", "", r"not usable as YAML: found undefined alias"),
+    ("spp: 16", "spp: [16]§]", "", r"not usable as YAML: something stands behind a finished value"),
+    ("spp: 16", "spp: [16", "", r"not usable as YAML: .*not closed; add , or \]"),
+    ("  spp: 16", "§\tspp: 16", "", r"not usable as YAML: .*indent with spaces"),
+    ("spp: 16", "spp: §*none", "", r"not usable as YAML: nothing above is marked &none"),
     ("spp: 16", "spp: 16§\x07", "", r"character U\+0007 may not stand in YAML"),
-    ("name: z", "name: z\n---\nname: y", "", r"not usable as YAML"),
+    ("name: z", "name: z\n---\nname: y", "", r"not usable as YAML: there is a second document"),
+    (
+        "    height: 1.5",
+        "   §height: 1.5",
+        "",
+        r"not usable as YAML: the indentation does not fit the lines above.*line \d+",
+    ),
+    ("name: z", "name: z§: y", "", r"not usable as YAML: a second colon in one line.*put the text in quotes"),
+    ("name: z", "name: §'z", "", r"not usable as YAML: a quoted text is not closed"),
+    ("name: z", "name: §@z", "", r"not usable as YAML: a value cannot begin with @; put the text in quotes"),
 ]
 MISTAKES = [mistake for mistake in MISTAKES if mistake[0] != "up: "]
 

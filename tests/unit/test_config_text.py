@@ -278,3 +278,37 @@ def test_black_hidden_items_are_said_only_when_all_are() -> None:
     )
     assert config_warnings(one) == ()
     assert "every hidden item has reflectance 0" in config_warnings(both)[0]
+
+
+# --- what a shell hands over ---
+
+
+@pytest.mark.parametrize(
+    ("override", "key", "value"),
+    [
+        ("output.path={name}/{name}.hdf5", "output.path", "z/z.hdf5"),
+        ("output.path=out/{name}.hdf5", "output.path", "out/z.hdf5"),
+        ("output.path=a: b #1.hdf5", "output.path", "a: b #1.hdf5"),
+        ("output.path=[a].hdf5", "output.path", "[a].hdf5"),
+        ('output.path="caf\\udce9.hdf5"', "output.path", "caf\udce9.hdf5"),
+        ("output.path=caf\udce9.hdf5", "output.path", "caf\udce9.hdf5"),
+        ("name=1e3", "name", "1e3"),
+        ("name=yes", "name", "yes"),
+        ("name=true", "name", "true"),
+        ("name=*x", "name", "*x"),
+        ("name='a b'", "name", "a b"),
+        ('name="\\ud83d\\ude00"', "name", "\U0001f600"),
+    ],
+)
+def test_text_needs_no_quotes_on_the_command_line(override: str, key: str, value: str) -> None:
+    """Where a key takes text, VALUE is that text, whatever YAML would make of it: the shell has taken the quotes."""
+    config = parse(SMALL, override)
+    assert str(config.output.path if key == "output.path" else config.name) == value
+
+
+def test_surrogate_pairs_are_one_character() -> None:
+    """A config that is JSON writes an emoji as two escapes; as key, value or part of a list it is one character."""
+    text = SMALL + '"name": "\\ud83d\\ude00 \\u00e9"\n'
+    assert parse(text).name == "\U0001f600 é"
+    refused(SMALL + '"\\ud83d\\ude00": 1\n', match="\U0001f600: unknown key")
+    refused(SMALL + 'name: "\\ud83d"\n', match=r"z\.yaml:\d+:7: name: .*halves of characters")
