@@ -23,7 +23,9 @@ def export(
     file_format: Annotated[
         str,
         typer.Option(
-            "--format", metavar="NAME", help="tal (y-tal), fk (f-k migration), lct, or phasor_mat (diffraction)."
+            "--format",
+            metavar="NAME",
+            help="tal (y-tal), fk (f-k migration), lct, phasor_mat (diffraction), or learned (for networks).",
         ),
     ],
     output: Annotated[
@@ -38,6 +40,22 @@ def export(
         ),
     ] = None,
     bounces: Annotated[str, typer.Option(metavar="3|all", help="Light to export; bounces are summed.")] = "all",
+    legs: Annotated[
+        str | None,
+        typer.Option(
+            metavar="remove|keep",
+            help="tal: whether time is counted from the wall, or the legs to the wall are left in.",
+            show_default="remove",
+        ),
+    ] = None,
+    key: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NAME",
+            help="learned: name of the variable, such as final_meas or data (t, row, column).",
+            show_default="measlr",
+        ),
+    ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the report as one JSON object.")] = False,
 ) -> None:
     """Write a capture in the format of another program; what that cannot hold is refused or reported."""
@@ -51,7 +69,7 @@ def export(
         raise OptionError(f"--bounces: got {bounces!r}, need 3 or all")
     ending = f"-{file_format}{suffix_of(file_format)}"
     target = output or beside(file, ending)
-    report = export_capture(file, target, file_format, bounces)
+    report = export_capture(file, target, file_format, bounces, legs=legs, key=key)
     if as_json:
         typer.echo(json.dumps({"written": str(report.path), "losses": report.losses}))
         return

@@ -11,8 +11,10 @@ import numpy as np
 
 from nlosrender.files.layout import Float64
 from nlosrender.files.reader import StoredCapture
-from nlosrender.files.scan import Scan, light_bands
-from nlosrender.interruption import uninterrupted
+from nlosrender.files.rectified import Rectification, rectification
+from nlosrender.files.scan import Scan
+from nlosrender.files.shielded_hdf5 import shielded_hdf5
+from nlosrender.files.wall_order import OrderedCapture
 
 
 class HFormat(IntEnum):
@@ -42,39 +44,70 @@ class VolumeFormat(IntEnum):
     X_Y_3 = 3
 
 
-def write_tal(path: Path, capture: StoredCapture, scan: Scan, bounces: tuple[int, ...]) -> list[str]:
+def write_tal(path: Path, ordered: OrderedCapture, keep_legs: bool) -> list[str]:
     """Write ``path`` laser point by laser point; return what the format does not hold.
 
     A capture of 1 x 1 laser points is ``T_Sx_Sy`` as in y-tal's own files, and so is a confocal one.
+
+    Parameters
+    ----------
+    path, ordered
+        File and capture.
+    keep_legs
+        Leave time as it is in the capture; else count it from the wall.
+
+    Raises
+    ------
+    OSError
+        The disk refuses.
     """
+    scan = ordered.scan
+    move = None if keep_legs else rectification(scan)
     lasers = (1, 1) if scan.confocal else scan.lasers.shape[:2]
     pairs = lasers != (1, 1)
+    n_bins = scan.n_bins if move is None else move.n_bins
     columns, rows = scan.sensors.shape[1], scan.sensors.shape[0]
-    with h5py.File(path, "w") as file:
-        shape = (scan.n_bins, *(lasers[::-1] if pairs else ()), columns, rows)
-        chunk = (scan.n_bins, *((1, 1) if pairs else ()), 1, rows)
+    with shielded_hdf5(path) as hdf5:
+        file = hdf5.file
+        shape = (n_bins, *(lasers[::-1] if pairs else ()), columns, rows)
+        chunk = (n_bins, *((1, 1) if pairs else ()), 1, rows)
         samples = file.create_dataset("H", shape, "<f4", chunks=chunk, compression="gzip", compression_opts=1)
         for y, x in np.ndindex(*lasers):
-            for part, light in light_bands(capture, (y, x), bounces):
+            for part, stored in ordered.bands((y, x)):
+                light = stored if move is None else move.apply(stored, part, (0, 0) if scan.confocal else (y, x))
                 for column in range(columns):
-                    where = (slice(None), *((x, y) if pairs else ()), column, part)
-                    with uninterrupted():
-                        samples[where] = light[:, column].T
+                    hdf5.fill(samples, (slice(None), *((x, y) if pairs else ()), column, part), light[:, column].T)
         _write_enum(file, "H_format", HFormat.T_Lx_Ly_Sx_Sy if pairs else HFormat.T_Sx_Sy)
-        for name, position, points, stored in (
-            ("sensor", scan.sensor_position, scan.sensors, capture.positions.sensor_normals),
-            ("laser", scan.laser_position, scan.lasers, capture.positions.laser_normals),
-        ):
-            file[f"{name}_xyz"] = h5py.Empty(float) if position is None else position.astype(np.float32)
-            file[f"{name}_grid_xyz"] = _x_first(points)
-            file[f"{name}_grid_normals"] = _x_first(stored @ scan.wall_to_file[:3, :3])  # the inverse's transpose
-            _write_enum(file, f"{name}_grid_format", GridFormat.X_Y_3)
+        _write_grids(file, ordered)
         _write_enum(file, "volume_format", VolumeFormat.X_Y_Z_3)
         file["delta_t"] = scan.bin_width_opl
-        file["t_start"] = scan.start_opl
-        file["t_accounts_first_and_last_bounces"] = scan.legs_counted
-        file["scene_info"] = _scene_info(capture, scan)
-    return []
+        file["t_start"] = scan.start_opl if keep_legs else 0.0
+        file["t_accounts_first_and_last_bounces"] = scan.legs_counted and keep_legs
+        file["scene_info"] = _scene_info(ordered.capture, scan)
+    return _leg_losses(scan, move)
+
+
+def _leg_losses(scan: Scan, move: Rectification | None) -> list[str]:
+    if move is None:
+        kept = "the legs are left in: of y-tal's methods only bp and pf_dev take them off"
+        return [kept] if scan.legs_counted else []
+    if move.is_identity:
+        return []
+    what = "the legs laser -> wall and wall -> sensor are taken off" if scan.legs_counted else "time starts at the wall"
+    return [f"{what}: histograms are moved, and blurred by up to a bin; --legs keep leaves time as it is"]
+
+
+def _write_grids(file: h5py.File, ordered: OrderedCapture) -> None:
+    scan, stored = ordered.scan, ordered.capture.positions
+    for name, position, points, normals, order in (
+        ("sensor", scan.sensor_position, scan.sensors, stored.sensor_normals, ordered.sensor_order),
+        ("laser", scan.laser_position, scan.lasers, stored.laser_normals, ordered.laser_order),
+    ):
+        file[f"{name}_xyz"] = h5py.Empty(float) if position is None else position.astype(np.float32)
+        file[f"{name}_grid_xyz"] = _x_first(points)
+        # normals go by the inverse's transpose
+        file[f"{name}_grid_normals"] = _x_first(order.sorted(normals) @ scan.wall_to_file[:3, :3])
+        _write_enum(file, f"{name}_grid_format", GridFormat.X_Y_3)
 
 
 def _x_first(points: Float64) -> np.ndarray:

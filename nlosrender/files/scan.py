@@ -149,11 +149,24 @@ def light_bands(
     step = int(max(BAND_BYTES // row_bytes, 1))
     for start in range(0, sizes["sensor_y"], step):
         rows = slice(start, min(start + step, sizes["sensor_y"]))
-        block = capture.read_block(lasers=laser, sensors=(rows, None), bounces=bounces)
-        light = intensity(capture.header, block[:, :, 0, 0]).sum(axis=0)
-        if not np.isfinite(light).all():
-            raise FileError(f"{capture.path}: data holds numbers that are not finite; see `nlosrender info --check`")
-        yield rows, light
+        yield rows, read_light(capture, laser, rows, None, bounces)
+
+
+def read_light(
+    capture: StoredCapture, laser: tuple[int, int], rows: slice | None, columns: slice | None, bounces: tuple[int, ...]
+) -> Float32:
+    """Return (row, column, bin) of one laser point, bounces summed, colours averaged, of polarised light the intensity.
+
+    Raises
+    ------
+    FileError
+        The file is damaged, or holds a number that is not finite.
+    """
+    block = capture.read_block(lasers=laser, sensors=(rows, columns), bounces=bounces)
+    light = intensity(capture.header, block[:, :, 0, 0]).sum(axis=0)
+    if not np.isfinite(light).all():
+        raise FileError(f"{capture.path}: data holds numbers that are not finite; see `nlosrender info --check`")
+    return light
 
 
 def _device(position: Numbers | None, wall_from_file: Float64) -> Float64 | None:
