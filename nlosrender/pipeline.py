@@ -35,7 +35,7 @@ from nlosrender.files.size import disk_warnings
 from nlosrender.rendering.dask_executor import render_on_cluster
 from nlosrender.rendering.dask_worker import Job
 from nlosrender.rendering.local import render_units, resumable
-from nlosrender.rendering.report import Progress, RenderReport, Stopwatch, Warn, Warnings
+from nlosrender.rendering.report import Progress, RenderReport, Stopwatch, Warn, Warnings, Watch
 from nlosrender.rendering.sharing import ALONE, Sharing
 from nlosrender.scene.hidden_geometry import Surface, hidden_surfaces
 from nlosrender.scene.placing import placed
@@ -57,6 +57,7 @@ def render_capture(
     selection: Selection = WHOLE,
     resume: bool | None = None,
     cluster: Cluster | None = None,
+    watch: Watch = lambda standing: None,
 ) -> RenderReport:
     """Render one capture, or a part of it, and write its file.
 
@@ -75,6 +76,8 @@ def render_capture(
         False: start anew.
     cluster
         Who renders the units; None: this process. The file is the same.
+    watch
+        Called with how many units are finished: before the first one, and after each.
 
     Raises
     ------
@@ -126,6 +129,7 @@ def render_capture(
                 stopwatch=stopwatch,
                 progress=progress,
                 warn=lambda text: warnings.say([text]),
+                watch=watch,
             )
             tally = partial.tally
             bounces = engine.options.bounces

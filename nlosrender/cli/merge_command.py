@@ -25,14 +25,14 @@ def merge(
         ),
     ],
     output: Annotated[Path, typer.Option("--output", "-o", help="File to write.", readable=False)],
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress bar, no report.")] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress, no report; warnings stay.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print the report as one JSON object.")] = False,
 ) -> None:
     """Put the parts of a capture together; what is missing, there twice, damaged or not its own is named."""
     from nlosrender.cli.progress import progress_bar
     from nlosrender.files.merge import merge_captures
 
-    with progress_bar("merge", hidden=quiet) as (progress, _):
+    with progress_bar("merge", hidden=quiet) as (progress, _, _):
         report = merge_captures(parts, output, progress)
     if as_json:
         import dataclasses

@@ -72,7 +72,7 @@ def reconstruct(
         bool, typer.Option("--score", help="Compare with the true silhouette (of a file that carries its scene).")
     ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print the report as one JSON object.")] = False,
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress bar, no report.")] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress, no report; warnings stay.")] = False,
 ) -> None:
     """Reconstruct the hidden scene of a capture with phasor fields or filtered backprojection."""
     from nlosrender.analysis.reconstruction.reconstruct import ReconstructionSettings, reconstruct_capture
@@ -90,7 +90,7 @@ def reconstruct(
         raise OptionError(f"--output: got {str(volume_path)!r}, the name --png gives the picture. Name it .hdf5")
     if png:
         check_writable(picture_path)
-    with progress_bar("reconstruct", hidden=quiet) as (progress, warn):
+    with progress_bar("reconstruct", hidden=quiet) as (progress, warn, _):
         found = reconstruct_capture(file, settings, progress, warn)
     silhouette, scored = None, None
     if score:

@@ -68,7 +68,7 @@ def render(
         int | None,
         typer.Option(min=1, help="dask: processes to start, or to wait for.", show_default="one per core"),
     ] = None,
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress bar, no report.")] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress, no report; warnings stay.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print the report as one JSON object.")] = False,
 ) -> None:
     """Render a capture and write it as one HDF5 file.
@@ -109,9 +109,9 @@ def render(
     try:
         with (
             _cluster(executor, scheduler, workers) as cluster,
-            progress_bar("render", hidden=quiet) as (progress, warn),
+            progress_bar("render", hidden=quiet) as telling,
         ):
-            report = render_capture(loaded, progress, warn, selection=selection, resume=resume, cluster=cluster)
+            report = render_capture(loaded, **telling._asdict(), selection=selection, resume=resume, cluster=cluster)
     except ConfigError as error:
         raise with_places(error, config, changes) from error
     if as_json:

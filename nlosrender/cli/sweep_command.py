@@ -46,12 +46,12 @@ def render_all(
 
     def render(config: Config, progress: Progress, warn: Warn, resume: bool | None) -> RenderReport:
         try:
-            return render_capture(config, progress, warn, resume=resume, cluster=cluster)
+            return render_capture(config, progress, warn, resume=resume, cluster=cluster, watch=telling.watch)
         except ConfigError as error:
             raise with_places(error, Path(sweep.source), overrides) from error
 
-    with progress_bar("sweep", hidden=quiet) as (progress, warn):
-        report = render_sweep(sweep, render, shard=shard, resume=resume, progress=progress, warn=warn)
+    with progress_bar("sweep", hidden=quiet) as telling:
+        report = render_sweep(sweep, render, shard=shard, resume=resume, **telling._asdict())
     if as_json:
         _print_json(report)
     elif not quiet:

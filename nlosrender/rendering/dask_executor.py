@@ -19,8 +19,8 @@ from nlosrender.files.partial_capture import PartialCapture
 from nlosrender.interruption import StopRequest
 from nlosrender.rendering.dask_cluster import Cluster
 from nlosrender.rendering.dask_worker import Job, PackedUnit, Refusal, render_remotely
-from nlosrender.rendering.local import kept
-from nlosrender.rendering.report import Progress, Stopwatch, Warn
+from nlosrender.rendering.local import kept, standing
+from nlosrender.rendering.report import Progress, Stopwatch, Warn, Watch
 from nlosrender.rendering.units import UnitWriter
 
 if TYPE_CHECKING:
@@ -45,6 +45,7 @@ def render_on_cluster(
     stopwatch: Stopwatch,
     progress: Progress,
     warn: Warn,
+    watch: Watch,
 ) -> None:
     """Render units on a cluster and store each as it comes.
 
@@ -62,8 +63,9 @@ def render_on_cluster(
         Who renders.
     store_variance
         Whether the file has the variance.
-    stopwatch, progress, warn
-        Told the seconds (render and compress: summed over the workers), the share that is done, and what is odd.
+    stopwatch, progress, warn, watch
+        Told the seconds (render and compress: summed over the workers), the share that is done, what is odd, and what
+        is finished.
 
     Raises
     ------
@@ -84,13 +86,16 @@ def render_on_cluster(
     flight = _Flight(units, job, budget, store_variance, cluster)
     writer = UnitWriter(partial, stopwatch)
     done = len(partial.tally.units)
+    so_far = partial.tally.sums
+    watch(standing(so_far, done, total))
     try:
         for arrived in flight.arrivals(stop, warn):
             for stage, spent in arrived.seconds.items():
                 stopwatch.seconds[stage] += spent
             writer.store(arrived)
-            done += 1
+            done, so_far = done + 1, so_far + arrived.sums
             progress(done / total)
+            watch(standing(so_far, done, total))
         writer.wait()
     except (BackendError, IncompleteRender) as error:
         writer.wait()

@@ -11,8 +11,9 @@ from typing import TYPE_CHECKING
 from nlosrender.capture.plan import Unit
 from nlosrender.errors import FileError, IncompleteRender, InterruptedRender, RenderError
 from nlosrender.files.partial_capture import PartialCapture
+from nlosrender.files.sums import Sums
 from nlosrender.interruption import StopRequest, stop_request
-from nlosrender.rendering.report import Progress, Stopwatch, Warn
+from nlosrender.rendering.report import Progress, Standing, Stopwatch, Warn, Watch
 from nlosrender.rendering.units import RenderedUnit, UnitWriter, finished_unit, render_unit
 
 if TYPE_CHECKING:
@@ -56,6 +57,7 @@ def render_units(
     stopwatch: Stopwatch,
     progress: Progress,
     warn: Warn,
+    watch: Watch,
 ) -> None:
     """Render units and store each as it is done.
 
@@ -71,8 +73,8 @@ def render_units(
         Looked at after every unit.
     store_variance
         Whether the file has the variance.
-    stopwatch, progress, warn
-        Told the seconds, the share that is done, and that the user has to wait.
+    stopwatch, progress, warn, watch
+        Told the seconds, the share that is done, that the user has to wait, and what is finished.
 
     Raises
     ------
@@ -86,6 +88,8 @@ def render_units(
     spent = partial.tally.sums.seconds
     begun = time.perf_counter()
     writer = UnitWriter(partial, stopwatch)
+    so_far = partial.tally.sums  # which the writer is a unit behind of, later on
+    watch(standing(so_far, earlier, total))
     try:
         for number, unit in enumerate(units):
             limit = budget.time_limit_s
@@ -97,8 +101,12 @@ def render_units(
                 if stop.came:
                     warn(f"{stop.signal_name}: finishing the unit in flight; once more stops at once.")
 
-            writer.store(rendered(engine, unit, replace(budget, time_limit_s=limit), store_variance, stopwatch, told))
+            finished = rendered(engine, unit, replace(budget, time_limit_s=limit), store_variance, stopwatch, told)
+            so_far += finished.sums
+            writer.store(finished)
+            del finished  # its arrays are the writer's now
             told(1.0)
+            watch(standing(so_far, earlier + number + 1, total))
             if stop.came and number + 1 < len(units):
                 writer.wait()
                 raise InterruptedRender(f"{partial.path}: stopped by {stop.signal_name}{kept(partial, total)}")
@@ -139,6 +147,11 @@ def rendered(
     stopwatch.seconds["render"] += seconds - compiled
     confocal = engine.capture.scan_type == "confocal"
     return finished_unit(unit, histogram, confocal=confocal, store_variance=store_variance, seconds=seconds)
+
+
+def standing(sums: Sums, done: int, total: int) -> Standing:
+    """Return where a render stands whose finished units have these sums."""
+    return Standing("units", done, total, sums.error_estimate if done else None)
 
 
 def kept(partial: PartialCapture, total: int | None = None) -> str:

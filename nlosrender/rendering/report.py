@@ -11,6 +11,19 @@ from pathlib import Path
 Progress = Callable[[float], None]  # told the share of the work that is done, in [0, 1]
 Warn = Callable[[str], None]  # told one warning
 
+
+@dataclass(frozen=True)
+class Standing:
+    """How many units of a render, or captures of a sweep, are finished."""
+
+    what: str  # they are: "units", "captures"
+    done: int
+    total: int
+    error: float | None = None  # relative L2 error of H over what is finished; None: nothing is, or it is not known
+
+
+Watch = Callable[[Standing], None]  # told after every unit
+
 STAGES = ("scene", "compile", "render", "compress", "write")
 
 

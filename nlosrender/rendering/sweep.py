@@ -17,7 +17,7 @@ from nlosrender.files.dataset_index import IndexEntry, relative_name, stored_ent
 from nlosrender.files.identity import comparable_config
 from nlosrender.files.replacement import explained_write, partial_folder
 from nlosrender.interruption import StopRequest, stop_request
-from nlosrender.rendering.report import Progress, RenderReport, Warn
+from nlosrender.rendering.report import Progress, RenderReport, Standing, Warn, Watch
 
 INDEX_SECONDS = 10.0  # between two writings of the index: that of a large dataset takes a while
 
@@ -84,6 +84,7 @@ def render_sweep(
     resume: bool | None = None,
     progress: Progress = lambda share: None,
     warn: Warn = lambda text: None,
+    watch: Watch = lambda standing: None,
 ) -> SweepReport:
     """Render the captures of a sweep that are not there yet, and write their index.
 
@@ -102,6 +103,8 @@ def render_sweep(
         everything anew.
     progress, warn
         Told the share of the captures that are done, and warnings with the capture they are about.
+    watch
+        Told how many captures are finished.
 
     Raises
     ------
@@ -128,13 +131,15 @@ def render_sweep(
     with _index_kept(dataset), stop_request() as stop:
         for number, index in enumerate(todo):
             _stop_if_asked(stop, dataset, number)
+            watch(Standing("captures", len(there) + number, len(dataset.chosen)))
 
             def told(share: float, done: int = number) -> None:
-                progress((done + share) / len(todo))
+                progress((len(there) + done + share) / len(dataset.chosen))
 
             _render_one(dataset, index, render, False if resume is False else None, told, warn)
             told(1.0)
             dataset.write()
+        watch(Standing("captures", len(dataset.chosen), len(dataset.chosen)))
     failed = tuple(entry for entry in dataset.entries.values() if entry.status == "failed")
     rendered, earlier = len(todo) - len(failed), len(dataset.chosen) - len(todo)
     return SweepReport(dataset.path, len(dataset.chosen), rendered, earlier, failed, time.perf_counter() - begun)

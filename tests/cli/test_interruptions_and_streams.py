@@ -262,7 +262,7 @@ def test_a_bar_is_for_terminals_that_can_redraw_a_line(
     printed = stream()
     monkeypatch.setenv("TERM", term)
     monkeypatch.setattr(sys, "stderr", printed)
-    with progress_bar("render", hidden=False) as (progress, warn):
+    with progress_bar("render", hidden=False) as (progress, warn, _):
         progress(0.5)
         warn("look out")
     assert ("render" in printed.getvalue(), "\r" in printed.getvalue()) == (shown, shown)
