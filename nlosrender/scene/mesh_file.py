@@ -41,7 +41,7 @@ def read_mesh(filename: str, kind: str, *, face_normals: bool = False) -> Triang
         if path.stat().st_size > MAX_BYTES:
             raise ValueError(f"it is larger than {MAX_BYTES >> 30} GiB. Use fewer triangles, or a binary .ply.")
         content = path.read_bytes()
-        mesh = READERS[kind](content)
+        mesh = READERS[kind](content).mesh
     except OSError as error:
         raise ValueError(f"it cannot be read: {error.strerror or error}") from error
     except MemoryError as error:

@@ -1,6 +1,6 @@
 """Reads .obj meshes: positions, texture coordinates and normals of polygons, in float64.
 
-Materials, groups, lines and curves are passed over; no other file is opened.
+No other file is opened; materials, lines and curves are told (``FileMesh``), not taken.
 """
 
 from __future__ import annotations
@@ -10,17 +10,22 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from nlosrender.scene.triangle_mesh import TriangleMesh, fan_triangles, numbers_in
+from nlosrender.scene.file_mesh import BYTE_ORDER_MARK, FileMesh
+from nlosrender.scene.obj_text import ObjText, shown
+from nlosrender.scene.polygons import cut_polygons
+from nlosrender.scene.pose import Float64
+from nlosrender.scene.triangle_mesh import TriangleMesh, numbers_in
 
 Int64 = NDArray[np.int64]
 
 MOST_CORNERS = 1000  # of a polygon
 ABSENT = 0  # in place of an index; the first of each kind is 1
 _LARGEST_INDEX = 2**40
-_KINDS = {b"v": 3, b"vt": 2, b"vn": 3}  # numbers that count; more may follow (weights, colours)
+_KINDS = {b"v": (3, 3), b"vt": (1, 2), b"vn": (3, 3)}  # numbers needed, and read; more may follow (weights, colours)
+_NAMES = ("vertex", "texture coordinate", "normal")
 
 
-def read_obj(content: bytes) -> TriangleMesh:
+def read_obj(content: bytes) -> FileMesh:
     """Return the mesh of an .obj file.
 
     Parameters
@@ -30,57 +35,63 @@ def read_obj(content: bytes) -> TriangleMesh:
 
     Returns
     -------
-    TriangleMesh
-        In the file's coordinates; texture coordinates and normals are kept when every corner has them. The vertical
-        texture coordinate is turned round, as images in .obj files have it. Polygons are cut into fans from their
-        first corner (right for convex ones).
+    FileMesh
+        In the file's coordinates; texture coordinates are kept when every corner has them. The vertical texture
+        coordinate is turned round, as images in .obj files have it. Polygons are cut into triangles.
 
     Raises
     ------
     ValueError
-        A number or an index cannot be; names the line's content.
+        A number or an index cannot be, or a polygon crosses itself; names the line.
     """
     if b"\0" in content:
-        raise ValueError("it holds a zero byte, so it is not text")
-    lines = content.replace(b"\\\r\n", b" ").replace(b"\\\n", b" ").splitlines()
-    rows: dict[bytes, list[int]] = {kind: [] for kind in (*_KINDS, b"f")}
-    for number, line in enumerate(lines):
-        words = line.split(None, 1)
-        if words and words[0] in rows:
-            rows[words[0]].append(number)
-    positions, uvs, normals = (_numbers([lines[i] for i in rows[kind]], kind) for kind in _KINDS)
+        hint = " It may be UTF-16: save it as UTF-8" if content[:2] in (b"\xff\xfe", b"\xfe\xff") else ""
+        raise ValueError(f"it holds a zero byte, so it is not text.{hint}".removesuffix("."))
+    text = ObjText.of(content.removeprefix(BYTE_ORDER_MARK))
+    positions, uvs, normals = (_numbers(text, kind) for kind in _KINDS)
     for kind, what in ((b"v", "vertices"), (b"f", "faces")):
-        if not rows[kind]:
+        if not text.rows(kind):
             raise ValueError(f"no line of it starts with {kind.decode()}: it has no {what}")
-    defined = [np.asarray(rows[kind], dtype=np.int64) for kind in _KINDS]
-    polygons = _polygons([lines[i] for i in rows[b"f"]], np.asarray(rows[b"f"], dtype=np.int64), defined)
-    corners = np.stack([fan_triangles([part[..., k] for part in polygons]) for k in range(3)], axis=-1).reshape(-1, 3)
-    has_uvs, has_normals = (bool((corners[:, k] >= 0).all()) for k in (1, 2))
-    chosen, faces = _distinct(corners, [0] + [1] * has_uvs + [2] * has_normals)
-    return TriangleMesh(
+    TriangleMesh(positions, np.zeros((0, 3), dtype=np.int64))  # refuses what is not finite
+    groups = _polygons(text)
+    corners, bent = _triangles(text, groups, positions)
+    has = corners >= 0
+    no_uvs = "it has no texture coordinates"
+    if has[:, 1].any():
+        no_uvs = "" if has[:, 1].all() else f"its face at {_first_without_uvs(text, groups)} has no texture coordinates"
+    has_normals = bool(has[:, 2].any())
+    chosen, faces = _distinct(corners, [0] + [1] * (not no_uvs) + [2] * has_normals)
+    n_flat = sum(len(rows) for rows, indices in groups if indices.shape[1] < 3)
+    mesh = TriangleMesh(
         positions[chosen[:, 0]],
         faces.reshape(-1, 3),
-        uvs[chosen[:, 1]] * [1.0, -1.0] + [0.0, 1.0] if has_uvs else None,
-        normals[chosen[:, 2]] if has_normals else None,
+        None if no_uvs else uvs[chosen[:, 1]] * [1.0, -1.0] + [0.0, 1.0],
+        # the row that -1 finds: a corner without a normal
+        np.append(normals, [[0.0, 0.0, 0.0]], axis=0)[chosen[:, 2]] if has_normals else None,
     )
+    dropped = [f"{n_flat} faces of less than 3 corners"] * bool(n_flat)
+    dropped += ["texture coordinates of some faces"] * bool(no_uvs and has[:, 1].any())
+    return FileMesh(mesh, text.materials(), (*dropped, *text.dropped()), bent + text.doubts(), no_uvs)
 
 
-def _numbers(lines: Sequence[bytes], kind: bytes) -> NDArray[np.float64]:
-    """Return the numbers of all lines of one kind, (lines, 2 or 3)."""
-    need = _KINDS[kind]
+def _numbers(text: ObjText, kind: bytes) -> Float64:
+    """Return the numbers of all lines of one kind, (lines, 2 or 3); zero where they may be left away."""
+    least, need = _KINDS[kind]
+    rows = text.rows(kind)
+    lines = [text.lines[row] for row in rows]
     if not lines:
         return np.zeros((0, need))
     width = len(lines[0].split()) - 1
     values = _parsed(lines, np.float64)
     if width >= need and len(values) == width * len(lines) and all(len(line.split()) == width + 1 for line in lines):
         return values.reshape(-1, width)[:, :need]
-    rows = []
-    for line in lines:
-        row = _parsed([line], np.float64)
-        if len(row) < need or len(row) != len(line.split()) - 1:
-            raise ValueError(f"line {_shown(line)}: need {need} numbers after {kind.decode()}")
-        rows.append(row[:need])
-    return np.array(rows)
+    found = np.zeros((len(lines), need))
+    for row, line in enumerate(lines):
+        numbers = _parsed([line], np.float64)
+        if len(numbers) < least or len(numbers) != len(line.split()) - 1:
+            raise ValueError(f"{text.place(rows[row])}: need {least} numbers after {kind.decode()}, got {shown(line)}")
+        found[row, : len(numbers)] = numbers[:need]
+    return found
 
 
 def _parsed(lines: Sequence[bytes], dtype: type) -> NDArray:
@@ -89,19 +100,22 @@ def _parsed(lines: Sequence[bytes], dtype: type) -> NDArray:
     return numbers_in(b" ".join(parts[1] for parts in words if len(parts) > 1).replace(b"/", b" "), dtype)
 
 
-def _polygons(lines: Sequence[bytes], at: Int64, defined: Sequence[Int64]) -> list[Int64]:
-    """Return polygons grouped by how their lines are built: (faces, corners, 3) indices from 0, -1 where absent.
+def _triangles(text: ObjText, groups: Sequence[tuple[Int64, Int64]], positions: Float64) -> tuple[Int64, tuple]:
+    """Return the corners (3 m, 3) of the triangles that polygons are cut into, and what there is to say of these."""
+    polygons = [(rows, indices) for rows, indices in groups if indices.shape[1] > 2]
+    cuts, bent = cut_polygons(
+        [positions[indices[..., 0]] for _, indices in polygons],
+        lambda group, number: text.place(polygons[group][0][number]),
+    )
+    parts = [indices[owners[:, None], corners] for (_, indices), (owners, corners) in zip(polygons, cuts, strict=True)]
+    return np.concatenate([np.zeros((0, 3, 3), np.int64), *parts]).reshape(-1, 3), bent
 
-    Parameters
-    ----------
-    lines
-        The lines that start with f.
-    at
-        Their places in the file.
-    defined
-        Places of the lines that define positions, texture coordinates and normals: a negative index counts back
-        from those above its line.
-    """
+
+def _polygons(text: ObjText) -> list[tuple[Int64, Int64]]:
+    """Return polygons grouped by how their lines are built: their lines (faces,), and the indices from 0 of their
+    corners (faces, corners, 3), -1 where absent."""
+    at, defined = np.asarray(text.rows(b"f")), [np.asarray(text.rows(kind), dtype=np.int64) for kind in _KINDS]
+    lines = [text.lines[row] for row in at]
     groups: dict[tuple[int, int, bytes], list[int]] = {}
     for number, line in enumerate(lines):
         pattern = line.translate(None, b"+-0123456789")
@@ -109,25 +123,38 @@ def _polygons(lines: Sequence[bytes], at: Int64, defined: Sequence[Int64]) -> li
     found = []
     for (n_corners, gaps, pattern), numbers in groups.items():
         if n_corners > MOST_CORNERS:
-            raise ValueError(f"line {_shown(lines[numbers[0]])}: {n_corners} corners, need at most {MOST_CORNERS}")
-        if n_corners < 3:
-            continue  # a point or a line has no surface
-        members = [lines[number] for number in numbers]
-        written = _corners(members, n_corners, _parts(n_corners, gaps, pattern.split()[1:]))
-        indices = written - 1
-        for k, places in enumerate(defined):
-            above = np.searchsorted(places, at[numbers])[:, None]
-            indices[..., k] = np.where(written[..., k] < 0, above + written[..., k], indices[..., k])
-            wrong = (indices[..., k] >= len(places)) | (indices[..., k] < (0 if k == 0 else -1))
-            wrong |= (indices[..., k] < 0) & (written[..., k] != ABSENT)
-            if wrong.any():
-                what, count = ("vertex", "texture coordinate", "normal")[k], len(places)
-                line = members[int(np.argmax(wrong.any(axis=1)))]
-                raise ValueError(
-                    f"line {_shown(line)} refers to a {what} that is not there: the file has {count}, the first is 1"
-                )
-        found.append(indices)
+            raise ValueError(f"{text.place(at[numbers[0]])}: {n_corners} corners, need at most {MOST_CORNERS}")
+        rows = at[numbers]
+        written = _corners(text, rows, n_corners, _parts(n_corners, gaps, pattern.split()[1:]))
+        found.append((rows, _from_zero(text, written, rows, defined)))
     return found
+
+
+def _from_zero(text: ObjText, written: Int64, rows: Int64, defined: Sequence[Int64]) -> Int64:
+    """Return indices from 0, -1 where absent.
+
+    Parameters
+    ----------
+    written
+        (faces, corners, 3) as the lines have them: a negative index counts back from those above its line.
+    rows
+        Lines of the faces.
+    defined
+        Lines that define positions, texture coordinates and normals.
+    """
+    indices = written - 1
+    for k, places in enumerate(defined):
+        above = np.searchsorted(places, rows)[:, None]
+        indices[..., k] = np.where(written[..., k] < 0, above + written[..., k], indices[..., k])
+        wrong = (indices[..., k] >= len(places)) | (indices[..., k] < (0 if k == 0 else -1))
+        wrong |= (indices[..., k] < 0) & (written[..., k] != ABSENT)
+        if wrong.any():
+            row = rows[int(np.argmax(wrong.any(axis=1)))]
+            raise ValueError(
+                f"{text.place(row)}, {shown(text.lines[row])}, refers to a {_NAMES[k]} that is not there: the file has "
+                f"{len(places)}, the first is 1"
+            )
+    return indices
 
 
 def _parts(n_corners: int, gaps: int, slashes: Sequence[bytes]) -> list[int]:
@@ -151,34 +178,38 @@ def _parts(n_corners: int, gaps: int, slashes: Sequence[bytes]) -> list[int]:
     return []
 
 
-def _corners(lines: Sequence[bytes], n_corners: int, parts: Sequence[int]) -> Int64:
+def _corners(text: ObjText, rows: Int64, n_corners: int, parts: Sequence[int]) -> Int64:
     """Return the indices as written, (lines, corners, 3)."""
+    lines = [text.lines[row] for row in rows]
     found = np.full((len(lines), n_corners, 3), ABSENT, dtype=np.int64)
     numbers = _parsed(lines, np.int64) if parts else np.zeros(0, dtype=np.int64)
     if len(numbers) == len(lines) * n_corners * len(parts) > 0 and np.abs(numbers).max() < _LARGEST_INDEX:
         found[..., parts] = numbers.reshape(len(lines), n_corners, len(parts))
         return found
-    for row, line in enumerate(lines):
+    for face, line in enumerate(lines):
         for corner, word in enumerate(line.split()[1:]):
             try:
                 written = [int(part) if part else ABSENT for part in word.split(b"/")]
             except ValueError:
                 written = []
             if not 1 <= len(written) <= 3 or any(abs(index) >= _LARGEST_INDEX for index in written):
-                raise ValueError(f"line {_shown(line)}: {_shown(word)} is no corner, need v, v/vt, v//vn or v/vt/vn")
-            found[row, corner, : len(written)] = written
+                raise ValueError(
+                    f"{text.place(rows[face])}: {shown(word)} is no corner, need v, v/vt, v//vn or v/vt/vn"
+                )
+            found[face, corner, : len(written)] = written
     return found
+
+
+def _first_without_uvs(text: ObjText, groups: Sequence[tuple[Int64, Int64]]) -> str:
+    lacking = [rows[(indices[..., 1] < 0).any(axis=1)] for rows, indices in groups if indices.shape[1] > 2]
+    return text.place(int(np.concatenate(lacking).min()))
 
 
 def _distinct(corners: Int64, parts: Sequence[int]) -> tuple[Int64, Int64]:
     """Return the different corners (n, 3), told by ``parts`` of their indices, and which of them each corner is."""
     ids = corners[:, 0]
     for part in parts[1:]:
-        # below 2^63: the first factor counts lines of the file at most
-        ids = np.unique(ids, return_inverse=True)[1] * (int(corners[:, part].max(initial=0)) + 1) + corners[:, part]
+        # below 2^63: the first factor counts lines of the file at most; from 0 where -1 is absent
+        ids = np.unique(ids, return_inverse=True)[1] * (int(corners[:, part].max(initial=0)) + 2) + corners[:, part] + 1
     _, first, which = np.unique(ids, return_index=True, return_inverse=True)
     return corners[first], which
-
-
-def _shown(text: bytes) -> str:
-    return repr(text[:60].decode("latin-1"))

@@ -175,31 +175,6 @@ class TriangleMesh:
         return np.cross(b - a, c - a)
 
 
-def fan_triangles(polygons: Sequence[NDArray]) -> NDArray[np.int64]:
-    """Return the triangles (m, 3) of polygons, each cut into a fan from its first corner: right for convex ones.
-
-    Parameters
-    ----------
-    polygons
-        Arrays (faces, corners) of vertex indices, one per number of corners; those of less than 3 have no area.
-
-    Raises
-    ------
-    ValueError
-        An index is not an integer.
-    """
-    fans = [np.zeros((0, 3), dtype=np.int64)]
-    for corners in polygons:
-        if corners.dtype.kind == "f" and not (np.abs(corners) < 2**53).all():
-            raise ValueError("a face has an index that is no number, or far too large")
-        indices = corners.astype(np.int64)
-        if corners.dtype.kind == "f" and (indices != corners).any():
-            raise ValueError(f"a face has the index {corners[indices != corners][0]:g}, need integers")
-        for corner in range(1, corners.shape[1] - 1):
-            fans.append(indices[:, [0, corner, corner + 1]])
-    return np.concatenate(fans)
-
-
 def numbers_in(text: bytes, dtype: type) -> NDArray:
     """Return the numbers in a text, separated by white space, up to the first word that is none."""
     with warnings.catch_warnings():

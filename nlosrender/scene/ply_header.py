@@ -1,0 +1,124 @@
+"""The header of a .ply file: which elements there are, how many of each, and how their values are laid out."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+MAX_HEADER = 2**16  # bytes; the header of a scan with long comments takes a few thousand
+TYPES = {"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4"}
+TYPES |= {"int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4"}
+TYPES |= {"float": "f4", "float32": "f4", "double": "f8", "float64": "f8"}
+BYTE_ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
+MOST_CORNERS = 1000  # of a polygon; more is a damaged count
+LONGEST_LIST = 2**31 - 1  # of anything else: one strip may hold all triangles of a mesh
+
+
+@dataclass(frozen=True)
+class PlyProperty:
+    """A value, or a list of values, of each record of an element."""
+
+    name: str
+    dtype: str
+    count_dtype: str | None  # of a list's length; None: one value
+
+
+@dataclass(frozen=True)
+class PlyElement:
+    """What the header says of one element."""
+
+    name: str
+    count: int
+    properties: tuple[PlyProperty, ...]
+
+    def dtype(self, lengths: Sequence[int], n_properties: int | None = None) -> np.dtype:
+        """Return the layout of the first properties of a record, all of them by default, whose lists have lengths."""
+        fields: list[tuple] = []
+        of_lists = iter(lengths)
+        for index, prop in enumerate(self.properties[:n_properties]):
+            if prop.count_dtype is None:
+                fields.append((f"{index}", prop.dtype))
+            else:
+                fields += [(f"{index}n", prop.count_dtype), (f"{index}", prop.dtype, (next(of_lists),))]
+        return np.dtype(fields)
+
+    @property
+    def longest_list(self) -> int:
+        """The most values that a list of this element can have."""
+        return MOST_CORNERS if self.name == "face" else LONGEST_LIST
+
+    def no_length(self, record: int, length: float) -> str:
+        """Return the message about a list that cannot be so long."""
+        return f"{self.name} {record} has a list of {length:g} values, need 0 to {self.longest_list}"
+
+    def cut_short(self, found: int) -> ValueError:
+        """Return the error of a file that has only some of the records."""
+        return ValueError(f"it says that it has {self.count} of element {self.name}, but ends after {found}")
+
+
+@dataclass(frozen=True)
+class PlyHeader:
+    """A header that makes sense."""
+
+    is_ascii: bool
+    elements: tuple[PlyElement, ...]
+    size: int  # bytes: where the body begins
+
+    def names(self, element: str) -> tuple[str, ...]:
+        """Return the names of the properties of an element; none if there is no such element."""
+        return tuple(prop.name for own in self.elements if own.name == element for prop in own.properties)
+
+    def promised(self) -> str:
+        """Return how many of which elements there are, for messages."""
+        return ", ".join(f"{element.count} of element {element.name}" for element in self.elements)
+
+
+def read_header(content: bytes) -> PlyHeader:
+    """Return the header at the beginning of a file's bytes; lines may end as on any system.
+
+    Raises
+    ------
+    ValueError
+        It is none, or a line of it means nothing.
+    """
+    first = re.match(rb"ply[ \t]*(\r\n|\n|\r)", content)
+    if first is None:
+        raise ValueError(f"it starts with {content[:12]!r}, not with the line ply" if content else "it is empty")
+    # old Macintosh lines end in \r alone, and a binary body after them may begin with \n
+    line_end = rb"\r" if first[1] == b"\r" else rb"\r?\n"
+    end = re.compile(rb"[\r\n]end_header[ \t]*" + line_end).search(content, 0, MAX_HEADER)
+    if end is None:
+        raise ValueError(f"its header has no line end_header within {MAX_HEADER} bytes")
+    order, elements = "", list[tuple[str, int, list[PlyProperty]]]()
+    for number, line in enumerate(content[: end.start()].decode("latin-1").splitlines()[1:], start=2):
+        words = line.split()
+        match words:
+            case [] | ["comment" | "obj_info", *_]:
+                continue
+            case ["format", name, _] if name in BYTE_ORDERS:
+                order = BYTE_ORDERS[name]
+            case ["element", name, count] if count.isdecimal() and len(count) < 20:
+                elements.append((name, int(count), []))
+            case ["property", "list", length, kind, name] if elements and {length, kind} <= set(TYPES):
+                elements[-1][2].append(PlyProperty(name, TYPES[kind], TYPES[length]))
+            case ["property", kind, name] if elements and kind in TYPES:
+                elements[-1][2].append(PlyProperty(name, TYPES[kind], None))
+            case _:
+                raise ValueError(f"line {number} of its header means nothing: {line[:60]!r}")
+    if not order:
+        raise ValueError(f"its header has no line format, one of {', '.join(BYTE_ORDERS)}")
+    ordered = [
+        PlyElement(name, count, tuple(_ordered(prop, order) for prop in props)) for name, count, props in elements
+    ]
+    return PlyHeader(order == "=", tuple(ordered), end.end())
+
+
+def _ordered(prop: PlyProperty, byte_order: str) -> PlyProperty:
+    """Return the property as it stands in the body; in an ASCII file, everything has been read as float64."""
+    if byte_order == "=":
+        return PlyProperty(prop.name, "=f8", None if prop.count_dtype is None else "=f8")
+    count = None if prop.count_dtype is None else byte_order + prop.count_dtype
+    return PlyProperty(prop.name, byte_order + prop.dtype, count)
