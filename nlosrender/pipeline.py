@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import functools
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -24,6 +24,7 @@ from nlosrender.config.document import Config
 from nlosrender.config.load import config_hash, config_to_dict
 from nlosrender.config.warnings import config_warnings
 from nlosrender.engine.backend import Backend, batch_memory, physical_memory, start_backend
+from nlosrender.errors import ConfigError, Problem
 from nlosrender.files.capture_file import CaptureHeader
 from nlosrender.files.chunks import sensor_tile
 from nlosrender.files.identity import capture_identity, files_read, identity_attributes
@@ -43,6 +44,8 @@ from nlosrender.scene.relay_wall import RelayWall, relay_wall_from_config
 
 if TYPE_CHECKING:
     from nlosrender.engine.path_engine import Budget
+    from nlosrender.engine.unsampled_paths import UnsampledPaths
+    from nlosrender.files.sums import Sums
     from nlosrender.rendering.dask_cluster import Cluster
     from nlosrender.rendering.units import Engine
     from nlosrender.scene.build import BuiltScene
@@ -58,6 +61,7 @@ def render_capture(
     resume: bool | None = None,
     cluster: Cluster | None = None,
     watch: Watch = lambda standing: None,
+    strict: bool = False,
 ) -> RenderReport:
     """Render one capture, or a part of it, and write its file.
 
@@ -78,10 +82,13 @@ def render_capture(
         Who renders the units; None: this process. The file is the same.
     watch
         Called with how many units are finished: before the first one, and after each.
+    strict
+        Refuse to render where light is missing that no technique samples.
 
     Raises
     ------
     ConfigError
+        ``strict``, and there are paths that carry light and are not sampled.
         Something only the renderer could find wrong: a mesh that cannot be read, a BSDF that Mitsuba rejects, a
         capture that does not fit the memory.
     OptionError
@@ -108,6 +115,8 @@ def render_capture(
     with PartialCapture.claim(output.path, identity, resume) as partial:
         with stopwatch.stage("scene"):
             plan, engine, header = set_up_engine(config, backend, selection, sharing)
+            unsampled = missing_light(engine, strict)
+            warnings.say(paths.warning for paths in unsampled)
             warnings.say(late_warnings(config, backend, plan, engine, header, sharing))
         with stopwatch.stage("render"):
             budget = settled_budget(config, engine)
@@ -129,11 +138,13 @@ def render_capture(
                 stopwatch=stopwatch,
                 progress=progress,
                 warn=lambda text: warnings.say([text]),
-                watch=watch,
+                watch=(lambda standing: watch(replace(standing, error=None))) if unsampled else watch,
             )
             tally = partial.tally
             bounces = engine.options.bounces
-            results = summed_attributes(tally.sums, bounces, stopwatch.report())
+            missing = tuple(paths.summary for paths in unsampled)
+            zero = () if tally.sums.squares else zero_capture(engine, unsampled, tally.sums, warnings)
+            results = summed_attributes(tally.sums, bounces, stopwatch.report(), missing, zero)
             if selection != WHOLE:
                 results |= part_attributes(plan.part, plan.tiling, tally)
             partial.publish(results)
@@ -146,14 +157,43 @@ def render_capture(
         units=earlier + len(units),
         resumed_units=earlier,
         samples=tally.sums.samples or 0,
-        error_estimate=tally.sums.error_estimate,
+        error_estimate=tally.sums.stated_error(missing),
         energy=tally.sums.energy_per_bounce(bounces),
         out_of_window=float(tally.sums.outside),
         n_bins=header.n_bins,
         n_triangles=engine.built.n_triangles,
         seconds=stopwatch.report(),
         warnings=tuple(warnings.said),
+        unsampled_paths=missing,
+        zero_because=zero,
     )
+
+
+def missing_light(engine: Engine, strict: bool = False) -> tuple[UnsampledPaths, ...]:
+    """Return the paths that carry light and that no technique of the engine samples.
+
+    Raises
+    ------
+    ConfigError
+        ``strict``, and there are any.
+    """
+    from nlosrender.engine.unsampled_paths import unsampled_paths
+
+    found = unsampled_paths(engine)
+    if strict and found:
+        raise ConfigError([Problem("", paths.key, f"--strict: {paths.warning}") for paths in found])
+    return found
+
+
+def zero_capture(
+    engine: Engine, unsampled: Sequence[UnsampledPaths], sums: Sums, warnings: Warnings
+) -> tuple[str, ...]:
+    """Return why a capture is zero everywhere, and warn of it."""
+    from nlosrender.engine.zero_capture import zero_reasons
+
+    reasons = zero_reasons(engine, unsampled, float(sums.outside))
+    warnings.say([f"H is zero everywhere: {'; '.join(reasons)}."])
+    return reasons
 
 
 def started_backend(config: Config) -> Backend:
@@ -198,9 +238,12 @@ def forecast_capture(config: Config) -> Forecast:
     warnings.say(config_warnings(config))
     backend = started_backend(config)
     plan, engine, header = set_up_engine(config, backend)
+    unsampled = missing_light(engine)
+    warnings.say(paths.warning for paths in unsampled)
     warnings.say(late_warnings(config, backend, plan, engine, header))
     spent = time.perf_counter() - begun
-    return forecast_render(config, backend, plan, engine, header, tuple(warnings.said), spent)
+    missing = tuple(paths.summary for paths in unsampled)
+    return forecast_render(config, backend, plan, engine, header, tuple(warnings.said), spent, missing)
 
 
 def late_warnings(

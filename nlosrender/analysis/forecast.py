@@ -42,6 +42,7 @@ class Forecast:
     seconds_estimate: float | None  # from scene to file, kernels compiled; None: the pilot saw nothing but noise
     estimate_basis: str
     warnings: tuple[str, ...]
+    unsampled_paths: tuple[str, ...] = ()  # classes of paths whose light will be missing: the error will not be known
 
     def as_json(self) -> dict[str, object]:
         """Return a dict of what JSON knows."""
@@ -56,6 +57,7 @@ def forecast_render(
     header: CaptureHeader,
     warnings: tuple[str, ...],
     seconds_before: float,
+    unsampled: tuple[str, ...] = (),
 ) -> Forecast:
     """Run the pilot and put together what is known of a render.
 
@@ -67,6 +69,8 @@ def forecast_render(
         What the file will say; what has been said already.
     seconds_before
         What it took to get here from the configuration [s].
+    unsampled
+        Classes of paths that no technique samples.
 
     Raises
     ------
@@ -104,6 +108,7 @@ def forecast_render(
         seconds_estimate=None if rendering.seconds is None else rendering.seconds + around,
         estimate_basis=rendering.basis,
         warnings=warnings,
+        unsampled_paths=unsampled,
     )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
@@ -145,7 +146,9 @@ def _subtitle(header: StoredHeader, view: LaserView) -> str:
     engine, error = header.attributes.get("render_engine"), header.attributes.get("error_estimate")
     if isinstance(engine, str):
         parts.append(f"engine {engine[:40]}")
-    if isinstance(error, (int, float)):
+    if isinstance(error, float) and math.isnan(error):
+        parts.append("error not known")
+    elif isinstance(error, (int, float)):
         parts.append(f"estimated error {100 * error:.2g} %")
     if not view.time.any():
         parts.append("no light in the time window")

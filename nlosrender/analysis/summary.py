@@ -9,6 +9,7 @@ from math import prod
 from pathlib import Path
 
 from nlosrender.errors import FileError
+from nlosrender.files.part_attributes import UNSAMPLED, ZERO, text_list
 from nlosrender.files.reader import read_header
 from nlosrender.files.stored_header import StoredHeader
 from nlosrender.units import opl_to_seconds
@@ -91,6 +92,8 @@ def _provenance(attributes: Mapping[str, object]) -> dict[str, object]:
         "samples": attributes.get("samples"),
         "seed": attributes.get("seed"),
         "error_estimate": attributes.get("error_estimate"),
+        "unsampled_paths": list(text_list(attributes, UNSAMPLED)) if UNSAMPLED in attributes else None,
+        "zero_because": list(text_list(attributes, ZERO)) if ZERO in attributes else None,
         "out_of_window_energy": attributes.get("out_of_window_energy"),
         "seconds": _json(attributes.get("seconds")),
         "created": attributes.get("created"),

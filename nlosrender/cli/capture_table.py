@@ -40,7 +40,9 @@ def _rows(summary: dict[str, object]) -> list[tuple[str, str]]:
         ("engine", _text(summary["engine"])),
         ("samples per pixel" if is_view else "samples per pair", _text(summary["samples"])),
         ("seed", _text(summary["seed"])),
-        ("error estimate", _percent(summary["error_estimate"])),
+        ("error estimate", _error(summary)),
+        *(("NOT SAMPLED", _text(paths)) for paths in _sequence(summary["unsampled_paths"] or [])),
+        *(("ZERO BECAUSE", _text(reason)) for reason in _sequence(summary["zero_because"] or [])),
         ("outside the window", _text(summary["out_of_window_energy"])),
         ("seconds", _named(summary["seconds"])),
         ("created", _text(summary["created"])),
@@ -104,6 +106,14 @@ def _named(values: object) -> str:
         if isinstance(values, dict)
         else _text(values)
     )
+
+
+def _error(summary: dict[str, object]) -> str:
+    if summary["error_estimate"] is None and summary["unsampled_paths"]:
+        return "unknown: light is missing"
+    if summary["error_estimate"] is None and summary["zero_because"]:
+        return "unknown: H is zero everywhere"
+    return _percent(summary["error_estimate"])
 
 
 def _percent(value: object) -> str:

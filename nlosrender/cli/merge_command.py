@@ -30,6 +30,7 @@ def merge(
 ) -> None:
     """Put the parts of a capture together; what is missing, there twice, damaged or not its own is named."""
     from nlosrender.cli.progress import progress_bar
+    from nlosrender.cli.stated_error import error_in_words, finite_or_none
     from nlosrender.files.merge import merge_captures
 
     with progress_bar("merge", hidden=quiet) as (progress, _, _):
@@ -37,14 +38,17 @@ def merge(
     if as_json:
         import dataclasses
         import json
-        import math
 
         content = dataclasses.asdict(report) | {"output": str(report.output)}
-        if not math.isfinite(report.error_estimate):
-            content["error_estimate"] = None  # pure noise: JSON knows no infinity
-        typer.echo(json.dumps(content))
+        content["error_estimate"] = finite_or_none(report.error_estimate)
+        typer.echo(json.dumps(content, allow_nan=False))
     elif not quiet:
         typer.echo(f"wrote {report.output} from {report.parts} parts")
-        typer.echo(f"  error estimate  {report.error_estimate:.2%} (relative L2)")
+        stated = error_in_words(report.error_estimate, report.unsampled_paths, report.zero_because)
+        typer.echo(f"  error estimate  {stated}")
+        for missing in report.unsampled_paths:
+            typer.echo(f"  not sampled     {missing}")
+        for reason in report.zero_because:
+            typer.echo(f"  zero because    {reason}")
         energies = ", ".join(f"{name}: {energy:.4g}" for name, energy in report.energy.items())
         typer.echo(f"  energy          bounce {energies}; outside the time window: {report.out_of_window:.4g}")

@@ -67,6 +67,8 @@ def _lines(forecast: Forecast) -> Iterator[str]:
     yield f"engine   {forecast.engine}: {forecast.reason} ({forecast.variant})"
     for item in forecast.skipped:
         yield f"skipped  {item.what}: {item.why}"
+    for paths in forecast.unsampled_paths:
+        yield f"missing  {paths}: sampled by no technique, the stated error will be unknown"
     hidden = "" if forecast.scan_type == LINE_OF_SIGHT else "hidden "
     yield f"scan     {_scan(forecast)}, {forecast.n_triangles} {hidden}triangles"
     start, end = forecast.window_opl

@@ -68,6 +68,10 @@ def render(
         int | None,
         typer.Option(min=1, help="dask: processes to start, or to wait for.", show_default="one per core"),
     ] = None,
+    strict: Annotated[
+        bool,
+        typer.Option("--strict", help="Exit 3 before rendering where light is missing that no technique samples."),
+    ] = False,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress, no report; warnings stay.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print the report as one JSON object.")] = False,
 ) -> None:
@@ -101,7 +105,14 @@ def render(
             raise typer.BadParameter("cuts one capture, not a sweep; use --shard", param_hint="--lasers")
         with _cluster(executor, scheduler, workers) as cluster:
             render_all(
-                sweep, changes, shard=selection.shard, resume=resume, quiet=quiet, as_json=as_json, cluster=cluster
+                sweep,
+                changes,
+                shard=selection.shard,
+                resume=resume,
+                quiet=quiet,
+                as_json=as_json,
+                cluster=cluster,
+                strict=strict,
             )
         return
     loaded = load_config(config, changes)
@@ -111,7 +122,9 @@ def render(
             _cluster(executor, scheduler, workers) as cluster,
             progress_bar("render", hidden=quiet) as telling,
         ):
-            report = render_capture(loaded, **telling._asdict(), selection=selection, resume=resume, cluster=cluster)
+            report = render_capture(
+                loaded, **telling._asdict(), selection=selection, resume=resume, cluster=cluster, strict=strict
+            )
     except ConfigError as error:
         raise with_places(error, config, changes) from error
     if as_json:
@@ -164,15 +177,17 @@ def _quoted(path: Path) -> str:
 def _print_json(report: RenderReport) -> None:
     import dataclasses
     import json
-    import math
+
+    from nlosrender.cli.stated_error import finite_or_none
 
     content = dataclasses.asdict(report) | {"output": str(report.output)}
-    if not math.isfinite(report.error_estimate):
-        content["error_estimate"] = None  # pure noise: JSON knows no infinity
-    typer.echo(json.dumps(content))
+    content["error_estimate"] = finite_or_none(report.error_estimate)
+    typer.echo(json.dumps(content, allow_nan=False))
 
 
 def _print_report(report: RenderReport) -> None:
+    from nlosrender.cli.stated_error import error_in_words
+
     seconds = report.seconds
     typer.echo(f"wrote {report.output}" + (f", {report.part} of the capture" if report.part else ""))
     if report.resumed_units:
@@ -180,7 +195,12 @@ def _print_report(report: RenderReport) -> None:
     typer.echo(f"  engine          {report.engine}: {report.reason}")
     is_view = report.engine == LINE_OF_SIGHT  # that engine renders nothing else
     paths = f", {report.samples} paths per {'pixel' if is_view else 'sensor point'}" if report.samples else ""
-    typer.echo(f"  error estimate  {report.error_estimate:.2%} (relative L2){paths}")
+    stated = error_in_words(report.error_estimate, report.unsampled_paths, report.zero_because)
+    typer.echo(f"  error estimate  {stated}{paths}")
+    for missing in report.unsampled_paths:
+        typer.echo(f"  not sampled     {missing}")
+    for reason in report.zero_because:
+        typer.echo(f"  zero because    {reason}")
     energies = ", ".join(f"{name}: {energy:.4g}" for name, energy in report.energy.items())
     counted = "interactions" if is_view else "bounce"
     typer.echo(f"  energy          {counted} {energies}; outside the time window: {report.out_of_window:.4g}")

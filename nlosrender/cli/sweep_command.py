@@ -28,6 +28,7 @@ def render_all(
     quiet: bool,
     as_json: bool,
     cluster: Cluster | None = None,
+    strict: bool = False,
 ) -> None:
     """Render the captures of a sweep and print what came of it.
 
@@ -46,7 +47,9 @@ def render_all(
 
     def render(config: Config, progress: Progress, warn: Warn, resume: bool | None) -> RenderReport:
         try:
-            return render_capture(config, progress, warn, resume=resume, cluster=cluster, watch=telling.watch)
+            return render_capture(
+                config, progress, warn, resume=resume, cluster=cluster, watch=telling.watch, strict=strict
+            )
         except ConfigError as error:
             raise with_places(error, Path(sweep.source), overrides) from error
 

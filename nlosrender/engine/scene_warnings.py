@@ -54,7 +54,7 @@ def scene_warnings(engine: Engine) -> tuple[str, ...]:
         return (*built.warnings, *_view_warnings(built), *window, *_bin_warnings(engine, time_axis))
     return (
         *built.warnings,
-        *_surface_warnings(built, capture, max_bounces),
+        *dark_surface_warnings(built, capture, max_bounces),
         *window,
         *near_wall_warnings(engine, built, capture),
         *_bin_warnings(engine, time_axis),
@@ -66,7 +66,16 @@ def _view_warnings(built: BuiltView) -> Iterator[str]:
         yield "nothing in the scene shines: the picture is black. Add scene.emitters."
 
 
-def _surface_warnings(built: BuiltScene, capture: Capture, max_bounces: int | None) -> Iterator[str]:
+def dark_surface_warnings(built: BuiltScene, capture: Capture, max_bounces: int | None) -> Iterator[str]:
+    """Yield one sentence for each hidden surface that returns no light, or none of the bounces asked for.
+
+    Parameters
+    ----------
+    built, capture
+        A scene with a wall, and what is measured of it.
+    max_bounces
+        Highest bounce that is rendered; None for no limit.
+    """
     facing: list[tuple[Surface, _SurfacePoints]] = []
     n_lit_by_nature = 0  # kinds of shape that cannot be sampled here: taken for visible
     wall_corners = wall_box(built.wall) / built.unit

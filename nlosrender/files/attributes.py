@@ -24,8 +24,8 @@ MAX_ARRAY_BYTES = 60_000
 def attribute_value(value: object) -> str | int | float | np.ndarray:
     """Return ``value`` as what is stored: text, a number, or a numeric array.
 
-    Booleans become 0 / 1. Numbers that are not finite, None, mappings, sequences of anything but numbers and
-    large arrays become text (JSON where there is structure): NaN and infinity never reach a file as numbers.
+    Booleans become 0 / 1. Infinity, None, mappings, sequences of anything but finite numbers and large arrays become
+    text (JSON where there is structure). A single NaN stays a number: it stands for one that is not known.
     """
     if isinstance(value, str):
         return _clean(value)
@@ -37,7 +37,7 @@ def attribute_value(value: object) -> str | int | float | np.ndarray:
         number = int(value)
         return number if -(2**63) <= number < 2**63 else str(number)
     if isinstance(value, (float, np.floating)):
-        return float(value) if math.isfinite(value) else str(float(value))
+        return str(float(value)) if math.isinf(value) else float(value)
     if isinstance(value, Mapping):
         return _clean(json.dumps(_plain(value), ensure_ascii=False))
     if isinstance(value, (list, tuple, np.ndarray)):

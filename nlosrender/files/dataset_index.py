@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -10,7 +11,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from nlosrender.errors import FileError
-from nlosrender.files.part_attributes import PART, json_object
+from nlosrender.files.part_attributes import PART, UNSAMPLED, json_object, text_list
 from nlosrender.files.reader import read_header
 from nlosrender.files.replacement import check_writable, explained_write, partial_path, publish
 
@@ -30,9 +31,10 @@ class IndexEntry:
     capture_hash: str  # of the configuration, without where and on what it is rendered
     config_hash: str | None = None
     energy: Mapping[str, float] | None = None  # H summed over the capture, by bounce [J m^-2 sr^-1]
-    error_estimate: float | None = None  # relative L2 of H
+    error_estimate: float | None = None  # relative L2 of H; None: not known
     seconds: float | None = None  # of the run that finished it
     message: str | None = None  # why it failed
+    unsampled_paths: Sequence[str] = ()  # classes of paths whose light is missing
 
 
 def stored_entry(index: int, path: Path, folder: Path, values: Mapping[str, Any], capture_hash: str) -> IndexEntry:
@@ -63,7 +65,8 @@ def stored_entry(index: int, path: Path, folder: Path, values: Mapping[str, Any]
         capture_hash,
         config_hash=stored if isinstance(stored, str) else None,
         energy=json_object(attributes.get("energy")),
-        error_estimate=error if isinstance(error, float) else None,
+        error_estimate=error if isinstance(error, float) and math.isfinite(error) else None,
+        unsampled_paths=text_list(attributes, UNSAMPLED),
         seconds=json_object(attributes.get("seconds")).get("total"),
     )
 

@@ -19,7 +19,17 @@ from nlosrender.capture.tile import Tile
 from nlosrender.config.canonical import tree_hash
 from nlosrender.errors import FileError
 from nlosrender.files import layout
-from nlosrender.files.part_attributes import CHECKSUMS, NOTE, PART, SUMS, json_object, summed_attributes
+from nlosrender.files.part_attributes import (
+    CHECKSUMS,
+    NOTE,
+    PART,
+    SUMS,
+    UNSAMPLED,
+    ZERO,
+    json_object,
+    summed_attributes,
+    text_list,
+)
 from nlosrender.files.pieces import PackedChunk
 from nlosrender.files.reader import explained_read, open_hdf5
 from nlosrender.files.replacement import check_writable, explained_write, partial_path, publish
@@ -38,10 +48,12 @@ class MergeReport:
 
     output: Path
     parts: int
-    error_estimate: float  # relative L2 error of H over the whole capture
+    error_estimate: float  # relative L2 error of H over the whole capture; NaN: not known
     energy: dict[str, float]  # H summed over the capture, per bounce [J m^-2 sr^-1]
     out_of_window: float  # the same outside the time window
     samples: int  # paths per sensor point, the least of all parts
+    unsampled_paths: tuple[str, ...] = ()  # classes of paths whose light is missing
+    zero_because: tuple[str, ...] = ()  # why H is zero everywhere; empty where it is not
 
 
 def merge_captures(
@@ -79,7 +91,7 @@ def merge_captures(
             _copy(shard, None if number == 0 else sink)
             progress((number + 1) / len(shards))
         sums = sum((shard.stored.sums for shard in shards), Sums())
-        sink.remove_attributes((PART, SUMS, CHECKSUMS, NOTE))
+        sink.remove_attributes((PART, SUMS, CHECKSUMS, NOTE, ZERO))
         sink.set_attributes(_attributes(shards, sums, output))
         sink.close()
         with uninterrupted(), explained_write(output):
@@ -93,10 +105,12 @@ def merge_captures(
     return MergeReport(
         output=output,
         parts=len(shards),
-        error_estimate=sums.error_estimate,
+        error_estimate=sums.stated_error(_told(shards, UNSAMPLED)),
         energy=sums.energy_per_bounce(_bounces(shards[0])),
         out_of_window=float(sums.outside),
         samples=sums.samples or 0,
+        unsampled_paths=_told(shards, UNSAMPLED),
+        zero_because=() if sums.squares else _told(shards, ZERO),
     )
 
 
@@ -173,7 +187,13 @@ def _attributes(shards: Sequence[Shard], sums: Sums, output: Path) -> dict[str, 
     if isinstance(config.get("output"), dict):
         config["output"]["path"] = str(output)
         changed |= {"config": json.dumps(config, ensure_ascii=False), "config_hash": tree_hash(config)}
-    return changed | summed_attributes(sums, _bounces(shards[0]), seconds)
+    zero = () if sums.squares else _told(shards, ZERO)
+    return changed | summed_attributes(sums, _bounces(shards[0]), seconds, _told(shards, UNSAMPLED), zero)
+
+
+def _told(shards: Sequence[Shard], name: str) -> tuple[str, ...]:
+    """Return the texts in a list of all shards, each once."""
+    return tuple(dict.fromkeys(text for shard in shards for text in text_list(shard.header.attributes, name)))
 
 
 def _bounces(shard: Shard) -> BounceAxis:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import astuple, dataclass
 from typing import Any
 
@@ -15,6 +15,7 @@ from nlosrender.files.sums import Sums
 from nlosrender.files.unit_log import Tally
 
 PART, SUMS, CHECKSUMS, NOTE = "part", "part_sums", "part_checksums", "incomplete"
+UNSAMPLED, ZERO = "unsampled_paths", "zero_because"
 
 
 @dataclass(frozen=True)
@@ -64,7 +65,13 @@ def part_attributes(part: Part, tiling: Tiling, tally: Tally) -> dict[str, objec
     }
 
 
-def summed_attributes(sums: Sums, bounces: BounceAxis, seconds: Mapping[str, float]) -> dict[str, object]:
+def summed_attributes(
+    sums: Sums,
+    bounces: BounceAxis,
+    seconds: Mapping[str, float],
+    unsampled: Sequence[str] = (),
+    zero_because: Sequence[str] = (),
+) -> dict[str, object]:
     """Return the results of a render, or of several that were put together.
 
     Parameters
@@ -75,14 +82,30 @@ def summed_attributes(sums: Sums, bounces: BounceAxis, seconds: Mapping[str, flo
         Names of the bounces.
     seconds
         Time spent in each stage [s].
+    unsampled
+        Classes of paths whose light is missing.
+    zero_because
+        Why H is zero everywhere; empty where it is not.
     """
-    return result_attributes(
+    known: dict[str, object] = {UNSAMPLED: list(unsampled)}
+    if zero_because:
+        known[ZERO] = list(zero_because)
+    return known | result_attributes(
         samples=sums.samples,
-        error_estimate=sums.error_estimate,
+        error_estimate=sums.stated_error(unsampled),
         seconds=seconds,
         out_of_window_energy=float(sums.outside),
         energy=sums.energy_per_bounce(bounces),
     )
+
+
+def text_list(attributes: Mapping[str, object], name: str) -> tuple[str, ...]:
+    """Return an attribute that holds a list of texts as JSON; an empty one where it is missing or does not."""
+    try:
+        found = json.loads(str(attributes.get(name, "[]")))
+    except (ValueError, RecursionError):
+        return ()
+    return tuple(str(text) for text in found) if isinstance(found, list) else ()
 
 
 def json_object(text: object) -> dict[str, Any]:

@@ -85,7 +85,7 @@ def result_attributes(
     samples
         Paths per pair of laser and sensor point.
     error_estimate
-        Estimated relative L2 error of H over the whole capture.
+        Estimated relative L2 error of H over the whole capture; NaN: not known.
     seconds
         Time spent in each stage [s].
     out_of_window_energy

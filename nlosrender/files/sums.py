@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
@@ -42,8 +43,12 @@ class Sums:
 
     @property
     def error_estimate(self) -> float:
-        """Relative L2 error of H over everything summed."""
-        return relative_l2_error(float(self.noise), float(self.squares))
+        """Relative L2 error of H over everything summed; NaN where H is zero everywhere, which has none."""
+        return relative_l2_error(float(self.noise), float(self.squares)) if self.squares else math.nan
+
+    def stated_error(self, unsampled: Sequence[str]) -> float:
+        """Return ``error_estimate``, or NaN where light is missing: ``unsampled`` lists the paths not sampled."""
+        return math.nan if unsampled else self.error_estimate
 
     def energy_per_bounce(self, bounces: BounceAxis) -> dict[str, float]:
         """Return the energy by bounce number, or under ``all`` when bounces are not split."""

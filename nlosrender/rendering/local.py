@@ -151,7 +151,7 @@ def rendered(
 
 def standing(sums: Sums, done: int, total: int) -> Standing:
     """Return where a render stands whose finished units have these sums."""
-    return Standing("units", done, total, sums.error_estimate if done else None)
+    return Standing("units", done, total, sums.error_estimate if done and sums.squares else None)
 
 
 def kept(partial: PartialCapture, total: int | None = None) -> str:

@@ -60,13 +60,15 @@ class RenderReport:
     units: int  # it was cut into
     resumed_units: int  # of them, finished by an earlier run
     samples: int  # paths per sensor point, the least of all units
-    error_estimate: float  # relative L2 error of H over the whole capture
+    error_estimate: float  # relative L2 error of H over the whole capture; NaN: not known
     energy: dict[str, float]  # H summed over the capture, per bounce [J m^-2 sr^-1]
     out_of_window: float  # the same outside the time window
     n_bins: int
     n_triangles: int
     seconds: dict[str, float]  # of this run
     warnings: tuple[str, ...]
+    unsampled_paths: tuple[str, ...] = ()  # classes of paths whose light is missing
+    zero_because: tuple[str, ...] = ()  # why H is zero everywhere; empty where it is not
 
 
 @dataclass(frozen=True)
