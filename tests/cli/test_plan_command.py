@@ -143,7 +143,7 @@ def test_warnings_are_in_the_report_of_a_render_even_when_it_is_quiet():
     """A machine that reads the JSON hears the same as a user at the terminal."""
     changes = ["--set", "scene.hidden_geometry.0.normal=[0, 0, 1]", "--set", "render.time_limit_s=5"]
     result = run("render", write_config(), *changes, "--json", "--quiet")
-    assert result.stderr == ""
+    assert all(line.startswith("warning: ") for line in result.stderr.splitlines())  # nothing else
     # the item, that no surface is left, and at the end why H is zero
     assert ["turns its back" in text for text in json.loads(result.stdout)["warnings"]] == [True, False, True]
 
