@@ -78,6 +78,8 @@ scene:
       normal: [0, 0, -1]         # the front side; default [0, 0, -1]
       up: [0, 1, 0]              # default [0, 1, 0]
       bsdf: {{type: diffuse, reflectance: 0.7}}  # default reflectance 1.0
+    # A picture has its first row at the item's up side, its first column at the left as seen from the front:
+    # bsdf: {{type: diffuse, reflectance: {{type: bitmap, filename: wood.png, raw: true}}}}  # see docs/textures.md
     # Further items, one example of each type. rotate_deg: degrees about x, then y, then z.
     # - {{type: mesh, filename: bunny.ply, scale: 1, rotate_deg: [0, 90, 0], translate: [0, 0, 1], face_normals: false}}
     # - {{type: letters, text: Z, height: 0.8, thickness: 0.0, stroke_width: null, spacing: null, center: [0, 0, 1]}}

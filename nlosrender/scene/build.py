@@ -26,6 +26,7 @@ from nlosrender.scene.hidden_geometry import (
 )
 from nlosrender.scene.materials import area_emitter, check_surface, first_line, load_bsdf, medium_warnings, rejected
 from nlosrender.scene.mesh_file import read_mesh
+from nlosrender.scene.pictures import readable, upright_bsdf
 from nlosrender.scene.pose import Float64
 from nlosrender.scene.relay_wall import RelayWall
 from nlosrender.scene.triangle_mesh import TriangleMesh
@@ -84,7 +85,8 @@ def build_scene(wall: RelayWall, wall_bsdf: Mapping[str, object], surfaces: Sequ
     unit = _unit_length(wall, joined_bounds(boxes))
     description = wall.shape_description()
     wall_item = description if isinstance(description, TriangleMesh) else ShapeDescription(description)
-    wall_shape = load_surface(Surface(WALL_ID, "scene.relay_wall", wall_item, wall_bsdf, True), wall_item, unit)
+    wall_surface = Surface(WALL_ID, "scene.relay_wall", wall_item, upright_bsdf(description, wall_bsdf), True)
+    wall_shape = load_surface(wall_surface, wall_item, unit)
     loaded, warnings = without_shared_faces(surfaces, loaded)
     hidden_shapes = [load_surface(surface, shape, unit) for surface, shape in zip(surfaces, loaded, strict=True)]
     contents: dict[str, object] = {"type": "scene", WALL_ID: wall_shape}
@@ -113,8 +115,8 @@ def read_mesh_of(surface: Surface) -> TriangleMesh | ShapeDescription:
         return shape
     try:
         mesh = read_mesh(shape.filename, shape.kind, face_normals=surface.face_normals).transformed(shape.to_local)
-        if shape.flip_v and mesh.uvs is not None:
-            mesh = replace(mesh, uvs=mesh.uvs * [1.0, -1.0] + [0.0, 1.0])
+        if shape.flip_v:
+            mesh = readable(mesh)
         return mesh.turned_round() if shape.flip_normals else mesh
     except ValueError as error:
         raise rejected(f"{surface.key}.filename", f"{shape.filename} cannot be used as a mesh: {error}.") from error

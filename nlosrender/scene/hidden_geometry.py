@@ -14,8 +14,10 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 
 from nlosrender.scene.letters import letters_mesh
+from nlosrender.scene.pictures import has_picture, readable, round_plugin, upright_bsdf
 from nlosrender.scene.pose import Float64, Pose, euler_xyz
 from nlosrender.scene.primitives import box_mesh, rectangle_mesh, room_mesh
+from nlosrender.scene.round_walls import cylinder_pose
 from nlosrender.scene.transforms import transform_matrix
 from nlosrender.scene.triangle_mesh import TriangleMesh
 
@@ -24,6 +26,7 @@ if TYPE_CHECKING:
     from nlosrender.config.relay_wall import MeshWallConfig
 
 MESH_PLUGINS = ("ply", "obj")
+_TO_WALL, _UP = (0.0, 0.0, -1.0), (0.0, 1.0, 0.0)  # default front and up of hidden items, in the scene
 Bounds = tuple[Float64, Float64]  # smallest and largest coordinates, (3,) and (3,) m
 Radiance = float | tuple[float, float, float]  # grey or [r, g, b], W m^-2 sr^-1
 
@@ -111,12 +114,18 @@ def hidden_surfaces(
         key = f"scene.hidden_geometry.{index}" if keys is None else keys[index]
         try:
             shape = _shape(item, frame)
+            bsdf: Mapping[str, object] = item.bsdf
+            if item.type != "mitsuba" and has_picture(bsdf):  # those keep Mitsuba's own convention
+                if isinstance(shape, TriangleMesh):
+                    shape = readable(shape, from_within=item.type == "room")
+                elif isinstance(shape, ShapeDescription):
+                    bsdf = upright_bsdf(shape.description, bsdf)
         except ValueError as error:
             raise ValueError(f"{key}: {error}") from error
         name = item.name or f"{item.type}-{index}"
         # Generated meshes are flat; analytic shapes bring their own normals; only files have a choice.
         face_normals = _wants_face_normals(item) if isinstance(shape, MeshFile) else isinstance(shape, TriangleMesh)
-        surfaces.append(Surface(name, key, shape, item.bsdf, face_normals, getattr(item, "radiance", None)))
+        surfaces.append(Surface(name, key, shape, bsdf, face_normals, getattr(item, "radiance", None)))
     return tuple(surfaces)
 
 
@@ -159,9 +168,14 @@ def _shape(item: HiddenItemConfig, wall: HasPose) -> TriangleMesh | MeshFile | S
         kind = Path(item.filename).suffix.lower().lstrip(".")
         return MeshFile(str(item.filename), wall.pose.inverse_matrix() @ mesh_matrix(item), kind)
     if item.type == "sphere":
+        if has_picture(item.bsdf):
+            return _pictured(item, Pose.from_normal_up(item.center, _TO_WALL, _UP), wall)
         center = wall.pose.to_local(item.center).tolist()
         return _round_shape(item, type="sphere", center=center)
     if item.type == "cylinder":
+        if has_picture(item.bsdf):
+            axis = cylinder_pose(item.center, item.axis)
+            return _pictured(item, Pose.from_normal_up(item.center, -axis.rotation[:, 2], axis.rotation[:, 1]), wall)
         center, half = wall.pose.to_local(item.center), _half_axis(item, wall)
         return _round_shape(item, type="cylinder", p0=(center - half).tolist(), p1=(center + half).tolist())
     if item.type == "mitsuba":
@@ -213,6 +227,13 @@ def _half_axis(item: CylinderConfig, wall: HasPose) -> Float64:
 
 def _round_shape(item: SphereConfig | CylinderConfig, **where: object) -> ShapeDescription:
     return ShapeDescription({**where, "radius": float(item.radius), "flip_normals": bool(item.inside)})
+
+
+def _pictured(item: SphereConfig | CylinderConfig, pose: Pose, wall: HasPose) -> ShapeDescription:
+    """Return a round shape whose picture has its middle at the +z side of a pose in the scene, its up along +y."""
+    height = item.height if item.type == "cylinder" else None
+    plugin = round_plugin(item.radius, height, inside=item.inside, turned=item.inside)
+    return ShapeDescription({**plugin, "to_world": _local_pose(pose, wall).matrix() @ np.asarray(plugin["to_world"])})
 
 
 def _object_bounds(description: Mapping[str, object]) -> Bounds | None:

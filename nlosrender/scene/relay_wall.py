@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from nlosrender.scene.mesh_wall import mesh_wall_from_config
+from nlosrender.scene.pictures import has_picture
 from nlosrender.scene.pose import Float64, Pose
 from nlosrender.scene.round_walls import CylinderWall, SphereWall, cylinder_pose
 from nlosrender.scene.triangle_mesh import TriangleMesh
@@ -124,7 +125,10 @@ class RectangleWall:
         return np.broadcast_to([0.0, 0.0, 1.0], (*xy.shape[:-1], 3)).copy()
 
     def uv(self, xy: ArrayLike) -> Float64:
-        """Return texture coordinates (..., 2), 0 to 1 along x and y; ValueError off the wall."""
+        """Return Mitsuba's texture coordinates (..., 2), 0 to 1 along x and y; ValueError off the wall.
+
+        v grows along y, and pictures lie the other way up (``pictures.upright_bsdf``).
+        """
         return on_wall(self, xy) / [self.width, self.height] + 0.5
 
     def bounds(self) -> tuple[Float64, Float64]:
@@ -157,14 +161,15 @@ def relay_wall_from_config(relay_wall_config: RelayWallConfig) -> RelayWall:
         begins with the key then.
     """
     wall = relay_wall_config
+    pictured = has_picture(wall.bsdf)
     if wall.type == "rectangle":
         pose = Pose.from_normal_up(wall.center, wall.normal, wall.up)
         return RectangleWall(pose, float(wall.width), float(wall.height))
     if wall.type == "sphere":
-        return SphereWall(np.asarray(wall.center, dtype=np.float64), float(wall.radius), bool(wall.inside))
+        return SphereWall(np.asarray(wall.center, dtype=np.float64), float(wall.radius), bool(wall.inside), pictured)
     if wall.type == "cylinder":
         return CylinderWall(
-            cylinder_pose(wall.center, wall.axis), float(wall.radius), float(wall.height), bool(wall.inside)
+            cylinder_pose(wall.center, wall.axis), float(wall.radius), float(wall.height), bool(wall.inside), pictured
         )
     if wall.type == "mesh":
         return mesh_wall_from_config(wall)

@@ -12,11 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
+from nlosrender.scene.pictures import round_plugin
 from nlosrender.scene.pose import Float64, Pose
 from nlosrender.scene.wall_coordinates import on_wall, require_positive
-
-# Mitsuba's sphere and cylinder have z as their axis and azimuth 0 at x; the wall has its axis on y, azimuth 0 at z.
-_POLAR_AXIS_TO_Y = np.array([[0.0, 1, 0, 0], [0, 0, 1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
 
 
 class _RoundWall(ABC):
@@ -24,10 +22,21 @@ class _RoundWall(ABC):
 
     radius: float
     inside: bool
+    has_picture: bool
 
     @abstractmethod
     def _outward(self, xy: ArrayLike) -> Float64:
         """Return unit vectors (..., 3) that point away from the centre or axis; ValueError off the wall."""
+
+    @property
+    def _sense(self) -> int:
+        """Whether u grows along the wall coordinate x, 1, or against it, -1: a picture's, seen from within."""
+        return -1 if self.inside and self.has_picture else 1
+
+    def _turns(self, xy: Float64) -> Float64:
+        """Return u (...,) in [0, 1): 1/2 at wall coordinate x = 0."""
+        turns = np.mod(0.5 + self._sense * xy[..., 0] / (2 * np.pi * self.radius), 1.0)
+        return np.where(turns < 1.0, turns, 0.0)  # mod of a tiny negative number rounds up to 1.0
 
     @property
     def is_planar(self) -> bool:
@@ -56,6 +65,8 @@ class SphereWall(_RoundWall):
         Radius [m], > 0.
     inside
         Lit from within: normals point to the centre.
+    has_picture
+        Whether texture coordinates matter; without, the frames that directions are sampled in stay Mitsuba's.
 
     Raises
     ------
@@ -66,6 +77,7 @@ class SphereWall(_RoundWall):
     center: Float64
     radius: float
     inside: bool = True
+    has_picture: bool = False
 
     def __post_init__(self) -> None:
         require_positive("relay wall", radius=self.radius)
@@ -95,7 +107,9 @@ class SphereWall(_RoundWall):
         return self.radius * self._outward(xy)
 
     def uv(self, xy: ArrayLike) -> Float64:
-        """Return texture coordinates (..., 2): u = longitude / 2 pi in [0, 1), v = 0 at the +y pole, 1 at the -y pole.
+        """Return texture coordinates (..., 2): u = 1/2 + longitude / 2 pi in [0, 1), v = 0 at the +y pole, 1 at -y.
+
+        Of a picture seen from within u runs the other way.
 
         Raises
         ------
@@ -104,7 +118,7 @@ class SphereWall(_RoundWall):
         """
         xy = on_wall(self, xy)
         v = np.arccos(np.clip(xy[..., 1] / self.radius, -1.0, 1.0)) / np.pi
-        return np.stack([_turns(xy[..., 0] / self.radius), v], axis=-1)
+        return np.stack([self._turns(xy), v], axis=-1)
 
     def bounds(self) -> tuple[Float64, Float64]:
         """Return the smallest and largest coordinates of the wall, (3,) and (3,) [m, local frame]."""
@@ -113,13 +127,7 @@ class SphereWall(_RoundWall):
 
     def shape_description(self) -> dict[str, object]:
         """Return the Mitsuba shape dict in the local frame, without bsdf."""
-        return {
-            "type": "sphere",
-            "center": [0.0, 0.0, 0.0],
-            "radius": float(self.radius),
-            "to_world": _POLAR_AXIS_TO_Y.copy(),
-            "flip_normals": bool(self.inside),
-        }
+        return round_plugin(self.radius, None, inside=self.inside, turned=self._sense < 0)
 
     def _outward(self, xy: ArrayLike) -> Float64:
         xy = on_wall(self, xy)
@@ -141,6 +149,8 @@ class CylinderWall(_RoundWall):
         Radius and length of the tube [m], > 0.
     inside
         Lit from within: normals point to the axis.
+    has_picture
+        Whether texture coordinates matter; without, the frames that directions are sampled in stay Mitsuba's.
 
     Raises
     ------
@@ -152,6 +162,7 @@ class CylinderWall(_RoundWall):
     radius: float
     height: float
     inside: bool = True
+    has_picture: bool = False
 
     def __post_init__(self) -> None:
         require_positive("relay wall", radius=self.radius, height=self.height)
@@ -173,7 +184,9 @@ class CylinderWall(_RoundWall):
         return points
 
     def uv(self, xy: ArrayLike) -> Float64:
-        """Return texture coordinates (..., 2): u = azimuth / 2 pi in [0, 1), v from 0 at -y to 1 at +y.
+        """Return texture coordinates (..., 2): u = 1/2 + azimuth / 2 pi in [0, 1), v from 0 at -y to 1 at +y.
+
+        Of a picture seen from within both run the other way; others ``pictures.upright_bsdf`` turns over.
 
         Raises
         ------
@@ -181,7 +194,7 @@ class CylinderWall(_RoundWall):
             A point is off the wall.
         """
         xy = on_wall(self, xy)
-        return np.stack([_turns(xy[..., 0] / self.radius), xy[..., 1] / self.height + 0.5], axis=-1)
+        return np.stack([self._turns(xy), self._sense * xy[..., 1] / self.height + 0.5], axis=-1)
 
     def bounds(self) -> tuple[Float64, Float64]:
         """Return the smallest and largest coordinates of the wall, (3,) and (3,) [m, local frame]."""
@@ -190,14 +203,7 @@ class CylinderWall(_RoundWall):
 
     def shape_description(self) -> dict[str, object]:
         """Return the Mitsuba shape dict in the local frame, without bsdf."""
-        return {
-            "type": "cylinder",
-            "p0": [0.0, 0.0, -self.height / 2],
-            "p1": [0.0, 0.0, self.height / 2],
-            "radius": float(self.radius),
-            "to_world": _POLAR_AXIS_TO_Y.copy(),
-            "flip_normals": bool(self.inside),
-        }
+        return round_plugin(self.radius, self.height, inside=self.inside, turned=self._sense < 0)
 
     def _outward(self, xy: ArrayLike) -> Float64:
         xy = on_wall(self, xy)
@@ -230,8 +236,3 @@ def cylinder_pose(center: ArrayLike, axis: ArrayLike) -> Pose:
     y = axis / length
     reference = np.array([0.0, 0.0, 1.0]) if abs(y[2]) < np.cos(np.radians(1.0)) else np.array([1.0, 0.0, 0.0])
     return Pose.from_normal_up(center, reference - np.dot(reference, y) * y, y)
-
-
-def _turns(angle: Float64) -> Float64:
-    turns = np.mod(angle / (2 * np.pi), 1.0)
-    return np.where(turns < 1.0, turns, 0.0)  # mod of a tiny negative angle rounds up to 1.0

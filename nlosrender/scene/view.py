@@ -23,6 +23,7 @@ from nlosrender.scene.hidden_geometry import (
     joined_bounds,
 )
 from nlosrender.scene.materials import check_surface, medium_warnings, mitsuba_spectrum, rejected
+from nlosrender.scene.pictures import upright_bsdf
 from nlosrender.scene.pose import Float64, Pose
 from nlosrender.scene.relay_wall import relay_wall_from_config
 from nlosrender.scene.triangle_mesh import TriangleMesh
@@ -118,7 +119,8 @@ def _surfaces(scene_config: SceneConfig, frame: Pose) -> Iterator[Surface]:
         else:
             to_world = to_frame @ np.asarray(description.get("to_world", np.eye(4)))
             shape = ShapeDescription({**description, "to_world": to_world})
-        yield Surface("relay_wall", "scene.relay_wall", shape, scene_config.relay_wall.bsdf, False)
+        bsdf = upright_bsdf(description, scene_config.relay_wall.bsdf)
+        yield Surface("relay_wall", "scene.relay_wall", shape, bsdf, False)
     yield from hidden_surfaces(scene_config.hidden_geometry, at)
     for index, item in enumerate(scene_config.emitters):
         if not isinstance(item, (PointLamp, SpotLamp)):

@@ -133,7 +133,9 @@ def test_points_off_the_wall_are_refused(wall, axis):
 
 def test_rectangle_from_config_has_its_pose():
     """A wall with normal +x and up +z has its local x axis along scene +y."""
-    config = SimpleNamespace(type="rectangle", width=2.0, height=1.5, center=[1, 2, 3], normal=[2, 0, 0], up=[0, 0, 1])
+    config = SimpleNamespace(
+        bsdf={}, type="rectangle", width=2.0, height=1.5, center=[1, 2, 3], normal=[2, 0, 0], up=[0, 0, 1]
+    )
     wall = relay_wall_from_config(config)
     assert (wall.width, wall.height, wall.is_planar) == (2.0, 1.5, True)
     np.testing.assert_allclose(wall.pose.to_scene(wall.positions([0.5, 0.25])), [1, 2.5, 3.25], atol=1e-15)
@@ -143,7 +145,7 @@ def test_rectangle_from_config_has_its_pose():
 
 def test_sphere_from_config_keeps_the_scene_axes():
     """A sphere's local frame is the scene's, moved to the centre."""
-    wall = relay_wall_from_config(SimpleNamespace(type="sphere", center=(1, 2, 3), radius=0.5, inside=True))
+    wall = relay_wall_from_config(SimpleNamespace(bsdf={}, type="sphere", center=(1, 2, 3), radius=0.5, inside=True))
     np.testing.assert_allclose(wall.pose.to_scene(wall.positions([0, 0])), [1, 2, 3.5], atol=1e-15)
     np.testing.assert_array_equal(wall.pose.to_scene(wall.default_device_position), [1, 2, 3])
     outside = SphereWall(np.zeros(3), 0.5, inside=False)
@@ -154,7 +156,7 @@ def test_sphere_from_config_keeps_the_scene_axes():
 def test_cylinder_from_config_has_its_axis_as_local_y(axis):
     """Every point of the wall is one radius from the configured axis, and wall y runs along it."""
     center = np.array([1.0, -2.0, 0.5])
-    config = SimpleNamespace(type="cylinder", center=center, axis=axis, radius=0.4, height=1.1, inside=False)
+    config = SimpleNamespace(bsdf={}, type="cylinder", center=center, axis=axis, radius=0.4, height=1.1, inside=False)
     wall = relay_wall_from_config(config)
     direction = np.asarray(axis) / np.linalg.norm(axis)
     xy = wall_points(wall, 20)
@@ -178,7 +180,7 @@ def test_upright_cylinder_has_the_scene_axes():
         (lambda: SphereWall(np.zeros(3), -1.0), "relay wall radius: got -1.0"),
         (lambda: CylinderWall(Pose.identity(), 1.0, np.inf), "relay wall height: got inf"),
         (lambda: cylinder_pose([0, 0, 0], [0, 0, 0]), "axis .* has no direction"),
-        (lambda: relay_wall_from_config(SimpleNamespace(type="torus")), "relay wall type 'torus'"),
+        (lambda: relay_wall_from_config(SimpleNamespace(bsdf={}, type="torus")), "relay wall type 'torus'"),
         (lambda: WALLS["rectangle"].positions([0.0, 0.0, 0.0]), r"need \(\.\.\., 2\)"),
     ],
 )
