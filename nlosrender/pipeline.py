@@ -90,7 +90,7 @@ def render_capture(
     ConfigError
         ``strict``, and there are paths that carry light and are not sampled.
         Something only the renderer could find wrong: a mesh that cannot be read, a BSDF that Mitsuba rejects, a
-        capture that does not fit the memory.
+        capture that does not fit the memory, a memory limit below what the program itself takes.
     OptionError
         The capture does not have the part that is selected.
     BackendError
@@ -98,7 +98,7 @@ def render_capture(
     FileError
         The output cannot be written, or there is an unfinished render of something else.
     RenderError
-        The memory limit is below what the program itself takes, or the result is not finite.
+        The result is not finite.
     IncompleteRender, InterruptedRender
         The render stopped half-way; the same call goes on from there.
     """
@@ -214,7 +214,8 @@ def set_up_engine(
     """Stages 2 to 4 up to the first ray: scene, capture, plan, engine, and what the file will say of them."""
     built = load_view(config) if config.capture.is_line_of_sight else load_scene(config)
     capture, time_axis = describe_capture(config, built.wall, built)
-    plan, engine = prepare(config, backend, built, capture, time_axis, selection, sharing)
+    with sharing.named(config.render.memory_limit_bytes):
+        plan, engine = prepare(config, backend, built, capture, time_axis, selection, sharing)
     return plan, engine, describe_file(config, built, capture, time_axis)
 
 

@@ -6,6 +6,7 @@ Command modules import what they need inside the command: ``--help`` must not wa
 from __future__ import annotations
 
 import sys
+from collections.abc import Iterable
 from contextlib import suppress
 from typing import Annotated, NoReturn
 
@@ -27,8 +28,9 @@ from nlosrender.cli import (
     render_command,
 )
 from nlosrender.cli.interrupt_watch import InterruptWatch
+from nlosrender.cli.json_output import OUTPUT, problems_of
 from nlosrender.cli.streams import open_closed_streams, print_any_name
-from nlosrender.errors import EXIT_FAILURE, EXIT_INTERRUPTED, NlosError
+from nlosrender.errors import EXIT_FAILURE, EXIT_INTERRUPTED, NlosError, Problem
 
 app = typer.Typer(
     name="nlosrender",
@@ -75,14 +77,24 @@ def main() -> None:
         with InterruptWatch():
             app()
     except NlosError as error:
-        _end(f"error: {error}" if "\n" not in str(error) else f"errors:\n{error}", error.exit_code)
+        message = f"error: {error}" if "\n" not in str(error) else f"errors:\n{error}"
+        _end(message, error.exit_code, str(error).splitlines(), problems_of(error))
     except KeyboardInterrupt:
-        _end("interrupted", EXIT_INTERRUPTED)
+        _end("interrupted", EXIT_INTERRUPTED, ["interrupted"])
     except OSError as error:  # commands explain those of their files: what is left is standard output, mostly
-        _end(f"error: {error}. Check the disk, and where the output goes.", EXIT_FAILURE)
+        message = f"{error}. Check the disk, and where the output goes."
+        _end(f"error: {message}", EXIT_FAILURE, [message])
+    except SystemExit as error:  # of mistakes in the arguments, which typer has printed
+        if error.code:
+            told = getattr(error.__context__, "format_message", str)()
+            _end(None, error.code if isinstance(error.code, int) else EXIT_FAILURE, told.splitlines())
+        raise
 
 
-def _end(message: str, exit_code: int) -> NoReturn:
+def _end(message: str | None, exit_code: int, parts: Iterable[str], problems: Iterable[Problem] = ()) -> NoReturn:
     with suppress(OSError):  # nobody listens any more: the exit code still tells
-        typer.echo(message, err=True)
+        if message is not None:
+            typer.echo(message, err=True)
+    with suppress(OSError):
+        OUTPUT.print_failure(parts, exit_code, problems)
     sys.exit(exit_code)

@@ -8,6 +8,8 @@ from typing import Annotated
 
 import typer
 
+from nlosrender.cli.json_output import OUTPUT
+
 
 def register(app: typer.Typer) -> None:
     """Add ``bench`` to ``app``."""
@@ -45,7 +47,6 @@ def bench(
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object instead of a table.")] = False,
 ) -> None:
     """Measure run time against error on scenes with known truth, scaling, and rates."""
-    import json
 
     from nlosrender.bench.benchmark import PARTS, run_benchmark
     from nlosrender.bench.report import table, write_json, write_plot
@@ -66,7 +67,10 @@ def bench(
     write_json(json_path, report)
     if report["scenes"]:
         write_plot(png_path, report)
-    typer.echo(json.dumps(report, allow_nan=False) if as_json else table(report))
+    if as_json:
+        OUTPUT.print(report)
+    else:
+        typer.echo(table(report))
 
 
 def _outputs(output: Path) -> tuple[Path, Path]:

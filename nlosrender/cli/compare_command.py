@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from nlosrender.cli.json_output import OUTPUT
+
 if TYPE_CHECKING:
     from nlosrender.analysis.comparison.captures import Tolerances
     from nlosrender.analysis.comparison.dataset import CheckedFile
@@ -85,17 +87,18 @@ def compare(
     Without any tolerance they have to be equal up to rounding (relative L2 at most 1e-6), as two renders with the
     same seed, version and machine are. Relative numbers are relative to B.
     """
-    import json
-
     from nlosrender.analysis.comparison.captures import compare_captures
     from nlosrender.analysis.comparison.report import comparison_report
     from nlosrender.cli.comparison_table import comparison_table
-    from nlosrender.errors import ComparisonError
+    from nlosrender.errors import EXIT_COMPARISON_EXCEEDED, EXIT_OK, ComparisonError
 
     tolerances = _tolerances(max_rel_l2, max_energy, max_shift, z_test, significance)
     comparison = compare_captures(capture, reference, tolerances)
     report = comparison_report(comparison)
-    typer.echo(json.dumps(report, allow_nan=False) if as_json else comparison_table(report))
+    if as_json:
+        OUTPUT.print(report, EXIT_COMPARISON_EXCEEDED if comparison.failures else EXIT_OK)
+    else:
+        typer.echo(comparison_table(report))
     if comparison.failures:
         listed = "\n".join(f"{capture}: {failure}" for failure in comparison.failures)
         raise ComparisonError(listed)
@@ -122,7 +125,6 @@ def check(
     as_json: AsJson = False,
 ) -> None:
     """Compare every capture of a reference folder with its namesake, as `nlosrender compare` does."""
-    import json
     from dataclasses import asdict
 
     from nlosrender.analysis.comparison.dataset import check_dataset
@@ -135,9 +137,10 @@ def check(
 
     found = check_dataset(folder, reference, _tolerances(max_rel_l2, max_energy, max_shift, z_test, significance), say)
     failed = [file for file in found.files if file.status != "ok"]
+    failure = FileError if found.with_status("unreadable") else ComparisonError
     if as_json:
         files = [asdict(file) for file in found.files]
-        typer.echo(json.dumps({"agrees": not failed, "files": files, "extra": found.extra}, allow_nan=False))
+        OUTPUT.print({"agrees": not failed, "files": files, "extra": found.extra}, failure.exit_code if failed else 0)
     else:
         for name in found.extra:
             typer.echo(f"extra       {name}: not in the reference")
@@ -147,7 +150,7 @@ def check(
         listed = "\n".join(
             f"{'' if file.status == 'unreadable' else f'{file.name}: '}{file.message}" for file in failed
         )
-        raise (FileError if found.with_status("unreadable") else ComparisonError)(listed)
+        raise failure(listed)
 
 
 def _tolerances(

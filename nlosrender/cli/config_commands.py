@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from nlosrender.errors import EXIT_BAD_INPUT, ConfigError, FileError, Problem
+from nlosrender.cli.json_output import OUTPUT, problem_as_json
+from nlosrender.errors import EXIT_BAD_INPUT, EXIT_OK, ConfigError, FileError, Problem
 
 if TYPE_CHECKING:
     from nlosrender.config.document import Config
@@ -114,11 +115,9 @@ def schema() -> None:
 
 
 def _print_verdict(problems: list[Problem], warnings: list[str]) -> None:
-    import json
-    from dataclasses import asdict
-
-    verdict = {"valid": not problems, "problems": [asdict(problem) for problem in problems], "warnings": warnings}
-    typer.echo(json.dumps(verdict, indent=2))
+    found = [problem_as_json(problem) for problem in problems]
+    verdict = {"valid": not problems, "problems": found, "warnings": warnings}
+    OUTPUT.print(verdict, EXIT_BAD_INPUT if problems else EXIT_OK, indent=2)
 
 
 def _summary(config: Config) -> str:

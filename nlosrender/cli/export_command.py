@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from nlosrender.cli.file_commands import CaptureFile
+from nlosrender.cli.json_output import OUTPUT
 
 
 def register(app: typer.Typer) -> None:
@@ -59,7 +60,6 @@ def export(
     as_json: Annotated[bool, typer.Option("--json", help="Print the report as one JSON object.")] = False,
 ) -> None:
     """Write a capture in the format of another program; what that cannot hold is refused or reported."""
-    import json
 
     from nlosrender.cli.output_names import beside
     from nlosrender.errors import OptionError
@@ -71,7 +71,7 @@ def export(
     target = output or beside(file, ending)
     report = export_capture(file, target, file_format, bounces, legs=legs, key=key)
     if as_json:
-        typer.echo(json.dumps({"written": str(report.path), "losses": report.losses}))
+        OUTPUT.print({"written": str(report.path), "losses": report.losses})
         return
     typer.echo(f"wrote {report.path}")
     for loss in report.losses:

@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from nlosrender.cli.capture_table import printable, summary_table
+from nlosrender.cli.json_output import OUTPUT
 
 CaptureFile = Annotated[
     Path, typer.Argument(metavar="FILE", help="Capture in Z-NLOS HDF5, by any writer.", readable=False)
@@ -36,24 +37,28 @@ def info(
     ] = False,
 ) -> None:
     """Show what a capture file holds, from its metadata alone."""
-    import json
-
     from nlosrender.analysis.summary import summarise
     from nlosrender.analysis.unfinished import is_unfinished, summarise_unfinished
-    from nlosrender.errors import FileError
+    from nlosrender.errors import EXIT_BAD_INPUT, EXIT_OK, FileError
 
     if is_unfinished(file):
         found = summarise_unfinished(file)
         lines = (f"{label.replace('_', ' '):<16}{printable(value)}" for label, value in found.items())
-        typer.echo(json.dumps(found, allow_nan=False) if json_output else "\n".join(lines))
+        if json_output:
+            OUTPUT.print(found)
+        else:
+            typer.echo("\n".join(lines))
         return
     summary = summarise(file)
     if check:
         from nlosrender.files.validation import validate_file
 
         summary["violations"] = validate_file(file)
-    typer.echo(json.dumps(summary, allow_nan=False) if json_output else summary_table(summary))
     violations = summary.get("violations")
+    if json_output:
+        OUTPUT.print(summary, EXIT_BAD_INPUT if violations else EXIT_OK)
+    else:
+        typer.echo(summary_table(summary))
     if violations and isinstance(violations, list):
         listed = "\n".join(f"{file}: {printable(violation)}" for violation in violations)
         raise FileError(f"{listed}\nThe file deviates from the Z-NLOS layout: other loaders may refuse or misread it.")

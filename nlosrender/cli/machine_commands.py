@@ -6,6 +6,8 @@ from typing import Annotated
 
 import typer
 
+from nlosrender.cli.json_output import OUTPUT
+
 
 def register(app: typer.Typer) -> None:
     """Add ``doctor`` to ``app``."""
@@ -22,7 +24,7 @@ def doctor(as_json: Annotated[bool, typer.Option("--json", help="Print one JSON 
     """
     from nlosrender.engine import llvm
     from nlosrender.engine.backend import cuda_available, start_backend
-    from nlosrender.errors import BackendError
+    from nlosrender.errors import EXIT_OK, BackendError
     from nlosrender.files.provenance import package_versions
 
     libraries = llvm.find_libraries()
@@ -32,12 +34,10 @@ def doctor(as_json: Annotated[bool, typer.Option("--json", help="Print one JSON 
     except BackendError as error:
         backend, trouble = None, error
     if as_json:
-        import json
-
         found = [{"path": str(x.path), "origin": x.origin, "usable": x.usable, "verdict": x.verdict} for x in libraries]
         report = {"versions": package_versions(), "llvm": found, "gpu": has_gpu}
         report |= {"backend": backend.name if backend else None, "library": backend.library if backend else None}
-        typer.echo(json.dumps(report | {"problem": str(trouble) if trouble else None}))
+        OUTPUT.print(report | {"problem": str(trouble) if trouble else None}, trouble.exit_code if trouble else EXIT_OK)
     else:
         typer.echo("versions: " + ", ".join(f"{name} {version}" for name, version in package_versions().items()))
         typer.echo("LLVM libraries:" if libraries else "LLVM libraries: none found")

@@ -7,6 +7,8 @@ from typing import Annotated
 
 import typer
 
+from nlosrender.cli.json_output import OUTPUT
+
 
 def register(app: typer.Typer) -> None:
     """Add ``merge`` to ``app``."""
@@ -30,18 +32,15 @@ def merge(
 ) -> None:
     """Put the parts of a capture together; what is missing, there twice, damaged or not its own is named."""
     from nlosrender.cli.progress import progress_bar
-    from nlosrender.cli.stated_error import error_in_words, finite_or_none
+    from nlosrender.cli.stated_error import error_in_words
     from nlosrender.files.merge import merge_captures
 
     with progress_bar("merge", hidden=quiet) as (progress, _, _):
         report = merge_captures(parts, output, progress)
     if as_json:
         import dataclasses
-        import json
 
-        content = dataclasses.asdict(report) | {"output": str(report.output)}
-        content["error_estimate"] = finite_or_none(report.error_estimate)
-        typer.echo(json.dumps(content, allow_nan=False))
+        OUTPUT.print(dataclasses.asdict(report) | {"output": str(report.output)})
     elif not quiet:
         typer.echo(f"wrote {report.output} from {report.parts} parts")
         stated = error_in_words(report.error_estimate, report.unsampled_paths, report.zero_because)

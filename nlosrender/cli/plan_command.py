@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from nlosrender.capture.bounces import LINE_OF_SIGHT
+from nlosrender.cli.json_output import OUTPUT
 
 if TYPE_CHECKING:
     from nlosrender.analysis.forecast import Forecast
@@ -53,9 +54,7 @@ def plan(
     except ConfigError as error:
         raise with_places(error, config, changes) from error
     if as_json:
-        import json
-
-        typer.echo(json.dumps(forecast.as_json(), allow_nan=False))
+        OUTPUT.print(forecast.as_json())
         return
     for line in _lines(forecast):
         typer.echo(line)

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from nlosrender.cli.file_commands import CaptureFile
+from nlosrender.cli.json_output import OUTPUT
 from nlosrender.cli.progress import progress_bar
 
 if TYPE_CHECKING:
@@ -125,7 +126,6 @@ def _score_attributes(score: Score | None) -> dict[str, object]:
 
 def _print_json(found: Reconstruction, score: Score | None, written: list[Path]) -> None:
     import dataclasses
-    import json
 
     report = {
         "written": [str(path) for path in written],
@@ -140,7 +140,7 @@ def _print_json(found: Reconstruction, score: Score | None, written: list[Path])
         "warnings": found.warnings,
         "score": None if score is None else dataclasses.asdict(score),
     }
-    typer.echo(json.dumps(report))
+    OUTPUT.print(report)
 
 
 def _print_report(found: Reconstruction, score: Score | None, written: list[Path]) -> None:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from nlosrender.capture.bounces import LINE_OF_SIGHT
+from nlosrender.cli.json_output import OUTPUT
 
 if TYPE_CHECKING:
     from nlosrender.capture.part import Selection
@@ -176,13 +177,8 @@ def _quoted(path: Path) -> str:
 
 def _print_json(report: RenderReport) -> None:
     import dataclasses
-    import json
 
-    from nlosrender.cli.stated_error import finite_or_none
-
-    content = dataclasses.asdict(report) | {"output": str(report.output)}
-    content["error_estimate"] = finite_or_none(report.error_estimate)
-    typer.echo(json.dumps(content, allow_nan=False))
+    OUTPUT.print(dataclasses.asdict(report) | {"output": str(report.output)})
 
 
 def _print_report(report: RenderReport) -> None:

@@ -21,8 +21,3 @@ def error_in_words(error: float, unsampled: Sequence[str], zero_because: Sequenc
     if zero_because:
         return "unknown: H is zero everywhere"
     return f"{error:.2%} (relative L2)" if math.isfinite(error) else "unknown: nothing but noise"
-
-
-def finite_or_none(error: float) -> float | None:
-    """Return what JSON can hold: it knows neither infinity nor NaN."""
-    return error if math.isfinite(error) else None

@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
+from nlosrender.cli.json_output import OUTPUT
+
 if TYPE_CHECKING:
     from nlosrender.analysis.forecast import Forecast
     from nlosrender.config.document import Config
@@ -74,8 +76,6 @@ def plan_all(sweep: Sweep, overrides: Sequence[str], as_json: bool) -> None:
     ConfigError, BackendError, RenderError
         As ``pipeline.forecast_capture``.
     """
-    import json
-
     from nlosrender.cli.plan_command import readable_size
     from nlosrender.config.places import with_places
     from nlosrender.errors import ConfigError
@@ -88,7 +88,7 @@ def plan_all(sweep: Sweep, overrides: Sequence[str], as_json: bool) -> None:
         raise with_places(error, Path(sweep.source), overrides) from error
     total = _total(sweep, indices, forecasts)
     if as_json:
-        typer.echo(json.dumps(total | {"pilots": [forecast.as_json() for forecast in forecasts]}, allow_nan=False))
+        OUTPUT.print(total | {"pilots": [forecast.as_json() for forecast in forecasts]})
         return
     basis = f"measured on {len(indices)} of them"
     typer.echo(f"captures {len(sweep)}, in {sweep.output_folder}")
@@ -124,8 +124,8 @@ def _total(sweep: Sweep, indices: Sequence[int], forecasts: Sequence[Forecast]) 
 
 
 def _print_json(report: SweepReport) -> None:
-    import json
     from dataclasses import asdict
 
-    content = asdict(report) | {"index": str(report.index)}
-    typer.echo(json.dumps(content, allow_nan=False))
+    from nlosrender.errors import EXIT_FAILURE, EXIT_OK
+
+    OUTPUT.print(asdict(report) | {"index": str(report.index)}, EXIT_FAILURE if report.failed else EXIT_OK)

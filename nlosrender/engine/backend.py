@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from nlosrender.engine import llvm
-from nlosrender.errors import BackendError, RenderError
+from nlosrender.errors import BackendError, ConfigError, Problem
 from nlosrender.interruption import uninterrupted
 
 BackendName = Literal["auto", "llvm", "cuda"]
@@ -147,17 +147,15 @@ def batch_memory(limit: int | None, n_triangles: int = 0) -> int:
 
     Raises
     ------
-    RenderError
+    ConfigError
         The limit is below what the program itself needs.
     """
     beside = 0 if limit is None else scene_memory(n_triangles)
     if limit is None:
         limit = physical_memory() // 4
     if limit <= PROCESS_BYTES:
-        raise RenderError(
-            f"render.memory_limit: got {limit / 1e6:.0f} MB, need more than {PROCESS_BYTES / 1e6:.0f} MB, "
-            "which the program takes before any histogram"
-        )
+        message = f"got {limit / 1e6:.0f} MB, need more than {PROCESS_BYTES / 1e6:.0f} MB, which the program takes "
+        raise ConfigError(Problem("", "render.memory_limit", f"{message}before any histogram."))
     left = limit - PROCESS_BYTES
     return int(max(left - beside, left / 8))
 

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import functools
 import os
 import signal
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from multiprocessing import resource_tracker
 from pathlib import Path
@@ -24,16 +25,29 @@ ADVICE = "Start one with 'dask scheduler' and 'dask worker ADDRESS', or leave --
 
 @dataclass(frozen=True)
 class Cluster:
-    """A connection to a dask scheduler with workers."""
+    """A connection to a dask scheduler with workers, made when it is first used."""
 
-    client: Client
+    connect: Callable[[], Client]  # the same one at every call
     sharing: Sharing
     threads: int | None  # of Dr.Jit in each worker; None: as many as dask gave that worker
+
+    @property
+    def client(self) -> Client:
+        """The connection.
+
+        Raises
+        ------
+        BackendError
+            The processes of this machine cannot be started.
+        """
+        return self.connect()
 
 
 @contextmanager
 def joined_cluster(scheduler: str | None = None, workers: int | None = None) -> Iterator[Cluster]:
     """Connect to a scheduler, or start one and workers on this machine; they end with the block.
+
+    On this machine they start when the first unit is sent, after everything about the capture is known to be right.
 
     Parameters
     ----------
@@ -54,13 +68,24 @@ def joined_cluster(scheduler: str | None = None, workers: int | None = None) -> 
         raise BackendError(message) from error
     if scheduler is not None:
         with _connected(scheduler) as client:
-            yield Cluster(client, Sharing(workers=_awaited(client, scheduler, workers)), threads=None)
+            yield Cluster(lambda: client, Sharing(workers=_awaited(client, scheduler, workers)), threads=None)
         return
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     count = workers or cores
-    with _local_workers(count) as local, distributed.Client(local) as client:
+    with ExitStack() as started:
+
+        @functools.cache
+        def connect() -> Client:
+            try:
+                local = started.enter_context(_local_workers(count))
+                client: Client = started.enter_context(distributed.Client(local))
+            except (OSError, RuntimeError, TimeoutError) as error:
+                reason = f"{str(error) or type(error).__name__}. Try fewer --workers."
+                raise BackendError(f"--executor dask: {count} workers cannot be started: {reason}") from error
+            return client
+
         # the process that writes takes a share of the memory, too
-        yield Cluster(client, Sharing(workers=count, memory_shares=count + 1), threads=max(1, cores // count))
+        yield Cluster(connect, Sharing(workers=count, memory_shares=count + 1), threads=max(1, cores // count))
 
 
 @contextmanager

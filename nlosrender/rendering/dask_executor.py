@@ -125,7 +125,8 @@ class _Flight:
 
         flying = as_completed([])
         looked = time.monotonic()
-        self._top_up(flying)
+        if not stop.came:  # while the workers started
+            self._top_up(flying)
         while not flying.is_empty():
             if stop.came and not self._recalled:
                 warn(f"{stop.signal_name}: finishing the units in flight; once more stops at once.")

@@ -27,6 +27,7 @@ from nlosrender.files.identity import capture_identity
 from nlosrender.files.journal import read_records
 from nlosrender.files.unit_log import UnfinishedRender
 from nlosrender.pipeline import set_up_engine
+from nlosrender.rendering import dask_cluster
 from nlosrender.rendering.dask_cluster import joined_cluster
 from nlosrender.rendering.dask_worker import Job, Refusal, render_remotely
 
@@ -187,10 +188,10 @@ def test_a_first_unit_that_ends_its_workers_leaves_nothing(folder: Path, monkeyp
     """There is nothing to go on with: a failure, exit code 1."""
     monkeypatch.setenv("DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES", "0")
     process = start(folder, *DASK, "--set", "render.spp=100000000")
-    while not any((folder / ".a.hdf5.partial").glob("samples.*")):
+    while len(local_workers(process)) < 2:
         assert process.poll() is None, process.communicate()
         time.sleep(0.01)
-    time.sleep(1)  # the first units are on their way
+    time.sleep(5)  # they have started, and the first units are on their way
     local_workers(process)[0].kill()
     code, _, errors = ended(process)
     assert (code, "Traceback" in errors) == (1, False), errors
@@ -313,6 +314,30 @@ def test_without_dask_it_says_what_to_install(folder: Path, monkeypatch: pytest.
     assert "pip install 'nlosrender[dask]'" in done.stderr
 
 
+@pytest.mark.parametrize(
+    ("setting", "message"),
+    [
+        # two workers and the process that writes: a third of 1 GB each, of which the program takes 0.4 GB
+        ("render.memory_limit=1GB", "shared by 2 workers and this process, 333 MB each"),
+        (
+            "render.memory_limit=1200.03MB",
+            "shared by 2 workers and this process, 400 MB each",
+        ),  # a sensor point takes more
+        ("scene.hidden_geometry.1.filename=empty.obj", "empty.obj"),
+    ],
+)
+def test_mistakes_are_told_before_workers_start(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, setting: str, message: str
+) -> None:
+    """Exit code 3 with the place, after less than a process takes to start; the share of a worker is named."""
+    (folder / "empty.obj").write_text("")
+    monkeypatch.setattr(dask_cluster, "_local_workers", lambda count: pytest.fail("workers are started"))
+    done = run(folder, "render", "scene.yaml", *DASK, "--set", setting)
+    assert (done.returncode, done.stderr.count("--set " + setting)) == (3, 1), done.stderr
+    assert message in done.stderr
+    assert not (folder / ".a.hdf5.partial").exists()
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("options", "code", "message"),
@@ -323,7 +348,6 @@ def test_without_dask_it_says_what_to_install(folder: Path, monkeypatch: pytest.
         (("--scheduler", "127.0.0.1:1"), 2, "needs --executor dask"),
         (("--workers", "2"), 2, "needs --executor dask"),
         (("--executor", "dask", "--workers", "0"), 2, "greater than or equal to 1"),
-        ((*DASK, "--set", "render.memory_limit=1GB"), 1, "render.memory_limit"),
     ],
 )
 def test_what_cannot_work_is_said_at_once(folder: Path, options: tuple[str, ...], code: int, message: str) -> None:

@@ -8,7 +8,7 @@ import pytest
 
 from nlosrender.engine import llvm
 from nlosrender.engine.backend import PROCESS_BYTES, batch_memory, scene_memory
-from nlosrender.errors import RenderError
+from nlosrender.errors import ConfigError
 
 
 @pytest.mark.parametrize(
@@ -77,7 +77,7 @@ def test_without_a_usable_library_the_exit_code_is_6_and_there_is_advice(command
 
 def test_a_memory_limit_below_the_program_itself_is_an_error():
     """The limit is for the process, so batches get what the program leaves."""
-    with pytest.raises(RenderError, match="memory_limit"):
+    with pytest.raises(ConfigError, match="memory_limit"):
         batch_memory(int(PROCESS_BYTES) - 1)
     assert batch_memory(int(PROCESS_BYTES) + 1000) == 1000
 

@@ -1,0 +1,83 @@
+"""``--json``: one object on standard output, whatever comes of a command."""
+
+from __future__ import annotations
+
+import re
+import sys
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+from nlosrender.errors import EXIT_OK, ConfigError, Problem
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+_PLACE = re.compile(r"(.*):(\d+):(\d+)", re.DOTALL)
+
+
+class JsonOutput:
+    """Whether the one object of this process was asked for, and printed."""
+
+    def __init__(self) -> None:
+        self.printed = False
+
+    @staticmethod
+    def asked(arguments: Sequence[str]) -> bool:
+        """Tell whether ``arguments`` ask for JSON; looked for by hand, for they may be no command line at all."""
+        options = arguments[: arguments.index("--")] if "--" in arguments else arguments
+        return "--json" in options
+
+    def print(self, content: Mapping[str, Any], exit_code: int = EXIT_OK, indent: int | None = None) -> None:
+        """Print the object: what a command found, with the exit code it will fail with.
+
+        Parameters
+        ----------
+        content
+            Plain values; numbers that are not finite become null, which is all that JSON knows of them.
+        exit_code
+            Added as ``exit_code`` unless it is 0.
+        indent
+            Spaces per level; None: one line.
+        """
+        import json
+
+        import typer
+
+        self.printed = True
+        failed = {"exit_code": exit_code} if exit_code != EXIT_OK else {}
+        typer.echo(json.dumps(_finite({**content, **failed}), indent=indent, allow_nan=False))
+
+    def print_failure(self, messages: Iterable[str], exit_code: int, problems: Iterable[Problem] = ()) -> None:
+        """Print why a command failed, unless it has printed its object before; only where ``--json`` asks for one."""
+        if self.printed or not self.asked(sys.argv[1:]):
+            return
+        found = [problem_as_json(problem) for problem in problems]
+        self.print({"exit_code": exit_code, "messages": list(messages), "problems": found})
+
+
+def problem_as_json(problem: Problem) -> dict[str, Any]:
+    """Return a mistake with its place in parts: ``file``, ``line`` and ``column`` are null where there is none."""
+    file, line, column = problem.place or None, None, None
+    match = _PLACE.fullmatch(problem.place)
+    if problem.place.startswith("--set "):
+        file = None
+    elif match:
+        file, line, column = match[1], int(match[2]), int(match[3])
+    where = {"file": file, "line": line, "column": column}
+    return {"place": problem.place, **where, "key": problem.key, "message": problem.message}
+
+
+def problems_of(error: BaseException) -> tuple[Problem, ...]:
+    """Return the mistakes in a configuration that an error tells of."""
+    return error.problems if isinstance(error, ConfigError) else ()
+
+
+def _finite(value: Any) -> Any:
+    if isinstance(value, float):
+        return value if value - value == 0 else None
+    if isinstance(value, Mapping):
+        return {key: _finite(item) for key, item in value.items()}
+    return [_finite(item) for item in value] if isinstance(value, (list, tuple)) else value
+
+
+OUTPUT = JsonOutput()
