@@ -8,11 +8,12 @@ from __future__ import annotations
 
 import functools
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from nlosrender.analysis.engine_check import MOST_REPLICAS, TECHNIQUES, EngineCheck, compare_trials, try_technique
 from nlosrender.analysis.forecast import Forecast, forecast_file, forecast_render
 from nlosrender.capture.bounces import BounceAxis, first_bounce_of
 from nlosrender.capture.grids import Capture, build_capture
@@ -24,7 +25,7 @@ from nlosrender.config.document import Config
 from nlosrender.config.load import config_hash, config_to_dict
 from nlosrender.config.warnings import config_warnings
 from nlosrender.engine.backend import Backend, batch_memory, physical_memory, start_backend
-from nlosrender.errors import ConfigError, Problem
+from nlosrender.errors import ConfigError, OptionError, Problem
 from nlosrender.files.capture_file import CaptureHeader
 from nlosrender.files.chunks import sensor_tile
 from nlosrender.files.identity import capture_identity, files_read, identity_attributes
@@ -247,6 +248,62 @@ def forecast_capture(config: Config) -> Forecast:
     return forecast_render(config, backend, plan, engine, header, tuple(warnings.said), spent, missing)
 
 
+def check_engines(
+    config: Config,
+    *,
+    points_per_axis: int,
+    target_error: float,
+    time_limit_s: float,
+    significance: float,
+    progress: Callable[[str], None] = lambda technique: None,
+) -> EngineCheck:
+    """Render a few sensor points by every technique that can, and say how far these are apart; no file is written.
+
+    Parameters
+    ----------
+    config
+        A validated configuration; its own goal of samples, error or time is not used.
+    points_per_axis
+        Sensor points along each side of the grid, spread over it; of exhaustive captures 3 x 3 laser points.
+    target_error, time_limit_s
+        When a technique stops: relative L2 error of H, or seconds.
+    significance
+        Chance of a false alarm.
+    progress
+        Told the name of each technique before it starts.
+
+    Raises
+    ------
+    ConfigError, BackendError, RenderError
+        As ``render_capture``.
+    OptionError
+        A line-of-sight capture, which one technique renders.
+    """
+    if config.capture.is_line_of_sight:
+        raise OptionError("check-engines: one technique renders line_of_sight captures; there is nothing to compare.")
+    backend = started_backend(config)
+    from nlosrender.engine.path_engine import Budget
+    from nlosrender.engine.pilot import pilot_of
+
+    built = load_scene(config)
+    capture, time_axis = describe_capture(config, built.wall, built)
+    pilot = pilot_of(capture, points_per_axis)
+    replicas = min(replicas_for(backend.lanes, pilot.sensors.size), MOST_REPLICAS)
+    budget, trials = Budget(target_error=target_error, time_limit_s=time_limit_s), []
+    missing: tuple[UnsampledPaths, ...] = ()
+    for technique in TECHNIQUES:
+        progress(technique.name)
+        changes = {"spp": None, "temporal_kernel_opl": 0.0, **technique.changes}
+        changed = config.model_copy(update={"render": config.render.model_copy(update=changes)})
+        _, engine = prepare(changed, backend, built, capture, time_axis, replicas=replicas)
+        missing = missing or missing_light(engine)
+        trials.append(try_technique(technique, engine, pilot, budget))
+    pairs = compare_trials(trials, bounce_axis(config), pilot, significance)
+    unsampled = tuple(paths.summary for paths in missing)
+    n_lasers = 1 if capture.scan_type == "confocal" else pilot.lasers.size
+    return EngineCheck(pilot.sensors.size, n_lasers, tuple(trials), tuple(pairs), unsampled)
+
+
 def late_warnings(
     config: Config, backend: Backend, plan: Plan, engine: Engine, header: CaptureHeader, sharing: Sharing = ALONE
 ) -> Iterator[str]:
@@ -321,8 +378,9 @@ def prepare(
     time_axis: TimeAxis,
     selection: Selection = WHOLE,
     sharing: Sharing = ALONE,
+    replicas: int | None = None,
 ) -> tuple[Plan, Engine]:
-    """Stages 3 and 4: cut the work into units and set up the engine."""
+    """Stages 3 and 4: cut the work into units and set up the engine; ``replicas`` other than the plan's on request."""
     from nlosrender.engine.path_engine import PathOptions
     from nlosrender.engine.planner import choose_engine
 
@@ -351,7 +409,7 @@ def prepare(
         russian_roulette=render.russian_roulette,
         channels=channels,
         seed=render.seed,
-        replicas=plan.replicas,
+        replicas=replicas or plan.replicas,
         temporal_kernel_bins=render.temporal_kernel_opl / time_axis.bin_width_opl,
     )
     return plan, choose_engine(render, built, capture, time_axis, options, backend.lanes)

@@ -15,6 +15,7 @@ import typer
 from nlosrender import __version__
 from nlosrender.cli import (
     bench_command,
+    check_engines_command,
     compare_command,
     config_commands,
     export_command,
@@ -50,6 +51,7 @@ reconstruct_command.register(app)
 export_command.register(app)
 machine_commands.register(app)
 compare_command.register(app)
+check_engines_command.register(app)
 bench_command.register(app)
 paper_command.register(app)
 

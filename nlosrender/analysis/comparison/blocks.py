@@ -18,6 +18,7 @@ from nlosrender.files.reader import StoredCapture, explained_read, open_hdf5
 from nlosrender.files.stored_header import samples_of
 
 Float32 = NDArray[np.float32]
+Samples = NDArray[np.float32] | NDArray[np.float64]  # as stored, or as rendered
 BLOCK_SAMPLES = 2**21  # of one dataset at a time: 8 MiB as read, and about 20 times that in intermediate results
 LARGEST_CHUNK = 8  # blocks; larger ones, by other writers, are unpacked more than once
 MAX_POINTS = 2**24  # of one grid; 4096 x 4096 is beyond any scan
@@ -36,10 +37,10 @@ class Block:
     rows: slice
     columns: slice
     bounces: tuple[int, ...]  # indices on the file's bounce axis
-    a: Float32
-    b: Float32
-    variance_a: Float32 | None  # None: not asked for, or not in the file
-    variance_b: Float32 | None
+    a: Samples
+    b: Samples
+    variance_a: Samples | None  # None: not asked for, or not in the file
+    variance_b: Samples | None
 
 
 class OpenCapture:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from nlosrender.analysis.comparison.blocks import Block, Float32
+from nlosrender.analysis.comparison.blocks import Block, Samples
 from nlosrender.files.stored_header import StoredHeader
 
 Float64 = NDArray[np.float64]
@@ -139,5 +139,5 @@ def _index(sums: Float64) -> tuple[int, int]:
     return int(row), int(column)
 
 
-def _value(samples: Float32, where: tuple[np.intp, ...]) -> float:
+def _value(samples: Samples, where: tuple[np.intp, ...]) -> float:
     return float(samples[where])

@@ -15,16 +15,16 @@ degrees of freedom; of n statements none may exceed the z that a single one exce
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from statistics import NormalDist
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from nlosrender.analysis.comparison.blocks import Block, Float32
+from nlosrender.analysis.comparison.blocks import Block, Samples
 from nlosrender.capture.bounces import FIRST_BOUNCE, LAST_FILE_BOUNCE, THIRD_BOUNCE
-from nlosrender.files.stored_header import StoredHeader
 
 Float64 = NDArray[np.float64]
 
@@ -86,6 +86,26 @@ class Side:
         return Side(*(change(part) for part in vars(self).values()))
 
 
+class Described(Protocol):
+    """What is known of a capture, stored or in memory: a ``StoredHeader``, or as much of one as the test asks for."""
+
+    @property
+    def attributes(self) -> Mapping[str, object]:
+        """Return ``render_engine``, ``replicas`` and ``max_bounces``, where they are known."""
+
+    @property
+    def sizes(self) -> Mapping[str, int]:
+        """Return the lengths of at least the axes channel and bounce."""
+
+    @property
+    def split_bounces(self) -> bool | None:
+        """Return whether each bounce has an index of its own; None: not known."""
+
+    @property
+    def n_bins(self) -> int:
+        """Return the number of bins."""
+
+
 class ErrorModel:
     """What the variances in a file mean.
 
@@ -95,7 +115,7 @@ class ErrorModel:
     the most they can be.
     """
 
-    def __init__(self, header: StoredHeader):
+    def __init__(self, header: Described):
         attributes, n_bounces = header.attributes, header.sizes["bounce"]
         replicas, limit = attributes.get("replicas"), attributes.get("max_bounces")
         self.is_independent = attributes.get("render_engine") != "virtual_lights"
@@ -114,7 +134,7 @@ class ErrorModel:
         # (channel, bounce) sums over all blocks so far
         self.light, self._noise = (np.zeros((header.sizes["channel"], n_bounces)) for _ in range(2))
 
-    def side(self, values: Float32, variance: Float32 | None, bounces: tuple[int, ...]) -> Side:
+    def side(self, values: Samples, variance: Samples | None, bounces: tuple[int, ...]) -> Side:
         """Return samples (channel, bounce, y, x, bin) with their errors; without a variance they count as exact."""
         value = values.astype(np.float64)
         stored = np.zeros_like(value) if variance is None else variance.astype(np.float64)
@@ -175,12 +195,12 @@ class ZTest:
     Parameters
     ----------
     a, b
-        Headers of the two captures; at least one has variances, the other may be exact.
+        What is known of the two captures; at least one has variances, the other may be exact.
     significance
         Probability of an alarm where both show the same, over the whole capture.
     """
 
-    def __init__(self, a: StoredHeader, b: StoredHeader, significance: float):
+    def __init__(self, a: Described, b: Described, significance: float):
         self.models = (ErrorModel(a), ErrorModel(b))
         self.significance = significance
         self.n_statements = 0
