@@ -123,7 +123,7 @@ def render_capture(
             budget = settled_budget(config, engine)
         with resumable(partial) as stop:
             provenance = provenance_attributes(
-                resolved, config_hash(config), engine=engine.name, seed=config.render.seed
+                resolved, config_hash(config), engine=engine.name, seed=config.render.seed, meshes=engine.built.meshes
             )
             partial.open(header, provenance | identity_attributes(identity), output.compression, output.variance)
             warnings.say(partial.damage)

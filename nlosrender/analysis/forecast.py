@@ -13,6 +13,7 @@ from nlosrender.config.document import Config
 from nlosrender.engine.backend import Backend, scene_memory
 from nlosrender.files.capture_file import CaptureHeader
 from nlosrender.files.size import FileSize, forecast_size
+from nlosrender.scene.mesh_report import MeshReport
 
 if TYPE_CHECKING:
     from nlosrender.engine.engines import Engine
@@ -42,6 +43,7 @@ class Forecast:
     seconds_estimate: float | None  # from scene to file, kernels compiled; None: the pilot saw nothing but noise
     estimate_basis: str
     warnings: tuple[str, ...]
+    meshes: tuple[MeshReport, ...] = ()  # what was read of mesh files
     unsampled_paths: tuple[str, ...] = ()  # classes of paths whose light will be missing: the error will not be known
 
     def as_json(self) -> dict[str, object]:
@@ -108,6 +110,7 @@ def forecast_render(
         seconds_estimate=None if rendering.seconds is None else rendering.seconds + around,
         estimate_basis=rendering.basis,
         warnings=warnings,
+        meshes=engine.built.meshes,
         unsampled_paths=unsampled,
     )
 

@@ -100,6 +100,7 @@ def _provenance(attributes: Mapping[str, object]) -> dict[str, object]:
         "config_hash": attributes.get("config_hash"),
         "part": _json(attributes.get("part")),
         "written_by": attributes.get("engine"),
+        "meshes": _json(attributes.get("meshes")),
         "versions": _json(attributes.get("versions")),
     }
 

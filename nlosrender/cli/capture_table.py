@@ -7,11 +7,12 @@ from collections.abc import Sequence
 from nlosrender.capture.bounces import LINE_OF_SIGHT
 
 SHOWN_LENGTH = 160  # characters of one value in the table; --json has all of it
+_LONGEST = {"mesh": 600}  # names of materials
 
 
 def summary_table(summary: dict[str, object]) -> str:
     """Return the summary of a capture (``analysis.summary.summarise``) as lines of label and text."""
-    rows = [(label, printable(text)) for label, text in _rows(summary) if text]
+    rows = [(label, printable(text, _LONGEST.get(label, SHOWN_LENGTH))) for label, text in _rows(summary) if text]
     width = max(len(label) for label, _ in rows)
     return "\n".join(f"{label:<{width}}  {text}" for label, text in rows)
 
@@ -48,6 +49,7 @@ def _rows(summary: dict[str, object]) -> list[tuple[str, str]]:
         ("created", _text(summary["created"])),
         ("config hash", _text(summary["config_hash"])),
         ("written by", _text(summary["written_by"])),
+        *(("mesh", line) for line in _meshes(summary["meshes"])),
         ("versions", _named(summary["versions"])),
         ("check", "" if checked is None else verdict),
     ]
@@ -100,6 +102,19 @@ def _lengths(position: object) -> str:
     return f"({', '.join(_text(length) for length in _sequence(position))}) m" if position else ""
 
 
+def _meshes(meshes: object) -> list[str]:
+    """Return a line for each mesh; as it stands where it is not ours."""
+    from nlosrender.scene.mesh_report import MeshReport
+
+    lines = []
+    for mesh in _sequence(meshes):
+        try:
+            lines.append(MeshReport(**mesh).line())  # type: ignore[arg-type]
+        except (TypeError, ValueError, AttributeError):
+            lines.append(_text(mesh))
+    return lines
+
+
 def _named(values: object) -> str:
     return (
         ", ".join(f"{name} {_text(value)}" for name, value in values.items())
@@ -135,8 +150,8 @@ def _sequence(value: object) -> Sequence[object]:
     return value if isinstance(value, (list, tuple)) else [value]
 
 
-def printable(text: object) -> str:
+def printable(text: object, longest: int = SHOWN_LENGTH) -> str:
     """Return text from a file as one line that is safe to print."""
     # attributes are anybody's: control characters would reach the terminal
     shown = "".join(character if character.isprintable() else ascii(character)[1:-1] for character in str(text))
-    return shown if len(shown) <= SHOWN_LENGTH else shown[:SHOWN_LENGTH] + " ..."
+    return shown if len(shown) <= longest else shown[:longest] + " ..."

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -14,6 +14,7 @@ from nlosrender.errors import EXIT_BAD_INPUT, EXIT_OK, ConfigError, FileError, P
 
 if TYPE_CHECKING:
     from nlosrender.config.document import Config
+    from nlosrender.scene.mesh_report import MeshReport
 
 
 class ScanTypeOption(StrEnum):
@@ -75,13 +76,15 @@ def validate(
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
-    """Check config files and print every mistake with its place; nothing is rendered."""
+    """Check config files and their meshes, and print every mistake with its place; nothing is rendered."""
     from nlosrender.config.load import load_config
+    from nlosrender.config.places import with_places
     from nlosrender.config.sweep_load import load_sweep
     from nlosrender.config.warnings import config_warnings
 
     problems: list[Problem] = []
     warnings: list[str] = []
+    meshes: list[MeshReport] = []
     for path in configs:
         try:
             sweep = load_sweep(path, overrides or ())
@@ -89,15 +92,23 @@ def validate(
         except ConfigError as error:
             problems += error.problems
             continue
-        found = [f"{path}: {warning}" for warning in config_warnings(config)]
+        try:
+            own_meshes, doubts = _meshes_of(config)
+        except ConfigError as error:
+            problems += with_places(error, path, overrides or ()).problems
+            continue
+        found = [f"{path}: {warning}" for warning in (*config_warnings(config), *doubts)]
         warnings += found
+        meshes += own_meshes
         if not as_json:
             captures = "" if sweep is None else f"a sweep of {len(sweep)} captures in {sweep.output_folder}, such as "
             typer.echo(f"{path}: ok ({captures}{_summary(config)})")
+            for mesh in own_meshes:
+                typer.echo(f"  mesh {mesh.line()}")
             for warning in found:
                 typer.echo(f"warning: {warning}", err=True)
     if as_json:
-        _print_verdict(problems, warnings)
+        _print_verdict(problems, warnings, meshes)
     if problems and as_json:
         raise typer.Exit(EXIT_BAD_INPUT)
     if problems:
@@ -114,9 +125,31 @@ def schema() -> None:
     typer.echo(json.dumps(document, indent=2))
 
 
-def _print_verdict(problems: list[Problem], warnings: list[str]) -> None:
-    found = [problem_as_json(problem) for problem in problems]
-    verdict = {"valid": not problems, "problems": found, "warnings": warnings}
+def _meshes_of(config: Config) -> tuple[Sequence[MeshReport], Sequence[str]]:
+    """Return what there is to say of the meshes of a scene, and warnings; numpy is loaded only where there are some.
+
+    Raises
+    ------
+    ConfigError
+        One cannot be used.
+    """
+    if not config.scene.has_mesh_files:
+        return (), ()
+    from nlosrender.scene.mesh_surfaces import describe_meshes
+
+    read = describe_meshes(config.scene)
+    return read.meshes, read.warnings
+
+
+def _print_verdict(problems: list[Problem], warnings: list[str], meshes: list[MeshReport]) -> None:
+    from dataclasses import asdict
+
+    verdict = {
+        "valid": not problems,
+        "problems": [problem_as_json(problem) for problem in problems],
+        "warnings": warnings,
+        "meshes": [asdict(mesh) for mesh in meshes],
+    }
     OUTPUT.print(verdict, EXIT_BAD_INPUT if problems else EXIT_OK, indent=2)
 
 

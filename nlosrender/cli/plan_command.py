@@ -70,6 +70,7 @@ def _lines(forecast: Forecast) -> Iterator[str]:
         yield f"missing  {paths}: sampled by no technique, the stated error will be unknown"
     hidden = "" if forecast.scan_type == LINE_OF_SIGHT else "hidden "
     yield f"scan     {_scan(forecast)}, {forecast.n_triangles} {hidden}triangles"
+    yield from (f"mesh     {mesh.line()}" for mesh in forecast.meshes)
     start, end = forecast.window_opl
     yield f"time     {forecast.n_bins} bins of {forecast.bin_width_opl:g} m, from {start:.6g} to {end:.6g} m"
     plural = "" if forecast.batches == 1 else "es"

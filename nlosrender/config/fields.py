@@ -153,6 +153,14 @@ def _brightness(value: object) -> Any:
     return tuple(numbers) if isinstance(value, (list, tuple)) else numbers[0]
 
 
+def _scale(value: object) -> Any:
+    need = "a number other than 0, or three of them [x, y, z]; negative ones mirror"
+    numbers = [as_finite(item) for item in value] if isinstance(value, (list, tuple)) else [as_finite(value)]
+    if len(numbers) != (3 if isinstance(value, (list, tuple)) else 1) or not all(numbers):
+        raise refuse(value, need, _quoted_number(value))
+    return tuple(numbers) if isinstance(value, (list, tuple)) else numbers[0]
+
+
 def _flag(value: object) -> bool:
     if not isinstance(value, bool):
         raise refuse(value, "true or false")
@@ -210,6 +218,14 @@ def _all_positive(vector: tuple[float, ...]) -> bool:
 
 Positive = Annotated[
     float, Checked(_number("a number > 0", lambda x: x > 0), {"type": "number", "exclusiveMinimum": 0})
+]
+_NOT_ZERO = {"type": "number", "not": {"const": 0}}
+Scale = Annotated[
+    float | tuple[float, float, float],
+    Checked(
+        _scale,
+        {"anyOf": [_NOT_ZERO, {"type": "array", "items": _NOT_ZERO, "minItems": 3, "maxItems": 3}]},
+    ),
 ]
 Energy = Annotated[
     float,

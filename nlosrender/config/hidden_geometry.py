@@ -20,13 +20,13 @@ from nlosrender.config.fields import (
     LengthOrZero,
     Name,
     Point3,
-    Positive,
+    Scale,
     Sizes3,
     Text,
 )
 from nlosrender.config.frozen import FrozenDict
 from nlosrender.config.plugin_check import checked_plugin, config_folder, existing_file
-from nlosrender.config.refusal import Fault, refusal, refuse
+from nlosrender.config.refusal import Fault, refusal, refuse, shown
 from nlosrender.config.section import Section, pose_faults
 from nlosrender.config.shape_check import check_shape
 
@@ -141,8 +141,8 @@ class FromFile(Section):
     """the command that makes the file, told when it is missing"""
     filename: MeshFilename
     """a .ply or .obj file; relative names start at the YAML's folder"""
-    scale: Positive = 1.0
-    """m per unit of the file"""
+    scale: Scale = 1.0
+    """m per unit of the file; [x, y, z]: along its axes; negative: mirrored, and its front stays its front"""
     rotate_deg: Angles3 = _NO_ROTATION
     """degrees about x, y, z, in this order"""
     translate: Point3 = (0.0, 0.0, 0.0)
@@ -153,8 +153,25 @@ class MeshConfig(FromFile, _HiddenItem):
     """A triangle mesh from a file: scaled, then rotated about x, then y, then z, then translated."""
 
     type: Literal["mesh"]
-    face_normals: Flag = False
-    """true: flat shading; false: the file's vertex normals"""
+    normals: Literal["auto", "file", "flat", "smooth"] = "auto"
+    """auto: the file's vertex normals where it has some, else flat faces; file: it has to have them; flat: none;
+    smooth: averaged from the faces around each vertex"""
+    face_normals: Flag | None = None
+    """as Mitsuba has it: true is normals: flat, false the file's or smooth ones; null: normals decides"""
+
+    def rules(self) -> Iterator[Fault]:
+        """Yield the fault of two keys that contradict each other."""
+        yield from super().rules()
+        if self.face_normals is not None and self.normals != "auto" and self.face_normals != (self.normals == "flat"):
+            message = f"face_normals is {shown(self.face_normals)}, normals is {self.normals}. Remove one of the two."
+            yield Fault(("normals",), message, needs=(("normals",), ("face_normals",)))
+
+    @property
+    def shading_normals(self) -> Literal["auto", "file", "flat", "smooth", "mitsuba"]:
+        """What ``normals`` and ``face_normals`` say together (``scene.mesh_normals.Normals``)."""
+        if self.face_normals is None or self.normals != "auto":
+            return self.normals
+        return "flat" if self.face_normals else "mitsuba"
 
 
 class BoxConfig(_HiddenItem):

@@ -58,13 +58,27 @@ class SceneConfig(Section):
             return True
         if self.mitsuba is not None and is_colored_xml(read_mitsuba_xml(self.mitsuba)[0]):
             return True
-        shaped = [item for item in self.emitters if not isinstance(item, (PointLamp, SpotLamp))]
+        shaped = [item for _, item in self.shining_surfaces]
         lights = [
             item.intensity if isinstance(item, (PointLamp, SpotLamp)) else item.radiance for item in self.emitters
         ]
         if any(isinstance(light, tuple) and len(set(light)) > 1 for light in lights):
             return True
         return any(is_colored(item.bsdf) for item in (*self.hidden_geometry, *shaped))
+
+    @property
+    def shining_surfaces(self) -> tuple[tuple[int, Any], ...]:
+        """Those of ``emitters`` that have a shape, with their places in the list."""
+        return tuple(
+            (place, item) for place, item in enumerate(self.emitters) if not isinstance(item, (PointLamp, SpotLamp))
+        )
+
+    @property
+    def has_mesh_files(self) -> bool:
+        """Whether .ply or .obj files have to be read, those of ``mitsuba`` aside."""
+        items = [self.relay_wall, *self.hidden_geometry, *(item for _, item in self.shining_surfaces)]
+        shapes = [item.shape["type"] for item in items if item is not None and item.type == "mitsuba"]
+        return any(item is not None and item.type == "mesh" for item in items) or bool({"ply", "obj"} & set(shapes))
 
     @property
     def wall(self) -> RelayWallConfig:

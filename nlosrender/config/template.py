@@ -81,7 +81,9 @@ scene:
     # A picture has its first row at the item's up side, its first column at the left as seen from the front:
     # bsdf: {{type: diffuse, reflectance: {{type: bitmap, filename: wood.png, raw: true}}}}  # see docs/textures.md
     # Further items, one example of each type. rotate_deg: degrees about x, then y, then z.
-    # - {{type: mesh, filename: bunny.ply, scale: 1, rotate_deg: [0, 90, 0], translate: [0, 0, 1], face_normals: false}}
+    # - {{type: mesh, filename: bunny.ply, scale: 1, rotate_deg: [0, 90, 0], translate: [0, 0, 1], normals: auto}}
+    #   # scale: a number or [x, y, z], negative mirrors; normals: auto, file, flat or smooth, or face_normals: true
+    #   # for flat ones; see docs/meshes.md
     # - {{type: letters, text: Z, height: 0.8, thickness: 0.0, stroke_width: null, spacing: null, center: [0, 0, 1]}}
     # - {{type: box, center: [0, 0, 1], size: [0.3, 0.2, 0.1], rotate_deg: [0, 0, 30]}}
     # - {{type: sphere, center: [0, 0, 1], radius: 0.3, inside: false}}

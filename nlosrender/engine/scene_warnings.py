@@ -36,7 +36,7 @@ class _SurfacePoints:
     """Points on the reflecting side of one hidden surface [engine units]."""
 
     points: Float64  # (n, 3)
-    normals: Float64  # (n, 3), any length; zero where both sides reflect
+    normals: Float64  # (n, 3), any length, those that reflection goes by; zero where both sides reflect
 
 
 def scene_warnings(engine: Engine) -> tuple[str, ...]:
@@ -125,7 +125,7 @@ def _surface_points(built: BuiltScene, shape: mi.Shape) -> _SurfacePoints:
     k = np.arange(count)
     u, v = (k + 0.5) / count, k * 0.618033988749895 % 1  # golden ratio: even in both dimensions
     if shape.is_mesh():
-        triangles, _ = facing_triangles(built, shape)
+        triangles, numbers = facing_triangles(built, shape)
         normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
         areas = np.linalg.norm(normals, axis=-1)
         if not len(areas):
@@ -134,8 +134,14 @@ def _surface_points(built: BuiltScene, shape: mi.Shape) -> _SurfacePoints:
         chosen = np.minimum(np.searchsorted(cumulative, u), len(areas) - 1)
         root, across = np.sqrt(v), (k * 0.754877666 % 1)
         a, b, c = (triangles[chosen, corner] for corner in range(3))
-        points = a + (b - a) * (root * (1 - across))[:, None] + (c - a) * (root * across)[:, None]
+        weights = np.stack([1 - root, root * (1 - across), root * across], axis=1)
+        points = a + (b - a) * weights[:, 1:2] + (c - a) * weights[:, 2:]
         normals = normals[chosen]
+        if shape.has_vertex_normals():
+            parameters = mi.traverse(shape)
+            corners = np.asarray(parameters["faces"]).reshape(-1, 3)[numbers[chosen]]
+            at_vertices = np.asarray(parameters["vertex_normals"], dtype=np.float64).reshape(-1, 3)
+            normals = np.einsum("pc,pcx->px", weights, at_vertices[corners])
     else:
         at = mi.Point2f(u.astype(np.float32), v.astype(np.float32))
         sample = shape.sample_position(mi.Float(0), at)

@@ -5,8 +5,13 @@ from __future__ import annotations
 import json
 import platform
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from nlosrender.scene.mesh_report import MeshReport
 
 PACKAGES = ("nlosrender", "mitsuba", "drjit", "numpy", "h5py")
 
@@ -17,6 +22,7 @@ def provenance_attributes(
     *,
     engine: str | None = None,
     seed: int | None = None,
+    meshes: Sequence[MeshReport] = (),
     created: datetime | None = None,
     samples: int | None = None,
     error_estimate: float | None = None,
@@ -35,6 +41,8 @@ def provenance_attributes(
         Name of the engine that rendered. Stored as ``render_engine``: ``engine`` names the program.
     seed
         Seed of the random numbers.
+    meshes
+        What was read of mesh files.
     created
         Time of creation, with its time zone; now when omitted.
     samples, error_estimate, seconds, out_of_window_energy
@@ -65,6 +73,8 @@ def provenance_attributes(
         attributes["render_engine"] = engine
     if seed is not None:
         attributes["seed"] = seed
+    if meshes:
+        attributes["meshes"] = json.dumps([asdict(mesh) for mesh in meshes], ensure_ascii=False)
     return attributes | result_attributes(
         samples=samples, error_estimate=error_estimate, seconds=seconds, out_of_window_energy=out_of_window_energy
     )

@@ -17,7 +17,6 @@ import numpy as np
 from nlosrender.scene.double_faces import doubles_of_earlier, without_double_faces
 from nlosrender.scene.hidden_geometry import (
     Bounds,
-    MeshFile,
     Radiance,
     ShapeDescription,
     Surface,
@@ -25,8 +24,9 @@ from nlosrender.scene.hidden_geometry import (
     joined_bounds,
 )
 from nlosrender.scene.materials import area_emitter, check_surface, first_line, load_bsdf, medium_warnings, rejected
-from nlosrender.scene.mesh_file import read_mesh
-from nlosrender.scene.pictures import readable, upright_bsdf
+from nlosrender.scene.mesh_report import MeshReport
+from nlosrender.scene.mesh_surfaces import read_surfaces
+from nlosrender.scene.pictures import upright_bsdf
 from nlosrender.scene.pose import Float64
 from nlosrender.scene.relay_wall import RelayWall
 from nlosrender.scene.triangle_mesh import TriangleMesh
@@ -49,6 +49,7 @@ class BuiltScene:
     unit: float  # metres per engine unit of length, a power of two
     n_triangles: int  # of the hidden geometry; analytic shapes count as none
     warnings: tuple[str, ...] = ()  # about what was left out, or hardly meant
+    meshes: tuple[MeshReport, ...] = ()  # what was read of mesh files
 
     @property
     def all_flat(self) -> bool:
@@ -78,14 +79,15 @@ def build_scene(wall: RelayWall, wall_bsdf: Mapping[str, object], surfaces: Sequ
     ConfigError
         Mitsuba rejects a shape or a BSDF, or a mesh file cannot be read; the key of the item is named.
     """
-    loaded = [read_mesh_of(surface) for surface in surfaces]
+    read = read_surfaces(surfaces, wall)
+    loaded = list(read.shapes)
     boxes = [shape.bounds() for shape in loaded]
     for surface, box in zip(surfaces, boxes, strict=True):
         _check_reach(surface, box, wall)
     unit = _unit_length(wall, joined_bounds(boxes))
     description = wall.shape_description()
     wall_item = description if isinstance(description, TriangleMesh) else ShapeDescription(description)
-    wall_surface = Surface(WALL_ID, "scene.relay_wall", wall_item, upright_bsdf(description, wall_bsdf), True)
+    wall_surface = Surface(WALL_ID, "scene.relay_wall", wall_item, upright_bsdf(description, wall_bsdf))
     wall_shape = load_surface(wall_surface, wall_item, unit)
     loaded, warnings = without_shared_faces(surfaces, loaded)
     hidden_shapes = [load_surface(surface, shape, unit) for surface, shape in zip(surfaces, loaded, strict=True)]
@@ -99,27 +101,10 @@ def build_scene(wall: RelayWall, wall_bsdf: Mapping[str, object], surfaces: Sequ
     n_triangles = sum(int(shape.face_count()) for shape in hidden_shapes if shape.is_mesh())
     shapes = tuple(hidden_shapes)
     warnings += medium_warnings((f"{surface.key}.bsdf", shape) for surface, shape in zip(surfaces, shapes, strict=True))
-    return BuiltScene(scene, wall, wall_shape, tuple(surfaces), shapes, hidden_bounds, unit, n_triangles, warnings)
-
-
-def read_mesh_of(surface: Surface) -> TriangleMesh | ShapeDescription:
-    """Read a mesh file in its own coordinates, then move it in float64; other shapes pass.
-
-    Raises
-    ------
-    ConfigError
-        The file cannot be used as a mesh.
-    """
-    shape = surface.shape
-    if not isinstance(shape, MeshFile):
-        return shape
-    try:
-        mesh = read_mesh(shape.filename, shape.kind, face_normals=surface.face_normals).transformed(shape.to_local)
-        if shape.flip_v:
-            mesh = readable(mesh)
-        return mesh.turned_round() if shape.flip_normals else mesh
-    except ValueError as error:
-        raise rejected(f"{surface.key}.filename", f"{shape.filename} cannot be used as a mesh: {error}.") from error
+    warnings = read.warnings + warnings
+    return BuiltScene(
+        scene, wall, wall_shape, tuple(surfaces), shapes, hidden_bounds, unit, n_triangles, warnings, read.meshes
+    )
 
 
 def without_shared_faces(
@@ -158,7 +143,7 @@ def without_shared_faces(
 
 
 def load_surface(surface: Surface, shape: TriangleMesh | ShapeDescription, unit: float) -> mi.Shape:
-    """Load a surface whose mesh file, if it has one, has been read (``read_mesh_of``).
+    """Load a surface whose mesh file, if it has one, has been read (``read_surfaces``).
 
     Raises
     ------
@@ -184,7 +169,7 @@ def _load_mesh(mesh: TriangleMesh, surface: Surface, unit: float) -> mi.Mesh:
     properties["mesh_bsdf"] = bsdf
     if surface.radiance is not None:
         properties["mesh_emitter"] = mi.load_dict(area_emitter(surface.radiance))
-    properties["face_normals"] = surface.face_normals
+    properties["face_normals"] = mesh.normals is None
     shape = mi.Mesh(
         surface.name,
         vertex_count=len(mesh.vertices),

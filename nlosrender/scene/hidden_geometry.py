@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 
 from nlosrender.scene.letters import letters_mesh
+from nlosrender.scene.mesh_normals import Normals
 from nlosrender.scene.pictures import has_picture, readable, round_plugin, upright_bsdf
 from nlosrender.scene.pose import Float64, Pose, euler_xyz
 from nlosrender.scene.primitives import box_mesh, rectangle_mesh, room_mesh
@@ -48,6 +49,7 @@ class MeshFile:
     kind: str = "ply"  # one of MESH_PLUGINS
     flip_normals: bool = False  # seen from the other side
     flip_v: bool = False  # turn the vertical texture coordinate round
+    normals: Normals = "auto"
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,7 +79,6 @@ class Surface:
     key: str  # where it is configured, "scene.hidden_geometry.2": for error messages
     shape: TriangleMesh | MeshFile | ShapeDescription
     bsdf: Mapping[str, object]  # Mitsuba dict
-    face_normals: bool  # flat shading: a file's shading normals are not used
     radiance: Radiance | None = None  # that its front side emits; None: it emits nothing
 
     def bounds(self) -> Bounds | None:
@@ -123,9 +124,7 @@ def hidden_surfaces(
         except ValueError as error:
             raise ValueError(f"{key}: {error}") from error
         name = item.name or f"{item.type}-{index}"
-        # Generated meshes are flat; analytic shapes bring their own normals; only files have a choice.
-        face_normals = _wants_face_normals(item) if isinstance(shape, MeshFile) else isinstance(shape, TriangleMesh)
-        surfaces.append(Surface(name, key, shape, bsdf, face_normals, getattr(item, "radiance", None)))
+        surfaces.append(Surface(name, key, shape, bsdf, getattr(item, "radiance", None)))
     return tuple(surfaces)
 
 
@@ -166,7 +165,8 @@ def _shape(item: HiddenItemConfig, wall: HasPose) -> TriangleMesh | MeshFile | S
         return room_mesh(item.size)  # defined in the wall's local frame
     if item.type == "mesh":
         kind = Path(item.filename).suffix.lower().lstrip(".")
-        return MeshFile(str(item.filename), wall.pose.inverse_matrix() @ mesh_matrix(item), kind)
+        to_local = wall.pose.inverse_matrix() @ mesh_matrix(item)
+        return MeshFile(str(item.filename), to_local, kind, normals=item.shading_normals)
     if item.type == "sphere":
         if has_picture(item.bsdf):
             return _pictured(item, Pose.from_normal_up(item.center, _TO_WALL, _UP), wall)
@@ -198,11 +198,8 @@ def _mesh_file(plugin: Mapping[str, object], to_world: Float64) -> MeshFile:
     turned_round = plugin["type"] == "obj"  # Mitsuba's default, and what reading an .obj does
     flip_v = bool(plugin.get("flip_tex_coords", turned_round)) != turned_round
     flip_normals = bool(plugin.get("flip_normals", False))
-    return MeshFile(str(plugin["filename"]), to_world, str(plugin["type"]), flip_normals, flip_v)
-
-
-def _wants_face_normals(item: HiddenItemConfig) -> bool:
-    return bool(item.face_normals if item.type == "mesh" else item.type == "mitsuba" and item.shape.get("face_normals"))
+    normals: Normals = "flat" if plugin.get("face_normals") else "mitsuba"
+    return MeshFile(str(plugin["filename"]), to_world, str(plugin["type"]), flip_normals, flip_v, normals)
 
 
 def _local_pose(pose: Pose, wall: HasPose) -> Pose:
@@ -212,7 +209,7 @@ def _local_pose(pose: Pose, wall: HasPose) -> Pose:
 def mesh_matrix(item: MeshConfig | MeshWallConfig) -> Float64:
     """Return scale, then rotations about x, y and z, then translation, as one (4, 4) matrix."""
     matrix = np.eye(4)
-    matrix[:3, :3] = euler_xyz(item.rotate_deg) * item.scale
+    matrix[:3, :3] = euler_xyz(item.rotate_deg) * np.asarray(item.scale)  # of columns: before the rotation
     matrix[:3, 3] = item.translate
     return matrix
 

@@ -2,34 +2,43 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
+from nlosrender.scene.file_mesh import FileMesh
+from nlosrender.scene.mesh_normals import Normals, with_normals
 from nlosrender.scene.obj import read_obj
 from nlosrender.scene.ply import read_ply
-from nlosrender.scene.pose import Float64
 from nlosrender.scene.triangle_mesh import TriangleMesh
 
 MAX_BYTES = 4 * 2**30
 MOST_FACES = 2**31 - 1  # Mitsuba counts with 32 bits
 LARGEST = 1e30  # of a coordinate: the squares of areas stay finite
-_SHORTEST = 1e-30  # normals below have no direction
 READERS = {"ply": read_ply, "obj": read_obj}
 
 
-def read_mesh(filename: str, kind: str, *, face_normals: bool = False) -> TriangleMesh:
-    """Return the triangles of a mesh file in its own coordinates, without those that have no area.
+def read_mesh(filename: str, kind: str, normals: Normals = "auto") -> TriangleMesh:
+    """Return the triangles of a mesh file (``read_mesh_file``) with unit normals, or without any.
 
     Parameters
     ----------
-    filename
-        The file.
-    kind
-        ``ply`` or ``obj``.
-    face_normals
-        Flat shading: no normals. Otherwise those of the file, or in their absence those of the faces around each
-        vertex (``smooth_normals``).
+    filename, kind
+        The file, and ``ply`` or ``obj``.
+    normals
+        Which (``mesh_normals.with_normals``).
+
+    Raises
+    ------
+    ValueError
+        As ``read_mesh_file``; or the file has not the normals asked for.
+    """
+    return with_normals(read_mesh_file(filename, kind).mesh, normals)[0]
+
+
+def read_mesh_file(filename: str, kind: str) -> FileMesh:
+    """Return what a mesh file holds in its own coordinates, without triangles that have no area.
 
     Raises
     ------
@@ -41,12 +50,13 @@ def read_mesh(filename: str, kind: str, *, face_normals: bool = False) -> Triang
         if path.stat().st_size > MAX_BYTES:
             raise ValueError(f"it is larger than {MAX_BYTES >> 30} GiB. Use fewer triangles, or a binary .ply.")
         content = path.read_bytes()
-        mesh = READERS[kind](content).mesh
+        found = READERS[kind](content)
     except OSError as error:
         raise ValueError(f"it cannot be read: {error.strerror or error}") from error
     except MemoryError as error:
         raise ValueError("it does not fit into memory. Use fewer triangles.") from error
     del content
+    mesh = found.mesh
     if not len(mesh.faces):
         raise ValueError("it has no triangles")
     if len(mesh.faces) > MOST_FACES:
@@ -55,51 +65,9 @@ def read_mesh(filename: str, kind: str, *, face_normals: bool = False) -> Triang
     if far.size:
         corners = mesh.vertices[mesh.faces[far[0]]].tolist()
         raise ValueError(f"its triangle {far[0]} has the corners {corners}, need coordinates up to {LARGEST:g}")
-    mesh = mesh.with_area_only()
-    if not len(mesh.faces):
+    with_area = mesh.with_area_only()
+    if not len(with_area.faces):
         raise ValueError("none of its triangles has an area")
-    if face_normals:
-        return TriangleMesh(mesh.vertices, mesh.faces, mesh.uvs)
-    return _with_normals(mesh)
-
-
-def smooth_normals(mesh: TriangleMesh) -> Float64:
-    """Return a unit normal per vertex, (n, 3): the faces' normals weighted by their angles there.
-
-    Thürmer & Wüthrich 1998. Zero at vertices without faces.
-    """
-    normals = np.zeros_like(mesh.vertices)
-    face_normals, twice_areas = mesh.face_normals(), 2 * mesh.areas()
-    corners = mesh.vertices[mesh.faces]
-    for corner in range(3):
-        a = corners[:, (corner + 1) % 3] - corners[:, corner]
-        b = corners[:, (corner + 2) % 3] - corners[:, corner]
-        angle = np.arctan2(twice_areas, np.einsum("ij,ij->i", a, b))  # |a x b| is the same at every corner
-        for axis in range(3):
-            normals[:, axis] += np.bincount(mesh.faces[:, corner], angle * face_normals[:, axis], len(normals))
-    length = np.linalg.norm(normals, axis=1, keepdims=True)
-    return np.divide(normals, length, out=np.zeros_like(normals), where=length > 0)
-
-
-def _with_normals(mesh: TriangleMesh) -> TriangleMesh:
-    """Return the mesh with a unit normal at every vertex: the file's, else a smooth one, else the face's."""
-    normals = np.zeros_like(mesh.vertices) if mesh.normals is None else mesh.normals
-    with np.errstate(over="ignore"):  # the length of an absurd normal is infinite: it becomes a missing one
-        length = np.linalg.norm(normals, axis=1, keepdims=True)
-    normals = np.divide(normals, length, out=np.zeros_like(normals), where=length > _SHORTEST)
-    if not normals.any(axis=1).all():
-        missing = ~normals.any(axis=1)
-        normals[missing] = smooth_normals(mesh)[missing]
-    torn = ~normals.any(axis=1)[mesh.faces]
-    if not torn.any():
-        return TriangleMesh(mesh.vertices, mesh.faces, mesh.uvs, normals)
-    # Where opposite faces share a vertex no normal serves both: each gets a vertex of its own.
-    owners = mesh.faces[torn]
-    faces = mesh.faces.astype(np.int64)
-    faces[torn] = len(mesh.vertices) + np.arange(len(owners))
-    return TriangleMesh(
-        np.concatenate([mesh.vertices, mesh.vertices[owners]]),
-        faces,
-        None if mesh.uvs is None else np.concatenate([mesh.uvs, mesh.uvs[owners]]),
-        np.concatenate([normals, mesh.face_normals()[np.nonzero(torn)[0]]]),
-    )
+    lost = len(mesh.faces) - len(with_area.faces)
+    dropped = (*found.dropped, f"{lost} triangles without area") if lost else found.dropped
+    return replace(found, mesh=with_area, dropped=dropped)

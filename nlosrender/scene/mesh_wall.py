@@ -11,8 +11,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from nlosrender.config.fields import LONGEST, SHORTEST
 from nlosrender.errors import ConfigError, Problem
+from nlosrender.scene.file_mesh import FileMesh
 from nlosrender.scene.hidden_geometry import mesh_matrix
-from nlosrender.scene.mesh_file import read_mesh
+from nlosrender.scene.mesh_file import read_mesh_file
+from nlosrender.scene.mesh_normals import with_normals
 from nlosrender.scene.pose import Float64, Pose
 from nlosrender.scene.triangle_mesh import TriangleMesh
 from nlosrender.scene.uv_map import NOWHERE, Indices, UvMap
@@ -41,6 +43,8 @@ class MeshWall:
         What u and v from 0 to 1 are in wall coordinates [m], > 0.
     coordinates
         (n, 2) texture coordinates of the vertices that wall coordinates are made of; None: those of ``mesh``.
+    read, file
+        What its file holds, and the file's name; None, if it has none.
 
     Raises
     ------
@@ -53,6 +57,8 @@ class MeshWall:
     width: float
     height: float
     coordinates: Float64 | None = None
+    read: FileMesh | None = None
+    file: str = ""
     _map: UvMap = field(init=False, repr=False)
     _face_normals: Float64 = field(init=False, repr=False)
     _is_planar: bool = field(init=False, repr=False)
@@ -160,12 +166,13 @@ def mesh_wall_from_config(config: MeshWallConfig) -> MeshWall:
     """
     kind = Path(config.filename).suffix.lower().lstrip(".")
     try:
-        mesh = read_mesh(str(config.filename), kind, face_normals=True).transformed(mesh_matrix(config))
+        read = read_mesh_file(str(config.filename), kind)
+        mesh = with_normals(read.mesh, "flat")[0].transformed(mesh_matrix(config))
         mesh = mesh.turned_round() if config.flip_normals else mesh
         size = float(np.ptp(mesh.bounds(), axis=0).max())
         if not SHORTEST <= size <= LONGEST:
             raise ValueError(f"it is {size:.4g} m large, need {SHORTEST:g} to {LONGEST:g} m; check its scale")
-        coordinates = _checked_uvs(mesh)
+        coordinates = _checked_uvs(mesh, read.no_uvs)
         if kind == "obj":  # reading one turns v round, as Mitsuba's textures need it
             coordinates = coordinates * [1.0, -1.0] + [0.0, 1.0]
         along_u, along_v, covered = _mean_tangents(mesh, coordinates)
@@ -176,15 +183,15 @@ def mesh_wall_from_config(config: MeshWallConfig) -> MeshWall:
         width, height = (
             float(given or scale * mean) for given, mean in zip((config.width, config.height), lengths, strict=True)
         )
-        return MeshWall(pose, mesh, width, height, coordinates)
+        return MeshWall(pose, mesh, width, height, coordinates, read, Path(config.filename).name)
     except ValueError as error:
         message = f"{config.filename} cannot be the relay wall: {str(error).rstrip('.')}."
         raise ValueError(f"scene.relay_wall.filename: {message}") from error
 
 
-def _checked_uvs(mesh: TriangleMesh) -> Float64:
+def _checked_uvs(mesh: TriangleMesh, no_uvs: str) -> Float64:
     if mesh.uvs is None:
-        raise ValueError("it has no texture coordinates (u, v), which name the points of a mesh wall")
+        raise ValueError(f"{no_uvs} (u, v), which name the points of a mesh wall")
     low, high = mesh.uvs.min(axis=0), mesh.uvs.max(axis=0)
     if low.min() < -UV_ROUNDING or high.max() > 1 + UV_ROUNDING:
         raise ValueError(

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from nlosrender.config.emitters import PointLamp, SpotLamp
-from nlosrender.scene.build import load_surface, read_mesh_of, shape_bounds
+from nlosrender.scene.build import load_surface, shape_bounds
 from nlosrender.scene.camera import ImagePlane, image_plane
 from nlosrender.scene.hidden_geometry import (
     Bounds,
@@ -23,6 +23,8 @@ from nlosrender.scene.hidden_geometry import (
     joined_bounds,
 )
 from nlosrender.scene.materials import check_surface, medium_warnings, mitsuba_spectrum, rejected
+from nlosrender.scene.mesh_report import MeshReport
+from nlosrender.scene.mesh_surfaces import read_surfaces
 from nlosrender.scene.pictures import upright_bsdf
 from nlosrender.scene.pose import Float64, Pose
 from nlosrender.scene.relay_wall import relay_wall_from_config
@@ -47,6 +49,7 @@ class BuiltView:
     unit: float  # metres per engine unit of length, a power of two
     n_triangles: int
     warnings: tuple[str, ...] = ()  # about what was hardly meant
+    meshes: tuple[MeshReport, ...] = ()  # what was read of mesh files
 
     def to_engine(self, positions: ArrayLike) -> Float64:
         """Take positions (..., 3) [m] of the local frame to the engine's [engine units]."""
@@ -76,7 +79,8 @@ def build_view(scene_config: SceneConfig, capture_config: CaptureConfig) -> Buil
     plane = _image_plane(capture_config, whole)
     frame = _engine_frame(scene_config, plane)
     surfaces = tuple(_surfaces(scene_config, frame))
-    loaded = [read_mesh_of(surface) for surface in surfaces]
+    read = read_surfaces(surfaces)
+    loaded = read.shapes
     lamps = [item for item in scene_config.emitters if isinstance(item, (PointLamp, SpotLamp))]
     points = [frame.to_local(lamp.position) for lamp in lamps]
     camera = frame.to_local(plane.pose.to_scene(plane.default_device_position))
@@ -102,7 +106,8 @@ def build_view(scene_config: SceneConfig, capture_config: CaptureConfig) -> Buil
         frame=frame,
         unit=unit,
         n_triangles=sum(int(shape.face_count()) for shape in shapes if shape.is_mesh()),
-        warnings=medium_warnings(zip(keys, shapes, strict=True)),
+        warnings=read.warnings + medium_warnings(zip(keys, shapes, strict=True)),
+        meshes=read.meshes,
     )
 
 
@@ -120,11 +125,10 @@ def _surfaces(scene_config: SceneConfig, frame: Pose) -> Iterator[Surface]:
             to_world = to_frame @ np.asarray(description.get("to_world", np.eye(4)))
             shape = ShapeDescription({**description, "to_world": to_world})
         bsdf = upright_bsdf(description, scene_config.relay_wall.bsdf)
-        yield Surface("relay_wall", "scene.relay_wall", shape, bsdf, False)
+        yield Surface("relay_wall", "scene.relay_wall", shape, bsdf)
     yield from hidden_surfaces(scene_config.hidden_geometry, at)
-    for index, item in enumerate(scene_config.emitters):
-        if not isinstance(item, (PointLamp, SpotLamp)):
-            yield from hidden_surfaces([item], at, [f"scene.emitters.{index}"])
+    for index, item in scene_config.shining_surfaces:
+        yield from hidden_surfaces([item], at, [f"scene.emitters.{index}"])
 
 
 @dataclass(frozen=True)

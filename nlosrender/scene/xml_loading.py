@@ -95,7 +95,7 @@ def _mesh_of(parameters: Mapping[str, object]) -> TriangleMesh | None:
         return None
     filename = str(parameters["filename"])
     try:
-        return read_mesh(filename, kind, face_normals=True)
+        return read_mesh(filename, kind, "flat")
     except ValueError as error:
         raise ValueError(f"{filename} cannot be used as a mesh: {error}") from error
 

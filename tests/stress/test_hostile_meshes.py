@@ -63,7 +63,7 @@ SOUND = {
 def read(path: Path, content: bytes) -> np.ndarray:
     """Write and read a file; return its corners, texture coordinates and normals, face by face."""
     path.write_bytes(content)
-    mesh = read_mesh(str(path), path.suffix.lstrip("."))
+    mesh = read_mesh(str(path), path.suffix.lstrip("."), "mitsuba")
     assert mesh.normals is not None
     parts = [mesh.vertices, mesh.normals] + ([] if mesh.uvs is None else [mesh.uvs])
     return np.concatenate([part[mesh.faces] for part in parts], axis=-1)
@@ -111,7 +111,7 @@ def test_normals_are_those_mitsuba_computes(tmp_path: Path) -> None:
     path.write_text(text + "".join(f"f {a} {b} {c}\n" for a, b, c in (faces + 1).tolist()))
     parameters = mi.traverse(mi.load_dict({"type": "obj", "filename": str(path)}))
     theirs = np.array(parameters["vertex_normals"]).reshape(-1, 3)[np.array(parameters["faces"]).reshape(-1, 3)]
-    mesh = read_mesh(str(path), "obj")
+    mesh = read_mesh(str(path), "obj", "mitsuba")
     assert mesh.normals is not None
     np.testing.assert_allclose(mesh.normals[mesh.faces], theirs, atol=2e-5)  # float32 angles, summed over 5 faces
 
@@ -120,7 +120,7 @@ def test_opposite_faces_on_shared_vertices_keep_their_own_normals(tmp_path: Path
     """Smooth normals of a double-sided sheet cancel out: each side is flat instead."""
     path = tmp_path / "sheet.ply"
     path.write_bytes(ply([(0, 1, 2), (0, 2, 1)]).replace(b"nx", b"ax").replace(b"ny", b"ay").replace(b"nz", b"az"))
-    mesh = read_mesh(str(path), "ply")
+    mesh = read_mesh(str(path), "ply", "mitsuba")
     assert mesh.normals is not None
     np.testing.assert_allclose(mesh.normals[mesh.faces], [[[0, 0, 1]] * 3, [[0, 0, -1]] * 3], atol=1e-12)
 

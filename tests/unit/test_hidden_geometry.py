@@ -52,7 +52,6 @@ def test_rectangle_lies_where_the_scene_says():
     assert scene[0] == pytest.approx([6, -0.8, 1.7])
     normals = WALL.pose.direction_to_scene(surface.shape.face_normals())
     np.testing.assert_allclose(normals, [[-1, 0, 0]] * 2, atol=1e-14)
-    assert surface.face_normals
     assert surface.bsdf is BSDF
 
 
@@ -79,11 +78,13 @@ def test_euler_angles_turn_counter_clockwise(axis):
 def test_mesh_file_is_scaled_turned_and_moved():
     """A file's point p comes to scale * p, turned about x, y, z, translated, then into the local frame."""
     angles, translate = [20, 35, -70], [1.0, 2.0, 3.0]
-    config = item("mesh", filename="/a/b.ply", scale=2.5, rotate_deg=angles, translate=translate, face_normals=False)
+    config = item(
+        "mesh", filename="/a/b.ply", scale=2.5, rotate_deg=angles, translate=translate, shading_normals="smooth"
+    )
     surface = one(config)
     assert isinstance(surface.shape, MeshFile)
     assert surface.shape.filename == "/a/b.ply"
-    assert not surface.face_normals
+    assert surface.shape.normals == "smooth"
     point = np.array([0.3, -0.1, 0.7])
     rotation = rotation_about(2, -70) @ rotation_about(1, 35) @ rotation_about(0, 20)
     expected = WALL.pose.to_local(rotation @ (2.5 * point) + translate)
@@ -121,7 +122,6 @@ def test_sphere_and_cylinder_become_descriptions():
     assert (description["radius"], description["flip_normals"]) == (0.1, False)
     np.testing.assert_allclose(WALL.pose.to_scene(description["p0"]), [6, -1, 1.75], atol=1e-14)
     np.testing.assert_allclose(WALL.pose.to_scene(description["p1"]), [6, -1, 2.25], atol=1e-14)
-    assert not cylinder.face_normals
 
 
 def test_mitsuba_shape_keeps_its_keys_and_gets_the_wall_on_top():
@@ -216,7 +216,7 @@ def test_joint_bounds_skip_what_only_a_file_knows():
     flat = TriangleMesh([[0, 0, 1], [1, 0, 1], [0, 2, 1]], [[0, 1, 2]])
     ball = ShapeDescription({"type": "sphere", "center": [-1, 0, 0], "radius": 0.5})
     file = MeshFile("bunny.ply", np.eye(4))
-    surfaces = [Surface("s", "k", shape, BSDF, True) for shape in (flat, file, ball)]
+    surfaces = [Surface("s", "k", shape, BSDF) for shape in (flat, file, ball)]
     np.testing.assert_allclose(bounds(surfaces), [[-1.5, -0.5, -0.5], [1, 2, 1]])
     assert bounds(surfaces[1:2]) is None
     assert joined_bounds([]) is None

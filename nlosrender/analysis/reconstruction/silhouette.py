@@ -85,7 +85,7 @@ def outline(surface: Surface, grid: VoxelGrid) -> BaseGeometry:
 
 def _read(surface: Surface, file: MeshFile) -> TriangleMesh:
     try:
-        mesh = read_mesh(file.filename, Path(file.filename).suffix.lower().lstrip("."), face_normals=True)
+        mesh = read_mesh(file.filename, Path(file.filename).suffix.lower().lstrip("."), "flat")
         return mesh.transformed(file.to_local)
     except ValueError as error:
         raise FileError(f"{surface.key}.filename: {file.filename}: {error}. Leave --score away.") from error

@@ -1,0 +1,167 @@
+"""One line per mesh: what has been read of its file, and what about it may not be as its author meant it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nlosrender.scene.file_mesh import FileMesh, some_of
+from nlosrender.scene.mesh_normals import normal_cosines, same_places
+from nlosrender.scene.pose import Float64
+from nlosrender.scene.triangle_mesh import TriangleMesh
+
+_NORMALS = {"flat": "flat", "file": "normals of the file", "smoothed": "smoothed normals"}
+CONTRADICTED = 0.01  # share of the area whose normals contradict its faces from which on it is told
+
+
+@dataclass(frozen=True)
+class MeshReport:
+    """What ``plan``, ``validate`` and ``info`` say of a mesh.
+
+    Parameters
+    ----------
+    key, name, file
+        Where it is configured, what it is called, which file it is read from.
+    triangles, area, extent
+        Their number; their area [m^2]; their size along the relay wall's axes [m].
+    facing_share
+        Share of the area whose front some point of the relay wall may see; None without a wall.
+    normals
+        flat, file or smoothed.
+    largest_angle_deg
+        Between a vertex normal and its face's.
+    contradicting_share
+        Share of the area whose vertex normals point to the back of its faces.
+    edges, disagreeing_edges
+        Edges of two faces; those whose faces disagree which side is the front.
+    has_uvs
+        Texture coordinates.
+    materials, dropped
+        Names of the file's materials, which are not read; what else of the file is not.
+    """
+
+    key: str
+    name: str
+    file: str
+    triangles: int
+    area: float
+    extent: tuple[float, ...]
+    facing_share: float | None
+    normals: str
+    largest_angle_deg: float
+    contradicting_share: float
+    edges: int
+    disagreeing_edges: int
+    has_uvs: bool
+    materials: tuple[str, ...] = ()
+    dropped: tuple[str, ...] = ()
+
+    def line(self) -> str:
+        """Return all of it as one line."""
+        parts = [
+            f"{self.triangles} triangles",
+            f"{self.area:.4g} m^2",
+            " x ".join(f"{e:.3g}" for e in self.extent) + " m",
+        ]
+        if self.facing_share is not None:
+            parts.append(f"{100 * self.facing_share:.3g} % of its area faces the wall")
+        is_flat = self.normals == "flat"
+        away = "" if is_flat else f" (up to {self.largest_angle_deg:.3g} degrees from the faces')"
+        parts.append(_NORMALS.get(self.normals, self.normals) + away)
+        if self.disagreeing_edges:
+            parts.append(f"faces disagree at {self.disagreeing_edges} of {self.edges} edges")
+        parts.append("texture coordinates" if self.has_uvs else "no texture coordinates")
+        if self.materials:
+            parts.append(f"materials not read: {some_of(self.materials)}")
+        if self.dropped:
+            parts.append(f"left out: {some_of(self.dropped)}")
+        return f"{self.name} ({self.file}): {', '.join(parts)}"
+
+    def warnings(self, read: FileMesh, *, has_two_sides: bool) -> Iterator[str]:
+        """Yield a sentence for each thing that is hardly meant; ``has_two_sides``: its back reflects, too."""
+        where = f"{self.key} ({self.name})"
+        yield from (f"{where}: {doubt}" for doubt in read.doubts)
+        if len(self.materials) > 1:
+            yield (
+                f"{where}: its faces have {len(self.materials)} materials ({some_of(self.materials)}), which are not "
+                "read: the item's bsdf is taken for all. Split the file into one item per material."
+            )
+        if self.disagreeing_edges and not has_two_sides:
+            yield (
+                f"{where}: at {self.disagreeing_edges} of its {self.edges} edges the two faces disagree which side is "
+                "the front: what shows its back is black. Make the winding consistent (mesh programs: recalculate "
+                "normals, outside), or wrap its bsdf in {type: twosided}."
+            )
+        if self.contradicting_share > CONTRADICTED:
+            yield (
+                f"{where}: the file's normals contradict its faces on {100 * self.contradicting_share:.3g} % of its "
+                "area. Light goes by the normals. Use normals: flat to go by the order of the faces' corners, or write "
+                "the file anew with both alike."
+            )
+
+
+def mesh_report(
+    key: str, name: str, file: str, read: FileMesh, placed: TriangleMesh, normals: str, wall_box: Float64 | None
+) -> MeshReport:
+    """Return what there is to say of a mesh.
+
+    Parameters
+    ----------
+    key, name, file, normals
+        As in ``MeshReport``.
+    read
+        As its file has it.
+    placed
+        In the relay wall's frame [m], with the normals that are rendered.
+    wall_box
+        (8, 3) corners of a box around the wall [m]; None: there is none.
+    """
+    cosines, areas = normal_cosines(placed), placed.areas()
+    low, high = placed.bounds()
+    edges, disagreeing = edge_counts(same_places(read.mesh.vertices)[read.mesh.faces])
+    total = float(areas.sum())
+    facing = None if wall_box is None else float(areas[_faces_wall(placed, wall_box)].sum()) / total
+    return MeshReport(
+        key,
+        name,
+        file,
+        len(placed.faces),
+        total,
+        tuple((high - low).tolist()),
+        facing,
+        normals,
+        float(np.degrees(np.arccos(np.clip(cosines.min(), -1, 1)))),
+        float(areas[cosines.sum(axis=1) < 0].sum()) / total,
+        edges,
+        disagreeing,
+        placed.uvs is not None,
+        read.materials,
+        read.dropped,
+    )
+
+
+def edge_counts(faces: NDArray[np.int64]) -> tuple[int, int]:
+    """Return how many edges have two faces (m, 3), and how many of these are run through the same way by both.
+
+    Faces agree which side is the front when they run through their common edge in opposite ways.
+    """
+    start, end = faces.ravel(), np.roll(faces, -1, axis=1).ravel()
+    keys = np.minimum(start, end) * (int(faces.max(initial=0)) + 1) + np.maximum(start, end)
+    order = np.argsort(keys, kind="stable")
+    keys, forwards = keys[order], (start < end)[order]
+    first = np.flatnonzero(np.append(True, keys[1:] != keys[:-1])) if len(keys) else np.zeros(0, np.int64)
+    pairs = first[np.diff(np.append(first, len(keys))) == 2]
+    return len(pairs), int((forwards[pairs] == forwards[pairs + 1]).sum())
+
+
+def _faces_wall(mesh: TriangleMesh, wall_box: Float64) -> NDArray[np.bool_]:
+    """Return which faces turn their front, by the normals that are rendered, to some point of the wall's box."""
+    normals = mesh.face_normals() if mesh.normals is None else mesh.normals[mesh.faces].mean(axis=1)
+    low, high = wall_box.min(axis=0), wall_box.max(axis=0)
+    corners = mesh.vertices[mesh.faces]
+    farthest = np.where(normals > 0, high, low) - corners.mean(axis=1)
+    is_above = corners[..., 2].max(axis=1) > low[2]
+    return is_above & (np.einsum("mx,mx->m", farthest, normals) > 0)
