@@ -58,6 +58,12 @@ class FileError(NlosError):
     exit_code = EXIT_BAD_INPUT
 
 
+class DiskError(FileError):
+    """A disk is full or fails: nothing is wrong with what was asked for."""
+
+    exit_code = EXIT_FAILURE
+
+
 class ComparisonError(NlosError):
     """Two captures, or two datasets, differ by more than their tolerances allow."""
 

@@ -29,10 +29,11 @@ from nlosrender.errors import ConfigError, OptionError, Problem
 from nlosrender.files.capture_file import CaptureHeader
 from nlosrender.files.chunks import sensor_tile
 from nlosrender.files.identity import capture_identity, files_read, identity_attributes
+from nlosrender.files.kinds import CAPTURE
 from nlosrender.files.part_attributes import part_attributes, summed_attributes
 from nlosrender.files.partial_capture import PartialCapture
 from nlosrender.files.provenance import provenance_attributes
-from nlosrender.files.replacement import check_writable, refuse_sources
+from nlosrender.files.replacement import check_writable
 from nlosrender.files.size import disk_warnings
 from nlosrender.rendering.dask_executor import render_on_cluster
 from nlosrender.rendering.dask_worker import Job
@@ -97,7 +98,8 @@ def render_capture(
     BackendError
         There is no usable LLVM or GPU, here or on a worker.
     FileError
-        The output cannot be written, or there is an unfinished render of something else.
+        The output cannot be written, there is an unfinished render of something else, or a file that is not this
+        capture: another capture is replaced when ``resume`` is False, anything else never.
     RenderError
         The result is not finite.
     IncompleteRender, InterruptedRender
@@ -107,8 +109,7 @@ def render_capture(
     warnings.say(config_warnings(config))
     resolved, output = config_to_dict(config), config.output
     with stopwatch.stage("scene"):
-        check_writable(output.path)
-        refuse_sources(output.path, files_read(resolved))
+        check_writable(output.path, CAPTURE, files_read(resolved))
         backend = started_backend(config)
     sharing = ALONE if cluster is None else cluster.sharing
     replicas = replicas_for(backend.lanes, config.capture.sensor_grid.n_points)

@@ -14,9 +14,10 @@ from nlosrender.analysis.pictures import SUFFIXES, save_animation, save_exr, sav
 from nlosrender.capture.bounces import LINE_OF_SIGHT
 from nlosrender.errors import FileError, OptionError
 from nlosrender.files.filled_folder import filled_folder
+from nlosrender.files.kinds import GIF, PICTURES
 from nlosrender.files.layout import STOKES
 from nlosrender.files.reader import StoredCapture, open_capture
-from nlosrender.files.replacement import check_writable, explained_write, partial_path, publish
+from nlosrender.files.replacement import check_writable, explained_write, replacing
 
 Float32 = NDArray[np.float32]
 
@@ -125,7 +126,7 @@ def _check_output(output: Path, source: str | Path, options: FrameOptions) -> No
             raise OptionError(
                 f"--output: got {str(output)!r}, an animation, with --format {options.kind}; need a folder"
             )
-        check_writable(output, source=source)
+        check_writable(output, GIF, [source])
     elif output.suffix.lower() in (*SUFFIXES.values(), ".mp4") and not output.is_dir():
         raise OptionError(
             f"--output: got {str(output)!r}, the name of one picture, but there are many; need a folder, or a name "
@@ -134,21 +135,17 @@ def _check_output(output: Path, source: str | Path, options: FrameOptions) -> No
 
 
 def _write_animation(shown: NDArray[np.uint8], output: Path, frames_per_second: float) -> None:
-    target = check_writable(output)
-    partial = partial_path(target)
-    with explained_write(output):
-        try:
-            save_animation(shown, partial, frames_per_second)
-            publish(partial, target)
-        finally:
-            partial.unlink(missing_ok=True)
+    with replacing(output, GIF) as partial:
+        save_animation(shown, partial, frames_per_second)
 
 
 def _remove_earlier(folder: Path, suffix: str, written: set[str]) -> None:
     """Remove the frames of an earlier run, of which there were more: they would be taken for this one's."""
     with explained_write(folder):
         for file in folder.glob(f"frame-?????{suffix}"):
-            if file.name not in written and file.stem.removeprefix("frame-").isdecimal():
+            if file.name in written or not file.stem.removeprefix("frame-").isdecimal():
+                continue
+            if file.is_file() and PICTURES[suffix].objection(file) is None:
                 file.unlink()
 
 

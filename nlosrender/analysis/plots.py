@@ -35,10 +35,11 @@ from nlosrender.analysis.theme import (
 )
 from nlosrender.capture.bounces import FILE_BOUNCES, LINE_OF_SIGHT
 from nlosrender.config.encodable import encodable
-from nlosrender.errors import FileError, OptionError
+from nlosrender.errors import OptionError
+from nlosrender.files.kinds import PICTURES
 from nlosrender.files.layout import data_unit
 from nlosrender.files.reader import StoredCapture, open_capture
-from nlosrender.files.replacement import check_writable, explained_write, partial_path, publish
+from nlosrender.files.replacement import check_writable, replacing
 from nlosrender.files.stored_header import StoredHeader
 from nlosrender.units import opl_to_seconds
 
@@ -85,21 +86,15 @@ def plot_capture(
     picture = Path(out_png)
     if picture.suffix.lower() not in FORMATS:
         raise OptionError(f"--output: got {str(picture)!r}, need a name that ends in one of {', '.join(FORMATS)}")
-    target = check_writable(picture)
-    if target == Path(path).resolve():
-        raise FileError(f"{picture}: is the capture itself. Name another picture.")
+    kind = PICTURES[picture.suffix.lower()]
+    check_writable(picture, kind, [path])  # before the work, not after it
     with open_capture(path) as capture:
         sizes = capture.header.sizes
         _check_point("--laser", laser, sizes["laser_y"], sizes["laser_x"])
         _check_point("--pixel", pixel, sizes["sensor_y"], sizes["sensor_x"])
         figure = _draw(capture, laser, pixel)
-    partial = partial_path(target)
-    with explained_write(picture):
-        try:
-            figure.savefig(partial, format=target.suffix[1:].lower(), dpi=130, facecolor=GROUND)
-            publish(partial, target)
-        finally:
-            partial.unlink(missing_ok=True)
+    with replacing(picture, kind, [path]) as partial:
+        figure.savefig(partial, format=picture.suffix[1:].lower(), dpi=130, facecolor=GROUND)
     return picture
 
 

@@ -6,7 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from nlosrender.files.replacement import explained_write, partial_path, publish
+from nlosrender.files.kinds import PLY
+from nlosrender.files.replacement import replacing
 
 FACE = np.dtype([("count", "u1"), ("corners", "<u4", 3)])
 
@@ -24,16 +25,10 @@ def write_ply(path: Path, vertices: np.ndarray, faces: np.ndarray) -> None:
     header += [f"element face {len(faces)}", "property list uchar uint vertex_indices", "end_header"]
     rows = np.zeros(len(faces), FACE)
     rows["count"], rows["corners"] = 3, faces
-    partial = partial_path(path)
-    with explained_write(path):
-        try:
-            with partial.open("wb") as file:
-                file.write(("\n".join(header) + "\n").encode("ascii"))
-                file.write(np.asarray(vertices, dtype="<f4").tobytes())
-                file.write(rows.tobytes())
-            publish(partial, path)
-        finally:
-            partial.unlink(missing_ok=True)
+    with replacing(path, PLY) as partial, partial.open("wb") as file:
+        file.write(("\n".join(header) + "\n").encode("ascii"))
+        file.write(np.asarray(vertices, dtype="<f4").tobytes())
+        file.write(rows.tobytes())
 
 
 def grid_faces(rows: int, columns: int) -> np.ndarray:

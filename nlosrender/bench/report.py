@@ -6,7 +6,8 @@ import json
 from pathlib import Path
 from typing import Any
 
-from nlosrender.errors import FileError
+from nlosrender.files.kinds import PNG, REPORT
+from nlosrender.files.replacement import replacing
 
 FAR = "never"
 NOTABLE = 0.1  # of the CPU time: setting up the engine is shown apart
@@ -20,11 +21,8 @@ def write_json(path: Path, report: dict[str, Any]) -> None:
     FileError
         The file cannot be written.
     """
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(json.dumps(report, indent=1, allow_nan=False) + "\n", encoding="utf-8")
-    except OSError as error:
-        raise FileError(f"{path}: cannot be written: {error.strerror}.") from error
+    with replacing(path, REPORT) as partial:
+        partial.write_text(json.dumps(report, indent=1, allow_nan=False) + "\n", encoding="utf-8")
 
 
 def table(report: dict[str, Any]) -> str:
@@ -131,11 +129,8 @@ def write_plot(path: Path, report: dict[str, Any]) -> None:
         _draw_scene(axes, scene)
     for axes in figure.axes[len(scenes) :]:
         axes.set_axis_off()
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        FigureCanvasAgg(figure).print_figure(path, dpi=130)
-    except OSError as error:
-        raise FileError(f"{path}: cannot be written: {error.strerror}.") from error
+    with replacing(path, PNG) as partial:
+        FigureCanvasAgg(figure).print_figure(partial, dpi=130, format="png")
 
 
 def _draw_scene(axes: Any, scene: dict[str, Any]) -> None:

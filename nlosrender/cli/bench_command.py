@@ -76,6 +76,7 @@ def bench(
 def _outputs(output: Path) -> tuple[Path, Path]:
     """Return the names of report and plot, once it is sure that they can be written: before the work, not after it."""
     from nlosrender.errors import FileError
+    from nlosrender.files.kinds import PNG, REPORT
     from nlosrender.files.replacement import check_writable, explained_write
 
     if output.name in ("", ".."):
@@ -83,8 +84,8 @@ def _outputs(output: Path) -> tuple[Path, Path]:
     with explained_write(output.parent):
         output.parent.mkdir(parents=True, exist_ok=True)
     report, plot = output.with_name(output.name + ".json"), output.with_name(output.name + ".png")
-    check_writable(report)
-    check_writable(plot)
+    check_writable(report, REPORT)
+    check_writable(plot, PNG)
     return report, plot
 
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from nlosrender.cli.json_output import OUTPUT, problem_as_json
-from nlosrender.errors import EXIT_BAD_INPUT, EXIT_OK, ConfigError, FileError, Problem
+from nlosrender.errors import EXIT_BAD_INPUT, EXIT_OK, ConfigError, Problem
 
 if TYPE_CHECKING:
     from nlosrender.config.document import Config
@@ -51,21 +51,16 @@ def new(
     import shlex
 
     from nlosrender.config.template import starter_config
+    from nlosrender.files.kinds import CONFIG, Kind
+    from nlosrender.files.replacement import replacing
 
     if path == "-":
         typer.echo(starter_config(scan_type.value), nl=False)
         return
     target = Path(path)
     text = starter_config(scan_type.value, target.stem, target.name)
-    try:
-        with target.open("w" if force else "x", encoding="utf-8") as file:
-            file.write(text)
-    except FileExistsError as error:
-        raise FileError(f"{path}: exists already; --force overwrites it.") from error
-    except FileNotFoundError as error:
-        raise FileError(f"{path}: there is no folder {target.parent}; create it first.") from error
-    except (OSError, ValueError) as error:
-        raise FileError(f"{path}: cannot be written: {getattr(error, 'strerror', None) or error}.") from error
+    with replacing(path, CONFIG if force else Kind(lambda _: "exists already; --force overwrites it.")) as partial:
+        partial.write_text(text, encoding="utf-8")
     typer.echo(f"{path}: written; nlosrender validate {shlex.quote(path)} checks it after changes.")
 
 

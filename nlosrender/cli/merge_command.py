@@ -27,6 +27,7 @@ def merge(
         ),
     ],
     output: Annotated[Path, typer.Option("--output", "-o", help="File to write.", readable=False)],
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a file that holds another capture.")] = False,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress, no report; warnings stay.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print the report as one JSON object.")] = False,
 ) -> None:
@@ -36,7 +37,7 @@ def merge(
     from nlosrender.files.merge import merge_captures
 
     with progress_bar("merge", hidden=quiet) as (progress, _, _):
-        report = merge_captures(parts, output, progress)
+        report = merge_captures(parts, output, progress, overwrite=overwrite)
     if as_json:
         import dataclasses
 

@@ -80,17 +80,18 @@ def reconstruct(
     from nlosrender.analysis.reconstruction.volume_file import write_volume
     from nlosrender.cli.output_names import beside
     from nlosrender.errors import OptionError
+    from nlosrender.files.kinds import PNG, VOLUME
     from nlosrender.files.replacement import check_writable
 
     center, size = _lengths(volume_center, "--volume-center"), _lengths(volume_size, "--volume-size")
     settings = ReconstructionSettings(method, wavelength, cycles, center, size, voxels, voxel_size, bounces)
     volume_path = output or beside(file, f"-{method}.hdf5")
-    check_writable(volume_path, source=file)  # before the work, not after it
+    check_writable(volume_path, VOLUME, [file])  # before the work, not after it
     picture_path = volume_path.with_suffix(".png")
     if png and picture_path == volume_path:
         raise OptionError(f"--output: got {str(volume_path)!r}, the name --png gives the picture. Name it .hdf5")
     if png:
-        check_writable(picture_path)
+        check_writable(picture_path, PNG, [file])
     with progress_bar("reconstruct", hidden=quiet) as (progress, warn, _):
         found = reconstruct_capture(file, settings, progress, warn)
     silhouette, scored = None, None

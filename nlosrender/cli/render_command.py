@@ -54,7 +54,7 @@ def render(
         bool | None,
         typer.Option(
             "--resume/--overwrite",
-            help="Demand an unfinished render to go on with / throw it away.",
+            help="Demand an unfinished render to go on with / throw it away, and replace another capture there.",
             show_default="go on with one if there is one",
         ),
     ] = None,

@@ -11,9 +11,10 @@ from pathlib import Path
 from typing import Any, Literal
 
 from nlosrender.errors import FileError
+from nlosrender.files.kinds import INDEX
 from nlosrender.files.part_attributes import PART, UNSAMPLED, json_object, text_list
 from nlosrender.files.reader import read_header
-from nlosrender.files.replacement import check_writable, explained_write, partial_path, publish
+from nlosrender.files.replacement import replacing
 
 FORMAT_VERSION = 1
 
@@ -101,11 +102,5 @@ def write_index(path: Path, source: str, keys: Sequence[str], entries: Sequence[
         "keys": list(keys),
         "captures": [asdict(entry) for entry in entries],
     }
-    target = check_writable(path)
-    partial = partial_path(target)
-    try:
-        with explained_write(path):
-            partial.write_text(json.dumps(content, indent=1, allow_nan=False) + "\n", encoding="utf-8")
-            publish(partial, target)
-    finally:
-        partial.unlink(missing_ok=True)
+    with replacing(path, INDEX) as partial:
+        partial.write_text(json.dumps(content, indent=1, allow_nan=False) + "\n", encoding="utf-8")

@@ -20,9 +20,10 @@ from pathlib import Path
 from nlosrender.errors import OptionError
 from nlosrender.files.exports_mat import write_fk, write_lct, write_learned, write_phasor_mat
 from nlosrender.files.exports_tal import write_tal
+from nlosrender.files.kinds import MAT, TAL, Kind
 from nlosrender.files.layout import STOKES
 from nlosrender.files.reader import StoredCapture, open_capture
-from nlosrender.files.replacement import check_writable, explained_write, partial_path, publish
+from nlosrender.files.replacement import replacing
 from nlosrender.files.scan import chosen_bounces, read_scan
 from nlosrender.files.wall_order import OrderedCapture, ordered_capture
 
@@ -32,16 +33,17 @@ class ExportFormat:
     """How a program has the points of a wall as one sees it: x to the right, y up, the hidden scene before it."""
 
     suffix: str  # of a file's name
+    kind: Kind
     y_descends: bool = False  # whether the first row is the top one
     x_descends: bool = False  # whether the first column is the right one
 
 
 PROGRAMS = {
-    "tal": ExportFormat(".hdf5"),
-    "fk": ExportFormat(".mat", y_descends=True, x_descends=True),
-    "lct": ExportFormat(".mat", y_descends=True),
-    "phasor_mat": ExportFormat(".mat", y_descends=True),
-    "learned": ExportFormat(".mat", y_descends=True, x_descends=True),
+    "tal": ExportFormat(".hdf5", TAL),
+    "fk": ExportFormat(".mat", MAT, y_descends=True, x_descends=True),
+    "lct": ExportFormat(".mat", MAT, y_descends=True),
+    "phasor_mat": ExportFormat(".mat", MAT, y_descends=True),
+    "learned": ExportFormat(".mat", MAT, y_descends=True, x_descends=True),
 }
 FORMATS = tuple(PROGRAMS)
 LEGS = ("remove", "keep")
@@ -72,7 +74,7 @@ def export_capture(
     path
         Capture file.
     output
-        File to write; an existing one is replaced.
+        File to write; an existing one of the same format is replaced.
     file_format
         One of ``FORMATS``.
     bounces
@@ -91,21 +93,13 @@ def export_capture(
     """
     suffix_of(file_format)  # refuses a format that there is not
     _refuse_options(file_format, legs, key)
-    target = check_writable(output, source=path)
-    partial = partial_path(target)
     order = PROGRAMS[file_format]
-    with open_capture(path) as capture:
+    with open_capture(path) as capture, replacing(output, order.kind, [path]) as partial:
         indices = chosen_bounces(capture.header, bounces)
         ordered = ordered_capture(
             capture, read_scan(capture), indices, x_descends=order.x_descends, y_descends=order.y_descends
         )
-        losses = _general_losses(capture, indices)
-        with explained_write(output):
-            try:
-                losses += _write(file_format, partial, ordered, legs, key)
-                publish(partial, target)
-            finally:
-                partial.unlink(missing_ok=True)
+        losses = _general_losses(capture, indices) + _write(file_format, partial, ordered, legs, key)
     return ExportReport(Path(output), tuple(losses))
 
 

@@ -4,18 +4,20 @@ from __future__ import annotations
 
 import os
 import shutil
+import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from nlosrender.errors import FileError
+from nlosrender.files.kinds import PICTURES
 from nlosrender.files.replacement import explained_write
 from nlosrender.interruption import uninterrupted
 
 
 @contextmanager
 def filled_folder(folder: str | Path) -> Iterator[Path]:
-    """Give the block an empty folder; what it leaves there moves to ``folder``, over files of the same names.
+    """Give the block an empty folder; the pictures it leaves there move to ``folder``, over those of the same names.
 
     A block that fails or is interrupted leaves no file behind, nor a folder that was not there before.
 
@@ -27,7 +29,8 @@ def filled_folder(folder: str | Path) -> Iterator[Path]:
     Raises
     ------
     FileError
-        It is a file or cannot be written to, or an OSError left the block.
+        It is a file or cannot be written to, a file of another kind has the name of a picture, or an OSError left the
+        block.
     """
     with explained_write(folder):
         target = Path(os.path.realpath(folder))
@@ -35,12 +38,15 @@ def filled_folder(folder: str | Path) -> Iterator[Path]:
             raise FileError(f"{folder}: is a file. Name a folder, which may be a new one.")
         is_new = not target.exists()
         target.mkdir(parents=True, exist_ok=True)
-        unfinished = target / f".{os.getpid()}.partial"  # inside: beside it may be another disk
+        # inside: beside it may be another disk
+        unfinished = Path(tempfile.mkdtemp(prefix=".", suffix=".partial", dir=target))
         try:
-            unfinished.mkdir(exist_ok=True)
             yield unfinished
             with uninterrupted():
-                for file in sorted(unfinished.iterdir()):
+                files = sorted(unfinished.iterdir())
+                for file in files:  # all of them first: none is replaced where one may not be
+                    PICTURES[file.suffix].refuse_others(Path(folder) / file.name, target / file.name)
+                for file in files:
                     os.replace(file, target / file.name)
         finally:
             shutil.rmtree(unfinished, ignore_errors=True)

@@ -8,6 +8,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+from nlosrender.capture.part import WHOLE
 from nlosrender.config.canonical import tree_hash
 from nlosrender.config.mitsuba_xml import named_files, read_mitsuba_xml
 from nlosrender.files.layout import FORMAT_VERSION
@@ -19,6 +20,7 @@ NOT_THE_CAPTURE = (("output", "path"), ("render", "memory_limit"), ("render", "b
 PACKAGES = ("nlosrender", "mitsuba", "drjit")  # whose versions the samples depend on
 FILE_KEY = "filename"  # of meshes, textures, spectra
 SCENE_KEY = "mitsuba"  # of a whole scene, which names files of its own
+SELECTION = "part_selection"  # attribute of a file that holds a part: the option that selected it
 
 
 def capture_identity(resolved_config: Mapping[str, Any], part: str, variant: str, replicas: int) -> dict[str, Any]:
@@ -43,6 +45,8 @@ def capture_identity(resolved_config: Mapping[str, Any], part: str, variant: str
 def identity_attributes(identity: Mapping[str, Any]) -> dict[str, object]:
     """Return the attributes by which a file tells the capture it is, or is a part of."""
     told = {name: identity[name] for name in ("variant", "replicas")}
+    if identity["part"] != str(WHOLE):
+        told[SELECTION] = identity["part"]
     return {"capture_hash": tree_hash(identity["config"])} | told
 
 

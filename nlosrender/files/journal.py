@@ -8,7 +8,6 @@ the system drops the lock with the process.
 
 from __future__ import annotations
 
-import errno
 import fcntl
 import json
 import os
@@ -17,8 +16,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-# File systems without locks (some network ones): two renders into one file are then the user's to avoid.
-NO_LOCKS = (errno.ENOSYS, errno.EOPNOTSUPP, errno.ENOLCK, errno.EINVAL)
+from nlosrender.files.locking import NO_LOCKS
 
 
 class JournalInUseError(Exception):
@@ -108,7 +106,7 @@ def read_records(path: Path) -> Iterator[dict[str, Any]]:
 
 def _locked(path: Path) -> int:
     while True:
-        descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
+        descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o666)
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError as error:

@@ -15,10 +15,13 @@ import h5py
 import numpy as np
 
 from nlosrender.capture.bounces import BounceAxis
+from nlosrender.capture.part import WHOLE
 from nlosrender.capture.tile import Tile
 from nlosrender.config.canonical import tree_hash
 from nlosrender.errors import FileError
 from nlosrender.files import layout
+from nlosrender.files.identity import SELECTION
+from nlosrender.files.kinds import CAPTURE, Kind, same_capture
 from nlosrender.files.part_attributes import (
     CHECKSUMS,
     NOTE,
@@ -32,7 +35,7 @@ from nlosrender.files.part_attributes import (
 )
 from nlosrender.files.pieces import PackedChunk
 from nlosrender.files.reader import explained_read, open_hdf5
-from nlosrender.files.replacement import check_writable, explained_write, partial_path, publish
+from nlosrender.files.replacement import check_writable, explained_write, new_partial, publish
 from nlosrender.files.shards import Shard, read_shards
 from nlosrender.files.sink import CaptureSink, sample_names
 from nlosrender.files.sums import Sums
@@ -57,7 +60,11 @@ class MergeReport:
 
 
 def merge_captures(
-    paths: Sequence[str | Path], output: str | Path, progress: Progress = lambda share: None
+    paths: Sequence[str | Path],
+    output: str | Path,
+    progress: Progress = lambda share: None,
+    *,
+    overwrite: bool = False,
 ) -> MergeReport:
     """Put the parts of a capture together; ``data`` is bit for bit what one render of the whole would have given.
 
@@ -69,6 +76,8 @@ def merge_captures(
         File to write; it appears when it is complete.
     progress
         Told the share of the work done.
+    overwrite
+        Whether a file that holds another capture, or a part, may be replaced.
 
     Raises
     ------
@@ -76,12 +85,12 @@ def merge_captures(
         A part is damaged, of another capture, overlaps another one or is missing; or the output cannot be written.
     """
     output = Path(output)
-    target = check_writable(output)
+    check_writable(output, CAPTURE, paths)
     shards = read_shards([Path(path) for path in paths])
-    for shard in shards:
-        if target.exists() and target.samefile(shard.path):
-            raise FileError(f"{output}: is one of the parts. Name another output.")
-    partial = partial_path(target)
+    kind = CAPTURE if overwrite else _whole(shards[0])
+    target = check_writable(output, kind, paths)
+    with explained_write(output):
+        partial = new_partial(target)
     sink: CaptureSink | None = None
     try:
         with uninterrupted(), explained_write(output):
@@ -91,11 +100,11 @@ def merge_captures(
             _copy(shard, None if number == 0 else sink)
             progress((number + 1) / len(shards))
         sums = sum((shard.stored.sums for shard in shards), Sums())
-        sink.remove_attributes((PART, SUMS, CHECKSUMS, NOTE, ZERO))
+        sink.remove_attributes((PART, SUMS, CHECKSUMS, NOTE, ZERO, SELECTION))
         sink.set_attributes(_attributes(shards, sums, output))
         sink.close()
         with uninterrupted(), explained_write(output):
-            publish(partial, target)
+            publish(output, partial, target, kind)
     finally:
         with uninterrupted():
             if sink is not None:
@@ -112,6 +121,12 @@ def merge_captures(
         unsampled_paths=_told(shards, UNSAMPLED),
         zero_because=() if sums.squares else _told(shards, ZERO),
     )
+
+
+def _whole(shard: Shard) -> Kind:
+    """Return the kind of files that hold the capture that a shard is a part of."""
+    attributes = shard.header.attributes
+    return same_capture(str(attributes.get("capture_hash")), str(WHOLE), json_object(attributes.get("config")))
 
 
 def _copy(shard: Shard, sink: CaptureSink | None) -> None:

@@ -14,6 +14,7 @@ from __future__ import annotations
 import os
 import shutil
 import socket
+import stat
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import suppress
@@ -21,13 +22,22 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
+from nlosrender.config.canonical import tree_hash
 from nlosrender.errors import FileError
 from nlosrender.files.capture_file import CaptureHeader
 from nlosrender.files.header_writer import root_attributes
 from nlosrender.files.identity import differences
 from nlosrender.files.journal import Journal, JournalInUseError
+from nlosrender.files.kinds import CAPTURE, Kind, same_capture
 from nlosrender.files.pieces import Cutter, PackedChunk
-from nlosrender.files.replacement import check_writable, explained_write, partial_folder, publish, synchronise
+from nlosrender.files.replacement import (
+    check_writable,
+    explained_write,
+    new_partial,
+    partial_folder,
+    publish,
+    synchronise,
+)
 from nlosrender.files.sink import CaptureSink, new_capture, sample_names
 from nlosrender.files.stored_bytes import StoredBytes, stored_bytes
 from nlosrender.files.sums import Sums
@@ -60,6 +70,7 @@ class PartialCapture:
         self._journal = journal
         self._state = self._read_journal()
         self._identity: dict[str, Any] = {}
+        self._replaces_others = False
         self._sink: CaptureSink | None = None
         self._cutter: Cutter | None = None
 
@@ -105,17 +116,17 @@ class PartialCapture:
         identity
             What has to agree with an earlier render for this one to go on with it; plain JSON values.
         resume
-            True: there has to be something to go on with. False: what there is is thrown away. None: go on if there
-            is something.
+            True: there has to be something to go on with. False: what there is is thrown away, and another capture
+            that is finished may be replaced. None: go on if there is something.
 
         Raises
         ------
         FileError
             The output cannot be written, another process is writing it, there is nothing to resume, or what there is
-            belongs to another render.
+            belongs to another render; or the output exists and is another capture, or none.
         """
         path = Path(path)
-        target = check_writable(path)
+        target = check_writable(path, CAPTURE)
         partial = cls(path, target, _journal(path, target))
         try:
             partial._begin(dict(identity), resume)
@@ -157,7 +168,14 @@ class PartialCapture:
             self._sink = CaptureSink(self._samples(), self.path, names, reserved=root_attributes(header))
             return
         if not self.tally.units:
-            self._note({"identity": self._identity, "process": os.getpid(), "machine": socket.gethostname()})
+            self._note(
+                {
+                    "identity": self._identity,
+                    "overwrite": self._replaces_others,
+                    "process": os.getpid(),
+                    "machine": socket.gethostname(),
+                }
+            )
             self._sink = create()
             return
         self._rebuild(create)
@@ -205,10 +223,11 @@ class PartialCapture:
         FileError
             The disk refuses.
         """
+        self._kind.refuse_others(self.path, self.target)  # while there is still something to go on with
         self.sink.set_attributes(attributes)
         self.sink.close()
         with uninterrupted(), explained_write(self.path):
-            publish(self._samples(), self.target)
+            publish(self.path, self._samples(), self.target, self._kind)
         self.discard()
 
     def discard(self) -> None:
@@ -251,7 +270,10 @@ class PartialCapture:
             raise FileError(f"{self.path}: there is no unfinished render to resume.{hint}")
         if exists and resume is not False:
             self._refuse_other(identity)
-        else:
+            self._replaces_others = bool(self._state.first.get("overwrite"))  # as the first run was allowed to
+        self._identity, self._replaces_others = identity, self._replaces_others or resume is False
+        self._kind.refuse_others(self.path, self.target)
+        if not exists or resume is False:
             with explained_write(self.path):
                 self._journal.clear()
                 for leftover in self.folder.glob("samples.*"):
@@ -259,7 +281,14 @@ class PartialCapture:
             self._state = UnfinishedRender()
             if resume is False:
                 self.damage.clear()  # it was thrown away
-        self._identity = identity
+
+    @property
+    def _kind(self) -> Kind:
+        """What the output may replace."""
+        if self._replaces_others or not self._identity:
+            return CAPTURE
+        config = self._identity["config"]
+        return same_capture(tree_hash(config), str(self._identity["part"]), config)
 
     def _refuse_other(self, identity: dict[str, Any]) -> None:
         found = list(differences(self._state.first.get("identity", {}), identity))
@@ -347,8 +376,13 @@ class PartialCapture:
 def _journal(path: Path, target: Path) -> Journal:
     folder = partial_folder(target)
     with explained_write(path):
+        probe = new_partial(target)
+        owner = probe.lstat().st_uid  # of what this process makes there: network file systems have their own idea of it
+        probe.unlink()
         for attempt in range(ATTEMPTS):
-            folder.mkdir(exist_ok=True)
+            with suppress(FileExistsError):
+                folder.mkdir()
+            _refuse_foreign(path, folder, owner)
             try:
                 return Journal(folder / JOURNAL)
             except JournalInUseError as error:
@@ -358,6 +392,26 @@ def _journal(path: Path, target: Path) -> Journal:
                 if attempt == ATTEMPTS - 1:
                     raise
     raise FileError(f"{path}: cannot be written: its folder {folder} vanishes.")
+
+
+def _refuse_foreign(path: Path, folder: Path, owner: int) -> None:
+    """Make sure that the folder is our own and holds no links: what is written there must not end up elsewhere.
+
+    Raises
+    ------
+    FileError
+        It is not, or does.
+    """
+    hint = "Remove it, or name another output."
+    found = folder.lstat()
+    if not stat.S_ISDIR(found.st_mode):
+        raise FileError(f"{path}: {folder} is a link or a file, need a folder of unfinished renders. {hint}")
+    if found.st_uid != owner:
+        raise FileError(f"{path}: {folder} belongs to another user, number {found.st_uid}. Name another output.")
+    for entry in folder.iterdir():
+        mode, links = entry.lstat().st_mode, entry.lstat().st_nlink
+        if not stat.S_ISREG(mode) or links > 1:
+            raise FileError(f"{path}: {entry} is a link or no file, which no render leaves there. {hint}")
 
 
 def _copies(stored: StoredBytes, chunks: Iterable[StoredChunk]) -> Iterator[PackedChunk]:

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from nlosrender.errors import FileError
 from nlosrender.files import layout
+from nlosrender.files.locking import open_for_reading
 from nlosrender.files.stored_header import StoredHeader, header_of, samples_of, stored_points
 
 Part = int | slice | None  # of one axis; None: all of it
@@ -167,7 +168,7 @@ def open_hdf5(path: Path) -> Iterator[h5py.File]:
                 start = stream.read(16)
             content = f"it starts with {start!r}" if start else "it is empty"
             raise FileError(f"{path}: is not an HDF5 file ({content}). Captures are HDF5 files, usually named .hdf5")
-        file = h5py.File(path, "r")
+        file = open_for_reading(path)
     try:
         yield file
     finally:
@@ -200,7 +201,7 @@ def explained_read(path: Path) -> Iterator[None]:
 def _advice(error: Exception) -> str:
     if "truncated" in str(error):
         return "The file is cut short: copy it again completely, or render it again."
-    if "lock" in str(error):
+    if "unable to lock file" in str(error):
         return "Another program has it open for writing: wait for it, or set HDF5_USE_FILE_LOCKING=FALSE."
     return "The file may be damaged: copy it again, or render it again."
 

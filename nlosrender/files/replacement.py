@@ -1,28 +1,38 @@
-"""Files appear whole or not at all: written under another name beside the target, then renamed onto it."""
+"""Files appear whole or not at all, and in place of their own kind only.
+
+Every command writes through ``replacing``, or through what it is made of: a new file beside the target that nobody
+else has (``new_partial``), renamed onto it once it has reached the disk (``publish``). What is at the target and is
+none of the files that the command writes stays there.
+"""
 
 from __future__ import annotations
 
 import errno
 import os
 import re
+import secrets
+import shutil
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from nlosrender.errors import FileError
+from nlosrender.errors import DiskError, FileError
+from nlosrender.files.kinds import Kind
+
+DISK_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)
 
 
-def check_writable(path: str | Path, *, overwrite: bool = True, source: str | Path | None = None) -> Path:
-    """Make sure a capture can be written to ``path``, before anything long is started.
+def check_writable(path: str | Path, kind: Kind, sources: Iterable[str | Path] = ()) -> Path:
+    """Make sure a file can be written to ``path``, before anything long is started.
 
     Parameters
     ----------
     path
         File to be written; a symbolic link stands for the file it points to.
-    overwrite
-        Whether an existing file may be replaced.
-    source
-        The capture that is read for it, which must not be replaced.
+    kind
+        What it will be: only a file of this kind is replaced.
+    sources
+        Files that are read for it, which must not be replaced.
 
     Returns
     -------
@@ -33,28 +43,49 @@ def check_writable(path: str | Path, *, overwrite: bool = True, source: str | Pa
     ------
     FileError
         The folder is missing, is not a folder or cannot be written to, or the path is taken by something that is
-        not a file, by ``source``, or by a file when ``overwrite`` is off.
+        not a file, by one of ``sources``, or by a file of another kind.
     """
     try:
         target = Path(os.path.realpath(path))
         if target.is_dir():
             raise FileError(f"{path}: is a folder. Name a file in it, such as {target / 'capture.hdf5'}")
         if target.exists() and not target.is_file():
-            raise FileError(f"{path}: is not a regular file and cannot be replaced by a capture. Name another output.")
-        if source is not None and target == Path(os.path.realpath(source)):
-            raise FileError(f"{path}: is the capture itself. Name another output.")
-        if target.exists() and not overwrite:
-            raise FileError(f"{path}: exists already. Name another output, or allow it to be overwritten.")
+            raise FileError(f"{path}: is not a regular file and cannot be replaced. Name another output.")
+        refuse_sources(path, sources)
         if not target.parent.is_dir():
             raise FileError(f"{path}: there is no folder {target.parent}. Create it (mkdir -p) or name another output.")
+        kind.refuse_others(path, target)
         with explained_write(path):
-            partial = partial_path(target)
             # permissions, a read-only disk, a full one, a name that is too long: trying tells them all
-            os.close(os.open(partial, os.O_WRONLY | os.O_CREAT))
-            partial.unlink()
+            new_partial(target).unlink()
     except (OSError, ValueError) as error:  # ValueError: a zero byte in the name
         raise FileError(f"{path}: cannot be used as an output: {error}") from error
     return target
+
+
+@contextmanager
+def replacing(path: str | Path, kind: Kind, sources: Iterable[str | Path] = ()) -> Iterator[Path]:
+    """Give the block an empty file beside ``path``; it takes its place when the block ends well, and else vanishes.
+
+    Parameters
+    ----------
+    path, kind, sources
+        As for ``check_writable``.
+
+    Raises
+    ------
+    FileError
+        As ``check_writable``; or an OSError left the block.
+    """
+    target = check_writable(path, kind, sources)
+    with explained_write(path):
+        partial = new_partial(target)
+        try:
+            yield partial
+            publish(path, partial, target, kind)
+        finally:
+            with suppress(OSError):
+                partial.unlink(missing_ok=True)
 
 
 def refuse_sources(path: str | Path, sources: Iterable[str | Path]) -> None:
@@ -70,9 +101,18 @@ def refuse_sources(path: str | Path, sources: Iterable[str | Path]) -> None:
         raise FileError(f"{path}: is read for this and would be replaced. Name another output.")
 
 
-def partial_path(target: Path) -> Path:
-    """Return the name a file has until it is complete."""
-    return target.with_name(f".{target.name}.{os.getpid()}.partial")
+def new_partial(target: Path) -> Path:
+    """Create the empty file that ``target`` is until it is complete, under a name of its own.
+
+    Raises
+    ------
+    OSError
+        The system refuses.
+    """
+    # not the number of the process, which another one may have, on another machine or in another container
+    partial = target.with_name(f".{target.name}.{secrets.token_hex(4)}.partial")
+    os.close(os.open(partial, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW, 0o666))
+    return partial
 
 
 def partial_folder(target: Path) -> Path:
@@ -80,15 +120,27 @@ def partial_folder(target: Path) -> Path:
     return target.with_name(f".{target.name}.partial")
 
 
-def publish(partial: Path, target: Path) -> None:
+def publish(path: str | Path, partial: Path, target: Path, kind: Kind) -> None:
     """Rename the complete ``partial`` onto ``target`` once its content has reached the disk.
+
+    Parameters
+    ----------
+    path
+        What to call the target in messages.
+    partial, target
+        The two files.
+    kind
+        As for ``check_writable``: something may have come to lie there since.
 
     Raises
     ------
     OSError
         The disk is full or the folder has become unusable.
+    FileError
+        A file of another kind lies there.
     """
     synchronise(partial)
+    kind.refuse_others(path, target)
     os.replace(partial, target)
     with suppress(OSError):  # the new name itself; some network file systems cannot sync a folder
         synchronise(target.parent)
@@ -116,7 +168,8 @@ def explained_write(path: str | Path) -> Iterator[None]:
     Raises
     ------
     FileError
-        An OSError or RuntimeError (h5py's, when a file cannot be closed) left the block.
+        An OSError or RuntimeError (h5py's, when a file cannot be closed) left the block; a DiskError when the disk is
+        full or fails.
     """
     try:
         yield
@@ -124,7 +177,8 @@ def explained_write(path: str | Path) -> Iterator[None]:
         number = _system_error(error)
         # HDF5's own text runs over several lines, with addresses in memory
         reason = os.strerror(number) if number is not None else str(error).partition("\n")[0][:200]
-        raise FileError(f"{path}: cannot be written: {reason}. {_advice(number)}") from error
+        message = f"{path}: cannot be written: {reason}. {_advice(number, path)}"
+        raise (DiskError if number in DISK_ERRORS else FileError)(message) from error
 
 
 def _system_error(error: OSError | RuntimeError) -> int | None:
@@ -135,11 +189,22 @@ def _system_error(error: OSError | RuntimeError) -> int | None:
     return int(found.group(1)) if found else None
 
 
-def _advice(number: int | None) -> str:
+def _advice(number: int | None, path: str | Path) -> str:
     if number in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
-        return "Free some space or name an output on another disk; `nlosrender plan` tells the size to expect."
+        size = "`nlosrender plan` tells the size of a capture to expect."
+        return f"Free some space on {_disk_of(path)} or name an output on another disk; {size}"
     if number in (errno.EACCES, errno.EPERM, errno.EROFS):
         return "Name an output in a folder you may write to."
     if number == errno.ENAMETOOLONG:
         return "Name a shorter output."
     return "Check the disk, or name an output elsewhere."
+
+
+def _disk_of(path: str | Path) -> str:
+    """Return where the disk is mounted that ``path`` lies on, and what is left on it, in words."""
+    folder = Path(os.path.realpath(path)).parent
+    with suppress(OSError):
+        while not os.path.ismount(folder):
+            folder = folder.parent
+        return f"the disk {folder} ({shutil.disk_usage(folder).free / 1e6:.3g} MB left)"
+    return f"the disk of {folder}"

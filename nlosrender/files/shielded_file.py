@@ -18,7 +18,7 @@ class ShieldedFile:
     Parameters
     ----------
     path
-        File to create; an existing one is emptied.
+        File to create; an existing one is emptied, a symbolic link is not followed.
     keep
         Open an existing file as it is instead.
 
@@ -33,7 +33,7 @@ class ShieldedFile:
         self.writes: list[tuple[int, int]] = []  # position and length of all writes, until someone clears it
         self._held: list[tuple[int, bytes]] = []  # position and content of what the disk did not take, oldest first
         self._position = 0
-        flags = os.O_RDWR if keep else os.O_RDWR | os.O_CREAT | os.O_TRUNC
+        flags = os.O_RDWR | os.O_NOFOLLOW | (0 if keep else os.O_CREAT | os.O_TRUNC)
         self._descriptor: int | None = os.open(path, flags, 0o666)
 
     def raise_error(self) -> None:

@@ -94,6 +94,8 @@ def header_of(file: h5py.File, path: Path) -> StoredHeader:
         ``data`` or ``deltaT`` is missing, or what is there cannot be a capture.
     """
     samples = samples_of(file, path)
+    for name in layout.SPECS:  # read or not: a file that names others is refused as a whole
+        dataset_in(file, path, name)
     confocal = samples.ndim == len(layout.CONFOCAL_AXES)
     sizes = {"laser_y": 1, "laser_x": 1} | dict(zip(layout.file_axes(confocal), samples.shape, strict=True))
     attributes, data_attributes = get_attributes(file), get_attributes(samples)

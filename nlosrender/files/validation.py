@@ -50,7 +50,7 @@ def validate_file(path: str | Path) -> list[str]:
         found += damaged or wrong_energies(
             samples, _stored_parts(samples), get_attributes(file), get_attributes(samples)
         )
-        if layout.VARIANCE in file:
+        if dataset_in(file, path, layout.VARIANCE) is not None:
             variance = samples_of(file, path, layout.VARIANCE)
             if variance.shape != samples.shape:
                 found.append(f"variance: shape {variance.shape}, need that of data, {samples.shape}")

@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 
 from nlosrender.files import layout
 from nlosrender.files.capture_file import CaptureHeader
+from nlosrender.files.kinds import CAPTURE, NOTHING
 from nlosrender.files.pieces import TILE_AXES, Cutter
-from nlosrender.files.replacement import check_writable, explained_write, partial_path, publish
+from nlosrender.files.replacement import check_writable, explained_write, new_partial, publish
 from nlosrender.files.sink import CaptureSink, new_capture
 from nlosrender.interruption import uninterrupted
 
@@ -23,7 +24,7 @@ __all__ = ["CaptureWriter", "check_writable"]
 class CaptureWriter:
     """Context manager that writes one capture file in one go; ``PartialCapture`` survives an interruption.
 
-    Leaving the block normally puts the file in place under its name, replacing what was there; an exception
+    Leaving the block normally puts the file in place under its name, replacing a capture that was there; an exception
     (Ctrl-C too) removes what was written and leaves the earlier file as it was.
 
     Parameters
@@ -39,7 +40,7 @@ class CaptureWriter:
     store_variance
         Also store the variance of every sample, in a dataset ``variance`` shaped as ``data``.
     overwrite
-        Whether an existing file may be replaced.
+        Whether an existing capture may be replaced.
 
     Raises
     ------
@@ -70,8 +71,10 @@ class CaptureWriter:
         self._written: set[tuple[str, tuple[int, ...]]] = set()  # chunks that exist, by dataset
 
     def __enter__(self) -> CaptureWriter:
-        self._target = check_writable(self.path, overwrite=self._overwrite)
-        self._partial = partial_path(self._target)
+        self._kind = CAPTURE if self._overwrite else NOTHING
+        self._target = check_writable(self.path, self._kind)
+        with explained_write(self.path):
+            self._partial = new_partial(self._target)
         try:
             self._sink = new_capture(self._partial, self.path, self.header, self._compression, self._store_variance)
             self._sink.set_attributes(self._attributes)
@@ -89,7 +92,7 @@ class CaptureWriter:
         try:
             self._open_sink().close()
             with uninterrupted(), explained_write(self.path):
-                publish(self._partial, self._target)
+                publish(self.path, self._partial, self._target, self._kind)
         except BaseException:
             self._discard()
             raise

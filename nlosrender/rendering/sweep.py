@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import os
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from nlosrender.capture.part import WHOLE
 from nlosrender.config.canonical import tree_hash
 from nlosrender.config.document import Config
 from nlosrender.config.load import config_to_dict
@@ -15,6 +17,8 @@ from nlosrender.config.sweep_load import Sweep
 from nlosrender.errors import ConfigError, FileError, InterruptedRender, OptionError, RenderError
 from nlosrender.files.dataset_index import IndexEntry, relative_name, stored_entry, write_index
 from nlosrender.files.identity import comparable_config
+from nlosrender.files.kinds import CAPTURE, same_capture
+from nlosrender.files.reader import read_header
 from nlosrender.files.replacement import explained_write, partial_folder
 from nlosrender.interruption import StopRequest, stop_request
 from nlosrender.rendering.report import Progress, RenderReport, Standing, Warn, Watch
@@ -62,6 +66,23 @@ class _Dataset:
         entry = stored_entry(index, sweep.paths[index], self.folder, sweep.values(index), expected)
         self.entries[index] = entry
         return entry
+
+    def refuse_others(self, indices: Sequence[int], overwrite: bool) -> None:
+        """Make sure that the captures replace nothing but themselves: before the first one, not hours later.
+
+        Raises
+        ------
+        FileError
+            One of the outputs exists and is something else.
+        """
+        for index in indices:
+            path = self.sweep.paths[index]
+            target = Path(os.path.realpath(path))
+            if not os.path.lexists(target) or partial_folder(target).exists():  # the render knows what it began over
+                continue
+            config = config_to_dict(self.sweep.config(index))
+            kind = CAPTURE if overwrite else same_capture(self.entries[index].capture_hash, str(WHOLE), config)
+            kind.refuse_others(path, target)
 
     def forget(self) -> None:
         """Note that everything is to be rendered anew."""
@@ -127,6 +148,7 @@ def render_sweep(
         there = []
         dataset.forget()
     todo = sorted(set(dataset.chosen) - set(there))
+    dataset.refuse_others(todo, overwrite=resume is False)
     dataset.write(at_once=True)
     with _index_kept(dataset), stop_request() as stop:
         for number, index in enumerate(todo):
@@ -176,7 +198,12 @@ def _render_one(
         return
     entry = dataset.look(index)
     if entry.status != "done":
-        message = f"{relative_name(path, dataset.folder)} does not hold what was rendered: another process replaced it"
+        problem = "another process replaced it"
+        try:
+            read_header(path)
+        except FileError as error:
+            problem = str(error)
+        message = f"{relative_name(path, dataset.folder)} does not hold what was rendered: {problem}"
         dataset.entries[index] = replace(entry, status="failed", message=message)
 
 

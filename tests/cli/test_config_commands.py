@@ -71,17 +71,20 @@ def test_new_without_a_path_prints_the_same_text(tmp_path: Path) -> None:
 
 def test_new_overwrites_only_by_force(starter: Path) -> None:
     """An existing file survives without --force."""
-    starter.write_text("mine")
+    mine = "scene: {}  # mine"
+    starter.write_text(mine)
     result = runner.invoke(app, ["new", str(starter)])
     assert isinstance(result.exception, FileError)
     assert result.exception.exit_code == EXIT_BAD_INPUT
     assert "exists already; --force overwrites it" in str(result.exception)
-    assert starter.read_text() == "mine"
+    assert starter.read_text() == mine
     assert runner.invoke(app, ["new", str(starter), "--force"]).exit_code == 0
-    assert starter.read_text() != "mine"
+    assert starter.read_text() != mine
 
 
-@pytest.mark.parametrize(("name", "message"), [("no/z.yaml", "there is no folder"), ("a\0b", "cannot be written")])
+@pytest.mark.parametrize(
+    ("name", "message"), [("no/z.yaml", "there is no folder"), ("a\0b", "cannot be used as an output")]
+)
 def test_new_explains_a_place_it_cannot_write_to(name: str, message: str, tmp_path: Path) -> None:
     """A missing folder or an impossible name is explained."""
     result = runner.invoke(app, ["new", str(tmp_path / name)])

@@ -23,6 +23,7 @@ from nlosrender.errors import EXIT_BAD_INPUT, EXIT_FAILURE, EXIT_INTERRUPTED, EX
 from nlosrender.files.exports import export_capture
 from nlosrender.files.filled_folder import filled_folder
 
+PNG_START = b"\x89PNG\r\n\x1a\n"
 MAIN = "import sys; from nlosrender.cli.app import app, main; sys.argv = ['nlosrender', *sys.argv[1:]]\n"
 
 
@@ -122,10 +123,10 @@ def test_an_interrupted_export_leaves_nothing(tmp_path: Path, monkeypatch: pytes
 
 STOPPED = {  # commands, and a function each that is called while their output is half-written
     ("frames", "view.hdf5"): "analysis.frames.save_exr",
-    ("frames", "view.hdf5", "-o", "view.gif"): "analysis.frames.publish",
-    ("plot", "wall.hdf5"): "analysis.plots.publish",
+    ("frames", "view.hdf5", "-o", "view.gif"): "files.replacement.publish",
+    ("plot", "wall.hdf5"): "files.replacement.publish",
     ("export", "wall.hdf5", "--format", "tal"): "files.exports_tal._write_enum",
-    ("export", "wall.hdf5", "--format", "fk"): "files.exports.publish",
+    ("export", "wall.hdf5", "--format", "fk"): "files.replacement.publish",
     ("reconstruct", "wall.hdf5", "--voxels", "8"): "analysis.reconstruction.volume_file.set_attributes",
     ("merge", "part1.hdf5", "part2.hdf5", "-o", "merged.hdf5"): "files.merge._copy",
 }
@@ -195,20 +196,20 @@ def test_a_folder_is_filled_or_left_alone(tmp_path: Path, exists: bool, error: t
     folder = tmp_path / "out"
     if exists:
         folder.mkdir()
-        (folder / "a").write_text("old")
+        (folder / "a.png").write_bytes(PNG_START + b"old")
 
     def fill(fail: bool) -> None:
         with filled_folder(folder) as inside:
-            (inside / "a").write_text("new")
+            (inside / "a.png").write_bytes(PNG_START + b"new")
             if fail:
                 raise error
 
     with pytest.raises(error):
         fill(fail=True)
-    assert [path.read_text() for path in tmp_path.rglob("a")] == (["old"] if exists else [])
+    assert [path.read_bytes()[-3:] for path in tmp_path.rglob("a.png")] == ([b"old"] if exists else [])
     assert folder.exists() == exists
     fill(fail=False)
-    assert [(path.name, path.read_text()) for path in folder.iterdir()] == [("a", "new")]
+    assert [(path.name, path.read_bytes()[-3:]) for path in folder.iterdir()] == [("a.png", b"new")]
 
 
 def test_a_full_disk_below_a_folder_is_explained(tmp_path: Path) -> None:

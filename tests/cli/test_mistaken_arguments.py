@@ -98,7 +98,7 @@ def test_outputs_of_a_reconstruction_are_checked_before_it(folder: Path) -> None
     assert (done.returncode, "volume.png: is a folder" in done.stderr) == (EXIT_BAD_INPUT, True)
     assert not (folder / "volume.hdf5").exists()
     done = run(folder, "reconstruct", "wall.hdf5", "-o", "wall.hdf5", "--method", "phasor", "--wavelength", 9)
-    assert "is the capture itself" in done.stderr
+    assert "is read for this and would be replaced" in done.stderr
 
 
 def test_an_animation_goes_into_the_file_that_is_named(folder: Path) -> None:

@@ -86,7 +86,7 @@ def test_mistakes(capture: Path, tmp_path: Path) -> None:
     result = CliRunner().invoke(app, ["reconstruct", str(capture), "--volume-size", "1,x"])
     assert result.exit_code == EXIT_USAGE
     assert "need lengths in m" in result.output
-    with pytest.raises(FileError, match="is the capture itself"):
+    with pytest.raises(FileError, match="is read for this and would be replaced"):
         run(capture, "--voxels", 6, "-o", capture)
     bare = write_points(tmp_path / "bare.hdf5", points_header("single", cells(4, 3, 1.0, 1.0)), [(0, 0, 0.8)])
     with pytest.raises(FileError, match="nothing to score against"):

@@ -99,7 +99,8 @@ def test_the_index_tells_what_the_files_hold(dataset: Path) -> None:
 
 
 def test_what_is_there_is_not_rendered_again(dataset: Path, tmp_path: Path) -> None:
-    """A second run renders what is missing, damaged, a part or of another configuration, and nothing else."""
+    """A second run renders what is missing or damaged, and nothing else; what is of another configuration, or a part,
+    is replaced when --overwrite says so."""
     subprocess.run(["cp", "-r", f"{dataset}/.", str(tmp_path)], check=True)
     files = sorted((tmp_path / "plates").glob("*.hdf5"))
     files[1].unlink()
@@ -107,13 +108,16 @@ def test_what_is_there_is_not_rendered_again(dataset: Path, tmp_path: Path) -> N
     with h5py.File(files[3], "r+") as file:
         file.attrs["part"] = "{}"
     stamp = files[0].stat().st_mtime_ns
+    done = run(tmp_path, "render", "set.yaml", "--json")
+    assert (done.returncode, "a part of it there, the whole capture now" in done.stderr) == (EXIT_BAD_INPUT, True)
+    files[3].unlink()
     report = json.loads(run(tmp_path, "render", "set.yaml", "--json").stdout)
     assert (report["rendered"], report["earlier"]) == (3, 1)
     assert files[0].stat().st_mtime_ns == stamp
     for path in files:
         assert np.array_equal(samples_of(path), samples_of(dataset / "plates" / path.name))
-    report = json.loads(run(tmp_path, "render", "set.yaml", "--json", "--set", "render.spp=16").stdout)
-    assert (report["rendered"], report["earlier"]) == (4, 0)
+    done = run(tmp_path, "render", "set.yaml", "--json", "--set", "render.spp=16")
+    assert (done.returncode, "holds another capture (render.spp: " in done.stderr) == (EXIT_BAD_INPUT, True)
     report = json.loads(run(tmp_path, "render", "set.yaml", "--json", "--set", "render.spp=16", "--overwrite").stdout)
     assert (report["rendered"], report["earlier"]) == (4, 0)
 

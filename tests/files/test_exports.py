@@ -344,7 +344,7 @@ def test_what_a_format_cannot_hold_is_refused(tmp_path: Path) -> None:
         export_capture(paths["confocal"], tmp_path / "out.mat", "fk", legs="keep")
     with pytest.raises(OptionError, match="--key: got '2 b'"):
         export_capture(paths["confocal"], tmp_path / "out.mat", "learned", key="2 b")
-    with pytest.raises(FileError, match="is the capture itself"):
+    with pytest.raises(FileError, match="is read for this and would be replaced"):
         export_capture(paths["single"], paths["single"], "tal")
     assert not list(tmp_path.glob("*out*"))
 

@@ -166,7 +166,7 @@ def test_a_dark_capture_has_a_picture(tmp_path: Path, header_of: Callable) -> No
         ("a.png", {"pixel": (0, 5)}, OptionError, r"--pixel: got 0,5, need a row from 0 to 3 and a column from 0 to 4"),
         ("a.jpeg", {}, OptionError, r"--output: got 'a.jpeg', need a name that ends in one of \.png, \.pdf, \.svg"),
         ("none/a.png", {}, FileError, r"there is no folder"),
-        ("capture.png", {}, FileError, r"is the capture itself"),
+        ("capture.png", {}, FileError, r"is read for this and would be replaced"),
     ],
 )
 def test_pictures_that_cannot_be(

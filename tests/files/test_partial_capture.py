@@ -322,7 +322,7 @@ def test_one_render_at_a_time(tmp_path: Path, header_of: Callable, block_of: Cal
             PartialCapture.claim(path, {}, resume=False)
         first.open(header_of(), {}, "gzip", store_variance=False)
         first.publish({})
-    assert write_part(path, header_of(), block_of(header_of())) == 0
+    assert write_part(path, header_of(), block_of(header_of()), resume=False) == 0
 
 
 def test_a_full_disk_costs_the_unit_alone(
@@ -336,7 +336,8 @@ def test_a_full_disk_costs_the_unit_alone(
     kept = set()
     for limit in (1, 12_000, 15_000, 18_000, 20_000):
         path = tmp_path / f"{limit}.hdf5"
-        path.write_text("precious")
+        write_part(path, header, 2 * block)  # the same capture, as an earlier render left it
+        precious = path.read_bytes()
         left = [limit]
 
         def filling(descriptor: int, content: bytes, offset: int, left: list[int] = left) -> int:
@@ -349,7 +350,7 @@ def test_a_full_disk_costs_the_unit_alone(
         with pytest.raises(FileError, match=r"No space left on device\. Free some space"):
             write_part(path, header, block)
         monkeypatch.setattr(os, "pwrite", true_write)
-        assert path.read_text() == "precious"
+        assert path.read_bytes() == precious
         kept.add(write_part(path, header, block))
         assert_same(tmp_path / "whole.hdf5", path)
     assert min(kept) == 0

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import resource
 import signal
 import sys
@@ -15,6 +16,7 @@ import numpy as np
 import pytest
 
 from nlosrender.errors import FileError, RenderError
+from nlosrender.files.kinds import CAPTURE
 from nlosrender.files.provenance import provenance_attributes
 from nlosrender.files.writer import CaptureWriter, check_writable
 from nlosrender.scene.pose import Pose
@@ -305,7 +307,7 @@ def test_file_appears_only_when_complete(tmp_path: Path, header_of: Callable) ->
     """While it is written the file has another name, in the same folder."""
     path = tmp_path / "a.hdf5"
     with CaptureWriter(path, header_of()):
-        assert [entry.name for entry in tmp_path.iterdir()] == [f".a.hdf5.{os.getpid()}.partial"]
+        assert all(re.fullmatch(r"\.a\.hdf5\.\w+\.partial", entry.name) for entry in tmp_path.iterdir())
     assert [entry.name for entry in tmp_path.iterdir()] == ["a.hdf5"]
 
 
@@ -397,7 +399,7 @@ def test_outputs_that_cannot_be_written(tmp_path: Path, header_of: Callable, nam
     (tmp_path / "file").write_text("text")
     os.mkfifo(tmp_path / "pipe")
     with pytest.raises(FileError, match=message):
-        check_writable(tmp_path / name)
+        check_writable(tmp_path / name, CAPTURE)
     with pytest.raises(FileError, match=message), CaptureWriter(tmp_path / name, header_of()):
         pass
 
@@ -408,7 +410,7 @@ def test_folder_without_permission(tmp_path: Path) -> None:
     tmp_path.chmod(0o500)
     try:
         with pytest.raises(FileError, match="Name an output in a folder you may write to"):
-            check_writable(tmp_path / "a.hdf5")
+            check_writable(tmp_path / "a.hdf5", CAPTURE)
     finally:
         tmp_path.chmod(0o700)
 
@@ -416,12 +418,13 @@ def test_folder_without_permission(tmp_path: Path) -> None:
 def test_existing_files_are_kept_on_request(tmp_path: Path, header_of: Callable, write_capture: Callable) -> None:
     """overwrite=False refuses an existing file and leaves it alone."""
     path = tmp_path / "a.hdf5"
-    path.write_text("precious")
+    write_capture(path, header_of())
+    precious = path.read_bytes()
     with pytest.raises(FileError, match="exists already"):
         write_capture(path, header_of(), overwrite=False)
-    assert path.read_text() == "precious"
-    assert check_writable(path) == path.resolve()
-    assert path.read_text() == "precious"
+    assert path.read_bytes() == precious
+    assert check_writable(path, CAPTURE) == path.resolve()
+    assert path.read_bytes() == precious
     assert len(list(tmp_path.iterdir())) == 1
 
 

@@ -32,7 +32,7 @@ def capture(path: Path, **datasets: object) -> Path:
 
 
 @pytest.mark.parametrize("link", ["external", "soft", "storage", "virtual"])
-@pytest.mark.parametrize("name", ["data", "deltaT", "variance"])
+@pytest.mark.parametrize("name", ["data", "deltaT", "variance", "cameraGridPositions"])
 def test_numbers_in_other_files_are_not_read(name: str, link: str, tmp_path: Path) -> None:
     """Links out of the file, raw storage in any file of the disk, and virtual datasets are refused by name."""
     secret = capture(tmp_path / "secret.h5", secret=np.ones(SHAPE, "f4"))

@@ -11,8 +11,9 @@ from nlosrender.analysis.reconstruction.reconstruct import SEPARATOR, Reconstruc
 from nlosrender.analysis.reconstruction.score import Score, otsu_threshold
 from nlosrender.analysis.theme import COLORMAP, FAINT, GROUND, INK, MARK, color_bar, style
 from nlosrender.config.encodable import encodable
+from nlosrender.files.kinds import PNG
 from nlosrender.files.layout import Float64
-from nlosrender.files.replacement import check_writable, explained_write, partial_path, publish
+from nlosrender.files.replacement import replacing
 from nlosrender.files.scan import Float32
 
 if TYPE_CHECKING:
@@ -52,15 +53,9 @@ def draw_reconstruction(
     FileError
         The picture cannot be written.
     """
-    target = check_writable(path)
     figure = _figure(reconstruction, silhouette, score)
-    partial = partial_path(target)
-    with explained_write(path):
-        try:
-            figure.savefig(partial, format="png", dpi=130, facecolor=GROUND)
-            publish(partial, target)
-        finally:
-            partial.unlink(missing_ok=True)
+    with replacing(path, PNG) as partial:
+        figure.savefig(partial, format="png", dpi=130, facecolor=GROUND)
     return Path(path)
 
 

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import h5py
 import numpy as np
 
 from nlosrender.analysis.reconstruction.reconstruct import Reconstruction
-from nlosrender.errors import FileError
 from nlosrender.files.attributes import set_attributes
+from nlosrender.files.kinds import VOLUME
 from nlosrender.files.provenance import package_versions
-from nlosrender.files.replacement import check_writable, explained_write, partial_path, publish
+from nlosrender.files.replacement import replacing
+from nlosrender.files.shielded_hdf5 import shielded_hdf5
+from nlosrender.interruption import uninterrupted
 
 AXES = ("z", "y", "x")  # of the volume, as h5py shows it
 MEANING = {
@@ -36,7 +37,7 @@ def write_volume(
     reconstruction
         What to write.
     path
-        HDF5 file; an existing one is replaced.
+        HDF5 file; an existing reconstruction is replaced.
     silhouette
         (y, x) true front view, stored beside the volume when given.
     attributes
@@ -52,27 +53,23 @@ def write_volume(
     FileError
         The file cannot be written, or is the capture itself.
     """
-    target = check_writable(path)
-    if target == reconstruction.source.resolve():
-        raise FileError(f"{path}: is the capture itself. Name another output.")
-    partial = partial_path(target)
     grid = reconstruction.grid
-    with explained_write(path):
-        try:
-            with h5py.File(partial, "w") as file:
-                for name in AXES:
-                    file.create_dataset(name, data=getattr(grid, name))
-                    set_attributes(file[name], {"meaning": MEANING[name], "unit": "m"})
-                options = {"compression": "gzip", "compression_opts": 1, "shuffle": True}
-                volume = file.create_dataset("volume", data=reconstruction.volume, **options)
-                set_attributes(volume, {"meaning": MEANING["volume"], "axes": " ".join(AXES)})
-                if silhouette is not None:
-                    file.create_dataset("silhouette", data=silhouette.astype(np.float32), **options)
-                    set_attributes(file["silhouette"], {"meaning": MEANING["silhouette"], "axes": "y x"})
-                set_attributes(file, _attributes(reconstruction) | (attributes or {}))
-            publish(partial, target)
-        finally:
-            partial.unlink(missing_ok=True)
+    with (
+        replacing(path, VOLUME, [reconstruction.source]) as partial,
+        uninterrupted(),
+        shielded_hdf5(partial) as hdf5,
+    ):
+        file = hdf5.file
+        for name in AXES:
+            file.create_dataset(name, data=getattr(grid, name))
+            set_attributes(file[name], {"meaning": MEANING[name], "unit": "m"})
+        options = {"compression": "gzip", "compression_opts": 1, "shuffle": True}
+        volume = file.create_dataset("volume", data=reconstruction.volume, **options)
+        set_attributes(volume, {"meaning": MEANING["volume"], "axes": " ".join(AXES)})
+        if silhouette is not None:
+            file.create_dataset("silhouette", data=silhouette.astype(np.float32), **options)
+            set_attributes(file["silhouette"], {"meaning": MEANING["silhouette"], "axes": "y x"})
+        set_attributes(file, _attributes(reconstruction) | (attributes or {}))
     return Path(path)
 
 

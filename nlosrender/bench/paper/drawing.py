@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nlosrender.analysis.theme import COLORMAP, FAINT, GROUND, INK, style
-from nlosrender.files.replacement import explained_write
+from nlosrender.files.kinds import PNG
+from nlosrender.files.replacement import replacing
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -38,8 +39,8 @@ def save(figure: Figure, path: Path) -> Path:
     FileError
         It cannot be written.
     """
-    with explained_write(path):
-        figure.savefig(path, dpi=110, facecolor=GROUND)
+    with replacing(path, PNG) as partial:
+        figure.savefig(partial, dpi=110, facecolor=GROUND, format="png")
     return path
 
 

@@ -9,7 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from nlosrender.bench.paper.figure import PaperFigure, Table, relative_name
-from nlosrender.files.replacement import explained_write
+from nlosrender.files.kinds import PAGE, REPORT
+from nlosrender.files.replacement import replacing
 
 STYLE = """
 body{margin:0 auto;max-width:1080px;padding:24px;background:#0e0f14;color:#e8e8ee;font:16px/1.5 system-ui,sans-serif}
@@ -58,9 +59,10 @@ def write_page(figures: Sequence[PaperFigure], folder: Path, facts: dict[str, An
 <meta name=viewport content='width=device-width'><style>{STYLE}</style><body>{''.join(body)}</body></html>"
     page = folder / "index.html"
     report = {"facts": facts, "figures": [figure.report(folder) for figure in figures]}
-    with explained_write(page):
-        page.write_text(text, encoding="utf-8")
-        (folder / "paper.json").write_text(json.dumps(report, indent=1), encoding="utf-8")
+    with replacing(page, PAGE) as partial:
+        partial.write_text(text, encoding="utf-8")
+    with replacing(folder / "paper.json", REPORT) as partial:
+        partial.write_text(json.dumps(report, indent=1), encoding="utf-8")
     return page
 
 
