@@ -16,34 +16,20 @@ class SceneElement(Element):
     """An element and where it stands in its file."""
 
     line: int = 0  # counted from 1; 0: it does not come from a file
-    file: str = ""  # name of an included file; empty: the scene's own
-    included: tuple[Path, ...] = ()  # of a scene's root: files whose contents are in it
-
-    @classmethod
-    def like(cls, other: Element, tag: str, **attributes: str) -> SceneElement:
-        """Return a new element that stands where another one does."""
-        element = cls(tag, attributes)
-        if isinstance(other, SceneElement):
-            element.line, element.file = other.line, other.file
-        return element
 
 
-def place_of(element: Element) -> str:
-    """Return where an element begins: its line, counted from 1, and its file where that is an included one."""
-    if not isinstance(element, SceneElement):
-        return "line 0"
-    return f"{element.file}, line {element.line}" if element.file else f"line {element.line}"
+def line_of(element: Element) -> int:
+    """Return the line an element begins in, counted from 1; 0 for one that does not come from a file."""
+    return element.line if isinstance(element, SceneElement) else 0
 
 
-def read_xml(path: Path, name: str = "") -> Element:
+def read_xml(path: Path) -> Element:
     """Read an XML file; text between the elements is left out, no Mitsuba scene has any.
 
     Parameters
     ----------
     path
         The file, in any encoding that XML knows.
-    name
-        What it is called in messages; empty: not at all.
 
     Returns
     -------
@@ -62,33 +48,33 @@ def read_xml(path: Path, name: str = "") -> Element:
         raise ValueError(f"cannot be read: {error.strerror}") from error
     if len(content) > MAX_XML_BYTES:
         raise ValueError(f"it is larger than {MAX_XML_BYTES // 2**20} MiB; keep meshes in files of their own")
-    return _LimitedTree(name).read(content)
+    return _LimitedTree().read(content)
 
 
-def numbered_text(root: Element) -> tuple[str, list[Element]]:
-    """Return an element as XML, and for each line of that text the element it begins or ends."""
+def numbered_text(root: Element) -> tuple[str, list[int]]:
+    """Return an element as XML, and for each line of that text the line of the file it comes from."""
     lines: list[str] = []
-    sources: list[Element] = []
+    sources: list[int] = []
 
-    def write(element: Element) -> None:
+    def write(element: Element, line: int) -> None:
+        line = line_of(element) or line  # what was added stands where its parent does
         attributes = "".join(f" {key}={quoteattr(value)}" for key, value in element.attrib.items())
         lines.append(f"<{element.tag}{attributes}{'' if len(element) else '/'}>")
-        sources.append(element)
+        sources.append(line)
         for child in element:
-            write(child)
+            write(child, line)
         if len(element):
             lines.append(f"</{element.tag}>")
-            sources.append(element)
+            sources.append(line)
 
-    write(root)
+    write(root, 1)
     return "\n".join(lines), sources
 
 
 class _LimitedTree:
     """Builds a tree, or says what no scene needs while it is read, before it grows."""
 
-    def __init__(self, name: str) -> None:
-        self._name = name
+    def __init__(self) -> None:
         self._parser = expat.ParserCreate()
         self._parser.StartElementHandler = self._start
         self._parser.EndElementHandler = self._end
@@ -117,7 +103,7 @@ class _LimitedTree:
         if len(self._open) == MAX_DEPTH:
             raise ValueError(f"its elements lie in each other more than {MAX_DEPTH} deep")
         element = SceneElement(tag, attributes)
-        element.line, element.file = self._parser.CurrentLineNumber, self._name
+        element.line = self._parser.CurrentLineNumber
         if self._open:
             self._open[-1].append(element)
         else:

@@ -19,7 +19,13 @@ from nlosrender.scene.build import WALL_ID, BuiltScene
 from nlosrender.scene.mesh_wall import SAME_FACE, too_fine
 from nlosrender.scene.pose import Float64
 
-KINDS = {"Float": np.float32, "UInt": np.uint32, "UInt64": np.uint64, "Int": np.int32}  # by Dr.Jit's names
+KINDS = {
+    "Float": np.float32,
+    "UInt": np.uint32,
+    "UInt64": np.uint64,
+    "Int": np.int32,
+    "Float64": np.float64,
+}  # by Dr.Jit's names
 ALIGNMENT = 64  # bytes, the widest vectors there are
 MESH_LIFT = 1e-4  # engine units: less than any fold of a mesh wall, far more than the rounding of its points
 MESH_NUDGE = 1e-6  # engine units: off the edges of its triangles, where rays may slip through

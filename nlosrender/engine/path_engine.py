@@ -29,12 +29,12 @@ from nlosrender.engine.further_paths import (
 from nlosrender.engine.hidden_box import HiddenBox
 from nlosrender.engine.hidden_share import best_hidden_fraction, box_often_missed
 from nlosrender.engine.histogram import DeviceHistogram, Histogram, HistogramShape
+from nlosrender.engine.passes import Passes
 from nlosrender.engine.path_integrator import load_path_integrator
 from nlosrender.engine.pilot import Pilot, pilot_of
 from nlosrender.engine.plain_surfaces import only_normals_matter
 from nlosrender.engine.sampling import (
     Budget,
-    Progress,
     Schedule,
     accumulate,
     lane_randomness,
@@ -150,15 +150,15 @@ class PathEngine:
         self,
         batch: Batch,
         budget: Budget,
-        progress: Progress = lambda fraction: None,
+        passes: Passes | None = None,
         known_squares: float = 0.0,
     ) -> Histogram:
         """Render one batch.
 
         Parameters
         ----------
-        batch, budget, progress
-            What to render, when to stop, whom to tell the share of the work done.
+        batch, budget, passes
+            What to render, when to stop; who is told between two launches how far it is.
         known_squares
             Sum of the squares of H known from elsewhere, which ``target_error`` counts in [(engine unit)^-4].
 
@@ -180,8 +180,8 @@ class PathEngine:
             )
         if self._has_bounces:
             transport = self._of_paths(batch, shape, self._further_every(budget))
-            schedule = Schedule(budget, shape.replicas, known_squares)
-            mean, variance, per_lane = self._accumulate(batch, shape, transport, schedule, progress)
+            schedule = Schedule(budget, shape.replicas, known_squares, shape.lanes * shape.lasers)
+            mean, variance, per_lane = self._accumulate(batch, shape, transport, schedule, passes or Passes())
         else:
             axes = (shape.channels, bounces.n_slots, shape.lasers, shape.sensors, shape.row)
             mean, variance, per_lane = np.zeros(axes), np.zeros(axes), 0
@@ -214,7 +214,7 @@ class PathEngine:
         transport = self._of_paths(pilot, shape, self._further_every(budget))
 
         def look(schedule: Schedule) -> int:
-            return self._accumulate(pilot, shape, transport, schedule, lambda share: None)[2]
+            return self._accumulate(pilot, shape, transport, schedule, Passes())[2]
 
         return settled_by_pilot(budget, shape.replicas, look, known_squares)
 
@@ -230,25 +230,24 @@ class PathEngine:
         return highest is None or highest >= self.first_bounce
 
     def _accumulate(
-        self, batch: Batch | Pilot, shape: HistogramShape, transport: Transport, schedule: Schedule, progress: Progress
+        self, batch: Batch | Pilot, shape: HistogramShape, transport: Transport, schedule: Schedule, passes: Passes
     ) -> tuple[np.ndarray, np.ndarray, int]:
         bounces, points = self.options.bounces, self.sensor_indices(batch)[self.lane_order(batch)]
         seed, kernel = self.options.seed, self.kernel
-        stage, strata = range(0), Strata.of_stage(range(0), mi.UInt32(0))
 
         def launch(histogram: DeviceHistogram, randomness: LaneRandomness, more: int) -> LaneRandomness:
-            nonlocal stage, strata
             if randomness.turn is None:
                 turns = first_turns(seed, points, self.capture.sensor_grid.nx, shape.lanes, transport.further_every)
                 randomness = replace(randomness, turn=turns)
-            if stage != schedule.stage:
-                stage, strata = schedule.stage, Strata.of_stage(schedule.stage, randomness.sequence[0])
-            randomness, strata = self.integrator.accumulate(transport, histogram, randomness, strata, more)
-            return randomness
+            strata = randomness.strata
+            if strata is None or strata.stage != schedule.stage:
+                strata = Strata.of_stage(schedule.stage, randomness.sequence[0])
+            advanced, strata = self.integrator.accumulate(transport, histogram, randomness, strata, more)
+            return replace(advanced, strata=replace(strata, stage=schedule.stage))
 
         first = 1 if bounces.split else 0  # the second bounce has slot 0
         slots = range(-first, bounces.n_slots - first)
-        result = accumulate(shape, points, seed, launch, schedule, progress, self.scale, slots, kernel)
+        result = accumulate(shape, points, seed, launch, schedule, passes, self.scale, slots, kernel)
         self.compile_seconds += result.compile_seconds
         return result.mean, result.variance, result.per_lane
 

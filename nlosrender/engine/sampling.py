@@ -7,8 +7,9 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -17,17 +18,17 @@ from numpy.typing import NDArray
 
 from nlosrender.engine.device_arrays import on_device
 from nlosrender.engine.histogram import DeviceHistogram, HistogramShape
+from nlosrender.engine.passes import PASS_SECONDS, Passes, Snapshot
 from nlosrender.engine.temporal_kernel import TemporalKernel
 from nlosrender.engine.transport import LaneRandomness
 
 FIRST_SAMPLES = 32  # per lane, before the first look at the error
-LAUNCH_SECONDS = 0.5  # launches are kept this short, for the progress bar and Ctrl-C
+MOST_AT_FIRST = 2**23  # pairs of a path and a laser point in the first launch, whose speed is not known
 DEFAULT_TARGET = 0.01  # where neither an error nor samples are asked for
 SETTLED_SHARE = 0.9  # of the target error: the pilot's estimate has an error of its own
 PILOT_ERROR = 1.5  # times the goal: when a pilot has seen enough. Low-discrepancy numbers beat the 1 / sqrt(N) beyond
 PILOT_LANES = 512
 
-Progress = Callable[[float], None]
 Launch = Callable[[DeviceHistogram, LaneRandomness, int], LaneRandomness]
 
 
@@ -66,7 +67,7 @@ def accumulate(
     seed: int,
     launch: Launch,
     schedule: Schedule,
-    progress: Progress,
+    passes: Passes,
     scale: float = 1.0,
     slots: range | None = None,
     kernel: TemporalKernel | None = None,
@@ -83,8 +84,8 @@ def accumulate(
         Of the render.
     launch
         Traces so many more paths per lane into a histogram and returns the advanced random state.
-    schedule, progress
-        How many, and whom to tell the share of the work done.
+    schedule, passes
+        How many; who is told how far it is between two launches, and may have kept a state to go on from.
     scale
         What sums are multiplied by.
     slots
@@ -93,21 +94,35 @@ def accumulate(
         As for ``DeviceHistogram``.
     """
     histogram = DeviceHistogram(shape, kernel)
-    randomness = lane_randomness(shape, points, seed)
-    begun, done, compile_seconds = time.perf_counter(), 0, 0.0
+    if (earlier := passes.resumed("sums")) is None:
+        randomness = lane_randomness(shape, points, seed)
+        done, before = 0, 0.0
+    else:
+        histogram.sums = on_device(mi.Float64, earlier.arrays["sums"])
+        randomness = LaneRandomness.restored(earlier)
+        done, before = earlier.numbers["done"], earlier.numbers["seconds"]
+        schedule.restore(earlier.numbers)
+    begun, compile_seconds, is_first = time.perf_counter() - before, 0.0, True
     while (more := schedule.next_samples(done, time.perf_counter() - begun)) > 0:
         launched = time.perf_counter()
         randomness = launch(histogram, randomness, more)
         dr.sync_thread()
         seconds = time.perf_counter() - launched
-        if done == 0:
+        if is_first:
             compile_seconds = seconds  # the first launch is small: nearly all of it is compilation
         else:
             schedule.speed = more / max(seconds, 1e-6)
-        done += more
+        done, is_first = done + more, False
         if schedule.wants_error(done):
             schedule.record_error(done, histogram.relative_error(done, schedule.known_squares))
-        progress(schedule.fraction(done, time.perf_counter() - begun))
+        seconds = time.perf_counter() - begun
+
+        def take(random: LaneRandomness = randomness, done: int = done, seconds: float = seconds) -> Snapshot:
+            own = random.snapshot()
+            numbers = {"done": done, "seconds": seconds, **own.numbers, **schedule.numbers()}
+            return Snapshot({"sums": np.asarray(histogram.sums.numpy()), **own.arrays}, numbers)
+
+        passes.between(schedule.fraction(done, seconds), take)
     mean, variance = histogram.statistics(done, scale, slots)
     dr.eval(mean, variance)
     return Sampled(histogram.on_host(mean), histogram.on_host(variance), done, compile_seconds)
@@ -151,19 +166,36 @@ def settled_by_pilot(
 class Schedule:
     """How many samples each launch takes. Only the last launches depend on time, and only with a time limit."""
 
-    def __init__(self, budget: Budget, replicas: int, known_squares: float):
+    def __init__(self, budget: Budget, replicas: int, known_squares: float, lanes: int = 1):
         self.budget, self.known_squares = budget, known_squares
+        self.lanes = lanes  # times the laser points that each path is connected to
         self.limit = math.ceil(budget.spp / replicas) if budget.spp is not None else None
         self.errors: list[tuple[int, float]] = []  # (samples per lane, relative L2 error)
         self.speed = math.inf  # samples per lane and second
         self.stage = range(0)  # samples that are going to be complete, whatever the launches
         self._next_look = FIRST_SAMPLES
 
+    def numbers(self) -> dict[str, object]:
+        """Return what has been found out, as JSON can hold it."""
+        speed = self.speed if math.isfinite(self.speed) else None
+        return {"errors": [list(error) for error in self.errors], "speed": speed, "next_look": self._next_look}
+
+    def restore(self, numbers: Mapping[str, Any]) -> None:
+        """Go on where the ``numbers`` of an earlier schedule leave off."""
+        self.errors = [(done, error) for done, error in numbers["errors"]]
+        # of another machine, maybe: the first launch is a small one again
+        self.speed = (numbers["speed"] or 1.0) / 4
+        self._next_look = numbers["next_look"]
+        if "stage" in numbers:
+            self.stage = range(*numbers["stage"])
+
     def next_samples(self, done: int, seconds: float) -> int:
         """Return the samples per lane of the next launch; 0 when the budget is met."""
         budget = self.budget
         if done == 0:
             first = min(FIRST_SAMPLES, self.limit or FIRST_SAMPLES)
+            if self.limit is not None or budget.time_limit_s is not None:  # what a launch takes changes no result
+                first = max(1, min(first, MOST_AT_FIRST // self.lanes))
             self.stage = range(first if budget.time_limit_s is not None or self.limit is None else self.limit)
             return first
         if budget.time_limit_s is not None and seconds >= budget.time_limit_s:
@@ -176,7 +208,7 @@ class Schedule:
             goal = self._next_look
         else:
             goal = done * 2
-        launch = max(1.0, self.speed * LAUNCH_SECONDS)
+        launch = max(1.0, self.speed * PASS_SECONDS)
         if budget.time_limit_s is not None:
             launch = min(launch, max(1.0, self.speed * (budget.time_limit_s - seconds)))
         more = int(min(goal - done, launch if math.isfinite(launch) else 4 * done))

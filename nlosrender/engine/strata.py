@@ -22,6 +22,7 @@ class Strata:
 
     at: mi.UInt64  # its upper 32 bits are the next path's first coordinate
     stride: mi.UInt64  # from path to path, opaque
+    stage: range = range(0)  # numbers of the paths
 
     @classmethod
     def of_stage(cls, stage: range, start: mi.UInt32) -> Strata:
@@ -34,11 +35,20 @@ class Strata:
         start
             Random 32-bit integers, one per lane.
         """
-        stride = min(2**64 // max(len(stage), 1), 2**64 - 1)
+        stride = _stride(stage)
         place = mi.UInt64(start + mi.UInt32(stage.start * GOLDEN % 2**32))
         at = place * mi.UInt64(stride >> 32)
         dr.eval(at)
-        return cls(at, dr.opaque(mi.UInt64, stride))
+        return cls(at, dr.opaque(mi.UInt64, stride), stage)
+
+    @classmethod
+    def within_stage(cls, stage: range, at: mi.UInt64) -> Strata:
+        """Return the strata of a stage of which some paths are traced: ``at`` is where the lanes are."""
+        return cls(at, dr.opaque(mi.UInt64, _stride(stage)), stage)
+
+
+def _stride(stage: range) -> int:
+    return min(2**64 // max(len(stage), 1), 2**64 - 1)
 
 
 def first_coordinate(at: mi.UInt64) -> mi.UInt32:

@@ -6,11 +6,14 @@ from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from nlosrender.capture.bounces import FIRST_BOUNCE, THIRD_BOUNCE, BounceAxis
 from nlosrender.engine.deadline import Deadline
-from nlosrender.engine.device_arrays import WallPoints
+from nlosrender.engine.device_arrays import WallPoints, on_device
 from nlosrender.engine.hidden_box import HiddenBox
+from nlosrender.engine.passes import Snapshot
+from nlosrender.engine.strata import Strata
 from nlosrender.engine.surface_sampler import SurfaceSampler
 from nlosrender.scene.build import BuiltScene
 
@@ -91,6 +94,32 @@ class LaneRandomness:
     generator: mi.PCG32
     sequence: list[mi.UInt32]  # low-discrepancy state, three dimensions
     turn: mi.UInt32 | None = None  # paths until the next one that goes on beyond the third bounce
+    strata: Strata | None = None  # of the stage of paths that is under way
+
+    def snapshot(self) -> Snapshot:
+        """Return the state as arrays on the host."""
+        arrays = {"state": self.generator.state, "inc": self.generator.inc}
+        arrays |= {f"sequence{k}": state for k, state in enumerate(self.sequence)}
+        numbers: dict[str, object] = {}
+        if self.turn is not None:
+            arrays["turn"] = self.turn
+        if self.strata is not None:
+            arrays["at"] = self.strata.at
+            numbers["stage"] = [self.strata.stage.start, self.strata.stage.stop]
+        return Snapshot({name: np.asarray(values.numpy()) for name, values in arrays.items()}, numbers)
+
+    @classmethod
+    def restored(cls, snapshot: Snapshot) -> LaneRandomness:
+        """Undo ``snapshot``."""
+        arrays = snapshot.arrays
+        generator = mi.PCG32(len(arrays["state"]))
+        generator.state, generator.inc = (on_device(mi.UInt64, arrays[name]) for name in ("state", "inc"))
+        sequence = [on_device(mi.UInt32, arrays[f"sequence{k}"]) for k in range(3)]
+        turn = on_device(mi.UInt32, arrays["turn"]) if "turn" in arrays else None
+        strata = None
+        if "at" in arrays:
+            strata = Strata.within_stage(range(*snapshot.numbers["stage"]), on_device(mi.UInt64, arrays["at"]))
+        return cls(generator, sequence, turn, strata)
 
     @classmethod
     def seeded(cls, seed: int, lane_key: mi.UInt32) -> LaneRandomness:

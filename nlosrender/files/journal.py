@@ -64,7 +64,7 @@ class Journal:
         OSError
             The disk is full, or gone; the record does not count.
         """
-        line = _line(record)
+        line = line_of(record)
         written = 0
         while written < len(line):  # the system may take less than it is given, as the disk fills
             written += os.pwrite(self._descriptor, line[written:], self._end + written)
@@ -126,9 +126,19 @@ def _locked(path: Path) -> int:
         os.close(descriptor)
 
 
-def _line(record: Mapping[str, Any]) -> bytes:
+def line_of(record: Mapping[str, Any]) -> bytes:
+    """Return a record as a line."""
     text = json.dumps(record, separators=(",", ":"), allow_nan=False).encode()
     return b"%08x %s\n" % (zlib.crc32(text), text)
+
+
+def record_of(line: bytes) -> dict[str, Any] | None:
+    """Undo ``line_of``; None: the line is not whole."""
+    checksum, _, text = line.partition(b" ")
+    if not text.endswith(b"\n") or checksum != b"%08x" % zlib.crc32(text[:-1]):
+        return None
+    record: dict[str, Any] = json.loads(text)
+    return record
 
 
 def _up_to_last_line(path: Path, start: int) -> int:
@@ -146,7 +156,6 @@ def _lines(path: Path) -> Iterator[tuple[dict[str, Any], int]]:
     """Yield (record, length of its line) up to the first line that is not whole."""
     with path.open("rb") as stream:
         for line in stream:
-            checksum, _, text = line.partition(b" ")
-            if not text.endswith(b"\n") or checksum != b"%08x" % zlib.crc32(text[:-1]):
+            if (record := record_of(line)) is None:
                 return
-            yield json.loads(text), len(line)
+            yield record, len(line)

@@ -23,6 +23,7 @@ from types import TracebackType
 from typing import Any
 
 from nlosrender.config.canonical import tree_hash
+from nlosrender.engine.passes import Kept
 from nlosrender.errors import FileError
 from nlosrender.files.capture_file import CaptureHeader
 from nlosrender.files.header_writer import root_attributes
@@ -50,6 +51,7 @@ from nlosrender.files.unit_log import (
     unit_record,
     units_of,
 )
+from nlosrender.files.unit_state import PREFIX, has_states, read_state, state_path, write_state
 from nlosrender.interruption import uninterrupted
 
 JOURNAL = "journal"
@@ -61,7 +63,8 @@ class PartialCapture:
     """The unfinished render of one output; made by ``claim``, a context manager.
 
     Leaving the block gives the output free for others. What was finished but not published is kept, so that the same
-    render can go on; where nothing was finished, nothing is left.
+    render can go on, and so is the state of a unit in flight, in a file of its own; where there is neither, nothing is
+    left.
     """
 
     def __init__(self, path: Path, target: Path, journal: Journal):
@@ -176,6 +179,8 @@ class PartialCapture:
                     "machine": socket.gethostname(),
                 }
             )
+            with explained_write(self.path):  # without a finished unit it means nothing
+                self._samples().unlink(missing_ok=True)
             self._sink = create()
             return
         self._rebuild(create)
@@ -213,7 +218,41 @@ class PartialCapture:
             writing += time.perf_counter() - packed
         self._note(unit_record(self._state.generation, unit, stored, sums))
         self.tally.add(unit, stored, sums)
+        with suppress(OSError):
+            state_path(self.folder, unit).unlink(missing_ok=True)
         return time.perf_counter() - begun - writing, writing
+
+    @property
+    def has_states(self) -> bool:
+        """Whether there is a state of a unit in flight."""
+        return has_states(self.folder)
+
+    @property
+    def is_resumable(self) -> bool:
+        """Whether a later render can go on with something: finished units, or a state of one in flight."""
+        return bool(self.tally.units) or self.has_states
+
+    def keep_state(self, unit: UnitKey, budget: Mapping[str, Any], kept: Kept) -> None:
+        """Write what there is of a unit in flight, instead of what was written of it before.
+
+        Parameters
+        ----------
+        unit, budget
+            What is rendered, until when; plain JSON values.
+        kept
+            The state.
+
+        Raises
+        ------
+        FileError
+            The disk refuses.
+        """
+        with uninterrupted(), explained_write(self.path):
+            write_state(state_path(self.folder, unit), self._tag(budget), kept)
+
+    def kept_state(self, unit: UnitKey, budget: Mapping[str, Any]) -> Kept | None:
+        """Return what an earlier render has kept of a unit with the same budget, if it is whole."""
+        return read_state(state_path(self.folder, unit), self._tag(budget))
 
     def publish(self, attributes: Mapping[str, object]) -> None:
         """Complete the file with its last attributes and put it in place.
@@ -263,7 +302,8 @@ class PartialCapture:
             return UnfinishedRender()
 
     def _begin(self, identity: dict[str, Any], resume: bool | None) -> None:
-        exists = bool(self.tally.units) and self._samples().exists()
+        is_begun = self.has_states and bool(self._state.first)
+        exists = self._samples().exists() if self.tally.units else is_begun
         if resume is True and not exists:
             hint = " It is complete: leave out --resume to render it again." if self.target.exists() else ""
             hint = f" {self._journal.path} is damaged: leave out --resume to begin anew." if self.damage else hint
@@ -276,7 +316,7 @@ class PartialCapture:
         if not exists or resume is False:
             with explained_write(self.path):
                 self._journal.clear()
-                for leftover in self.folder.glob("samples.*"):
+                for leftover in (*self.folder.glob("samples.*"), *self.folder.glob(f"{PREFIX}*")):
                     leftover.unlink()
             self._state = UnfinishedRender()
             if resume is False:
@@ -346,9 +386,12 @@ class PartialCapture:
     def _leave(self) -> None:
         """Close what is open and give the output free; keep what is finished."""
         with uninterrupted():
-            if not self.tally.units:
+            if not self.is_resumable:
                 self.discard()
                 return
+            if self._sink is not None and not self.tally.units:
+                self._sink.abandon()  # it is begun anew
+                self._sink = None
             if self._sink is not None:
                 try:
                     self._sink.close()
@@ -364,6 +407,9 @@ class PartialCapture:
         chunks = (chunk for _, chunks, _ in self._stored_units() for chunk in chunks)
         with stored_bytes(self._samples()) as stored:
             return closing_record(stored.closing(chunks))
+
+    def _tag(self, budget: Mapping[str, Any]) -> str:
+        return tree_hash({"identity": self._identity, "budget": dict(budget)})
 
     def _note(self, record: Mapping[str, Any], *, durable: bool = False) -> None:
         with uninterrupted(), explained_write(self.path):

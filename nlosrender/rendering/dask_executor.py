@@ -5,6 +5,7 @@ dask hands out the units, and hands out again those of workers that die; here th
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Iterator, Sequence
 from concurrent.futures import CancelledError
@@ -28,6 +29,7 @@ if TYPE_CHECKING:
 
     from nlosrender.engine.path_engine import Budget
 
+STOP_SECONDS = 20.0  # that units in flight have after a signal: a batch system waits 30 s before it kills
 PER_WORKER = 2  # units on the way for each worker: the one it renders, and the next or the last
 LOOK_SECONDS = 0.02  # between two looks at what has come, and at the signals
 WORKER_LOOK_SECONDS = 5.0  # between two looks at whether there are workers at all
@@ -58,7 +60,7 @@ def render_on_cluster(
     partial
         Where they go; open.
     stop
-        When it comes no more units are begun; those that are being rendered are waited for.
+        When it comes no more units are begun; those that are being rendered have ``STOP_SECONDS``.
     cluster
         Who renders.
     store_variance
@@ -118,6 +120,7 @@ class _Flight:
         self._job = job
         self._out: dict[Future, None] = {}  # the oldest first: the order in which they are begun
         self._recalled = False
+        self._given_up_at = math.inf  # s of the monotonic clock, after a stop
 
     def arrivals(self, stop: StopRequest, warn: Warn) -> Iterator[PackedUnit]:
         """Yield units as they come; after a stop only those that were begun."""
@@ -129,8 +132,14 @@ class _Flight:
             self._top_up(flying)
         while not flying.is_empty():
             if stop.came and not self._recalled:
-                warn(f"{stop.signal_name}: finishing the units in flight; once more stops at once.")
+                warn(
+                    f"{stop.signal_name}: the units in flight have {STOP_SECONDS:g} s to be finished; once more stops "
+                    "at once."
+                )
                 self._recall()
+                self._given_up_at = time.monotonic() + STOP_SECONDS
+            if time.monotonic() > self._given_up_at:
+                return
             if time.monotonic() - looked > WORKER_LOOK_SECONDS:
                 looked = time.monotonic()
                 if not self._client.scheduler_info()["workers"]:

@@ -9,11 +9,13 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from nlosrender.capture.plan import Unit
+from nlosrender.engine.passes import Passes
 from nlosrender.errors import FileError, IncompleteRender, InterruptedRender, RenderError
 from nlosrender.files.partial_capture import PartialCapture
 from nlosrender.files.sums import Sums
 from nlosrender.interruption import StopRequest, stop_request
 from nlosrender.rendering.report import Progress, Standing, Stopwatch, Warn, Watch
+from nlosrender.rendering.unit_in_flight import UnitInFlight, UnitStopped
 from nlosrender.rendering.units import RenderedUnit, UnitWriter, finished_unit, render_unit
 
 if TYPE_CHECKING:
@@ -38,7 +40,7 @@ def resumable(partial: PartialCapture) -> Iterator[StopRequest]:
     except KeyboardInterrupt as error:
         raise InterruptedRender(f"{partial.path}: interrupted{kept(partial)}") from error
     except FileError as error:
-        if not partial.tally.units:
+        if not partial.is_resumable:
             raise
         raise IncompleteRender(f"{error} The render stopped{kept(partial)}") from error
     except RenderError:
@@ -70,7 +72,7 @@ def render_units(
     partial
         Where they go; open.
     stop
-        Looked at after every unit.
+        Looked at between passes: a unit that takes long is kept as it is.
     store_variance
         Whether the file has the variance.
     stopwatch, progress, warn, watch
@@ -99,18 +101,28 @@ def render_units(
             def told(share: float, done: int = earlier + number) -> None:
                 progress((done + share) / total)
                 if stop.came:
-                    warn(f"{stop.signal_name}: finishing the unit in flight; once more stops at once.")
+                    warn(
+                        f"{stop.signal_name}: the unit in flight is finished, or kept as it is after a few seconds; "
+                        "once more stops at once."
+                    )
 
-            finished = rendered(engine, unit, replace(budget, time_limit_s=limit), store_variance, stopwatch, told)
+            own_budget = replace(budget, time_limit_s=limit)
+            flight = UnitInFlight(partial, unit, own_budget, stop, told, warn)
+            finished = rendered(
+                engine, unit, own_budget, store_variance, stopwatch, flight.passes, flight.earlier_seconds
+            )
+            spent += flight.earlier_seconds
             so_far += finished.sums
             writer.store(finished)
-            del finished  # its arrays are the writer's now
+            del finished, flight  # its arrays are the writer's now
             told(1.0)
             watch(standing(so_far, earlier + number + 1, total))
             if stop.came and number + 1 < len(units):
-                writer.wait()
-                raise InterruptedRender(f"{partial.path}: stopped by {stop.signal_name}{kept(partial, total)}")
+                raise UnitStopped
         writer.wait()
+    except UnitStopped as stopped:
+        writer.wait()
+        raise InterruptedRender(f"{partial.path}: stopped by {stop.signal_name}{kept(partial, total)}") from stopped
     finally:
         writer.close()
 
@@ -121,18 +133,21 @@ def rendered(
     budget: Budget,
     store_variance: bool,
     stopwatch: Stopwatch,
-    progress: Progress = lambda share: None,
+    passes: Passes | None = None,
+    earlier_seconds: float = 0.0,
 ) -> RenderedUnit:
     """Render a unit; the engine's own arrays are gone when this returns.
 
     Parameters
     ----------
-    engine, unit, budget, progress
+    engine, unit, budget, passes
         As for ``render_unit``.
     store_variance
         Whether the file has the variance.
     stopwatch
         Told the seconds.
+    earlier_seconds
+        Spent on the unit by an earlier render.
 
     Raises
     ------
@@ -140,12 +155,13 @@ def rendered(
         The result is not finite.
     """
     compiled, begun = engine.compile_seconds, time.perf_counter()
-    histogram = render_unit(engine, unit, budget, progress)
+    histogram = render_unit(engine, unit, budget, passes or Passes())
     seconds = time.perf_counter() - begun
     compiled = engine.compile_seconds - compiled
     stopwatch.seconds["compile"] += compiled
     stopwatch.seconds["render"] += seconds - compiled
     confocal = engine.capture.scan_type == "confocal"
+    seconds += earlier_seconds
     return finished_unit(unit, histogram, confocal=confocal, store_variance=store_variance, seconds=seconds)
 
 
@@ -157,7 +173,8 @@ def standing(sums: Sums, done: int, total: int) -> Standing:
 def kept(partial: PartialCapture, total: int | None = None) -> str:
     """Return the end of a sentence: what is saved, of ``total`` units."""
     finished = len(partial.tally.units)
-    if not finished:
+    if not partial.is_resumable:
         return " before anything was finished; nothing is kept."
     of_all = "" if total is None else f" of {total}"
-    return f"; {finished}{of_all} units are finished and saved. The same command goes on from there."
+    begun = ", and so is what was done of the one in flight" if partial.has_states else ""
+    return f"; {finished}{of_all} units are finished and saved{begun}. The same command goes on from there."

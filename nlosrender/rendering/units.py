@@ -5,19 +5,19 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from nlosrender.capture.plan import Unit
+from nlosrender.engine.passes import Passes, Snapshot
 from nlosrender.files import layout
 from nlosrender.files.partial_capture import PartialCapture
 from nlosrender.files.pieces import Cutter, PackedChunk, packed_chunks
 from nlosrender.files.sums import Sums, sums_of
 from nlosrender.interruption import uninterrupted
-from nlosrender.rendering.report import Progress, Stopwatch
+from nlosrender.rendering.report import Stopwatch
 
 if TYPE_CHECKING:
     from nlosrender.engine.engines import Engine
@@ -25,15 +25,15 @@ if TYPE_CHECKING:
     from nlosrender.engine.path_engine import Budget
 
 
-def render_unit(engine: Engine, unit: Unit, budget: Budget, progress: Progress = lambda share: None) -> Histogram:
+def render_unit(engine: Engine, unit: Unit, budget: Budget, passes: Passes) -> Histogram:
     """Render one unit: everything that is needed to do so in another process.
 
     Parameters
     ----------
     engine, unit, budget
         What to render, and when to stop.
-    progress
-        Told the share of the unit that is done.
+    passes
+        Told the share of the unit that is done, and asked for what an earlier render has kept of it.
 
     Returns
     -------
@@ -45,15 +45,34 @@ def render_unit(engine: Engine, unit: Unit, budget: Budget, progress: Progress =
     RenderError
         The result is not finite.
     """
-    if len(unit.batches) == 1:
-        return engine.render(unit.batches[0], budget, progress)
-    limit = budget.time_limit_s
-    share_of = replace(budget, time_limit_s=None if limit is None else limit / len(unit.batches))
-    pieces = [
-        engine.render(batch, share_of, partial(_within, progress, number, len(unit.batches)))
-        for number, batch in enumerate(unit.batches)
-    ]
+    limit, count = budget.time_limit_s, len(unit.batches)
+    if count == 1:
+        part = passes.stage("batch 0")
+        whole = engine.render(unit.batches[0], budget, part)
+        part.finish(Snapshot())  # its parts are no longer needed
+        return whole
+    share_of = replace(budget, time_limit_s=None if limit is None else limit / count)
+    pieces = []
+    for number, batch in enumerate(unit.batches):
+        part = passes.stage(f"batch {number}", number / count, (number + 1) / count)
+        if (earlier := part.resumed("mean")) is not None:  # the whole batch was done
+            piece = _histogram(earlier)
+        else:
+            piece = engine.render(batch, share_of, part)
+        part.finish(_snapshot(piece))
+        pieces.append(piece)
     return joined_histogram(unit, pieces)
+
+
+def _snapshot(histogram: Histogram) -> Snapshot:
+    arrays = {name: getattr(histogram, name) for name in ("mean", "variance", "outside")}
+    return Snapshot(arrays, {"samples": histogram.samples})
+
+
+def _histogram(kept: Snapshot) -> Histogram:
+    from nlosrender.engine.histogram import Histogram
+
+    return Histogram(kept.arrays["mean"], kept.arrays["variance"], kept.arrays["outside"], kept.numbers["samples"])
 
 
 def joined_histogram(unit: Unit, pieces: list[Histogram]) -> Histogram:
@@ -188,7 +207,3 @@ class UnitWriter:
         packing, writing = self._capture.store((unit.sensors, unit.lasers), chunks, rendered.sums)
         self._stopwatch.seconds["compress"] += packing
         self._stopwatch.seconds["write"] += writing
-
-
-def _within(progress: Progress, number: int, count: int, share: float) -> None:
-    progress((number + share) / count)

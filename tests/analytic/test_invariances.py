@@ -77,7 +77,7 @@ def test_cutting_a_render_into_launches_changes_no_bit(
     # loaded by the render above, once the backend had been started
     sampling = sys.modules["nlosrender.engine.sampling"]
     monkeypatch.setattr(sampling, "FIRST_SAMPLES", 3)
-    monkeypatch.setattr(sampling, "LAUNCH_SECONDS", 1e-9)  # one sample per lane and launch
+    monkeypatch.setattr(sampling, "PASS_SECONDS", 1e-9)  # one sample per lane and launch
     assert_same(usual, render(config, hidden_fraction=hidden_fraction))
 
 

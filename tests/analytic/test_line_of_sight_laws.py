@@ -109,7 +109,7 @@ def test_samples_of_a_launch_all_count(monkeypatch: pytest.MonkeyPatch) -> None:
 
     long = see(crowded())
     monkeypatch.setattr(sampling, "FIRST_SAMPLES", 3)
-    monkeypatch.setattr(sampling, "LAUNCH_SECONDS", 1e-9)
+    monkeypatch.setattr(sampling, "PASS_SECONDS", 1e-9)
     assert np.array_equal(long.mean, see(crowded()).mean)
 
 
@@ -123,6 +123,7 @@ def test_target_error_is_met() -> None:
 @pytest.mark.parametrize(
     ("content", "message"),
     [
+        ("<shape type='sphere'><float name='nonsense' value='1'/></shape>", "nonsense"),
         ("<shape type='ply'><string name='filename' value='damaged.ply'/></shape>", "damaged.ply"),
         ("<shape type='sphere'><ref id='nobody'/></shape>", "nobody"),
         (

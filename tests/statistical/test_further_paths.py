@@ -118,7 +118,7 @@ def test_launches_and_batches_do_not_show(hidden_fraction: float, monkeypatch: p
     whole = render(config, **options)
     parts = render(config, batch_bytes=40_000, **options)
     assert len(parts.plan.batches) > 1
-    monkeypatch.setattr(sampling, "LAUNCH_SECONDS", TINY_LAUNCHES)
+    monkeypatch.setattr(sampling, "PASS_SECONDS", TINY_LAUNCHES)
     pieces = render(config, **options)
     assert whole.bounce(4).sum() > 0
     for other in (parts, pieces):

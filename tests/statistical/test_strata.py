@@ -84,7 +84,7 @@ def test_launches_do_not_show(max_bounces: int, monkeypatch: pytest.MonkeyPatch)
     plan, engine = path_engine(flat_wall(PLATE, BEHIND, max_bounces=max_bounces))
     budget = Budget(spp=165 * engine.options.replicas)  # the first two launches take 32 and 128
     whole = engine.render(plan.batches[0], budget)
-    monkeypatch.setattr(sampling, "LAUNCH_SECONDS", TINY_LAUNCHES)
+    monkeypatch.setattr(sampling, "PASS_SECONDS", TINY_LAUNCHES)
     pieces = engine.render(plan.batches[0], budget)
     assert whole.mean.sum() > 0
     for name in ("mean", "variance", "outside"):

@@ -19,11 +19,11 @@ from nlosrender.engine.line_of_sight.transport import (
     crosses_rough_surfaces,
     view_transport,
 )
+from nlosrender.engine.passes import Passes
 from nlosrender.engine.path_engine import PathOptions
 from nlosrender.engine.pilot import Pilot, pilot_of
 from nlosrender.engine.sampling import (
     Budget,
-    Progress,
     Sampled,
     Schedule,
     accumulate,
@@ -83,13 +83,13 @@ class LineOfSightEngine:
         return HistogramShape(options.replicas, batch.sensors.size, 1, slots, options.channels, self.time_axis.n_bins)
 
     def render(
-        self, batch: Batch, budget: Budget, progress: Progress = lambda fraction: None, known_squares: float = 0.0
+        self, batch: Batch, budget: Budget, passes: Passes | None = None, known_squares: float = 0.0
     ) -> Histogram:
         """Render one batch.
 
         Parameters
         ----------
-        batch, budget, progress, known_squares
+        batch, budget, passes, known_squares
             As for the path engine.
 
         Returns
@@ -107,8 +107,8 @@ class LineOfSightEngine:
             raise RenderError(
                 f"a batch of {shape.size:.2e} sums is more than 32-bit indices reach; lower render.memory_limit"
             )
-        schedule = Schedule(budget, shape.replicas, known_squares)
-        sampled = self._accumulate(batch, shape, schedule, progress)
+        schedule = Schedule(budget, shape.replicas, known_squares, shape.lanes)
+        sampled = self._accumulate(batch, shape, schedule, passes or Passes())
         mean, variance = sampled.mean, sampled.variance
         if not (np.isfinite(mean).all() and np.isfinite(variance).all()):
             raise RenderError("the line-of-sight engine produced a value that is not finite; please report the scene")
@@ -129,20 +129,18 @@ class LineOfSightEngine:
         shape = replace(self.shape(pilot, self.n_slots), replicas=replicas)
 
         def look(schedule: Schedule) -> int:
-            return self._accumulate(pilot, shape, schedule, lambda share: None).per_lane
+            return self._accumulate(pilot, shape, schedule, Passes()).per_lane
 
         return settled_by_pilot(budget, replicas, look, known_squares)
 
-    def _accumulate(
-        self, batch: Batch | Pilot, shape: HistogramShape, schedule: Schedule, progress: Progress
-    ) -> Sampled:
+    def _accumulate(self, batch: Batch | Pilot, shape: HistogramShape, schedule: Schedule, passes: Passes) -> Sampled:
         pixels = np.array(batch.sensors.flat_indices(self.capture.sensor_grid.nx), dtype=np.uint32)
         transport = view_transport(self.built, self.capture, self.time_axis, pixels, shape.lanes)
 
         def launch(histogram: DeviceHistogram, randomness: LaneRandomness, more: int) -> LaneRandomness:
             return self._launch(transport, histogram, randomness, more)
 
-        sampled = accumulate(shape, pixels, self.options.seed, launch, schedule, progress, self.scale)
+        sampled = accumulate(shape, pixels, self.options.seed, launch, schedule, passes, self.scale)
         self.compile_seconds += sampled.compile_seconds
         return sampled
 

@@ -7,7 +7,6 @@ import time
 from dataclasses import replace
 from functools import cached_property
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 
@@ -15,10 +14,12 @@ from nlosrender.capture.bounces import THIRD_BOUNCE
 from nlosrender.capture.grids import Capture
 from nlosrender.capture.plan import Batch
 from nlosrender.capture.time_axis import TimeAxis
+from nlosrender.engine.device_arrays import on_device
 from nlosrender.engine.histogram import Histogram
+from nlosrender.engine.passes import Passes, Snapshot
 from nlosrender.engine.path_engine import PathEngine, PathOptions
 from nlosrender.engine.pilot import Pilot, pilot_of
-from nlosrender.engine.sampling import DEFAULT_TARGET, Budget, Progress
+from nlosrender.engine.sampling import DEFAULT_TARGET, Budget
 from nlosrender.engine.virtual_lights.further_bounces import (
     SHARES_OF_THIRD,
     SQUARES,
@@ -173,22 +174,21 @@ class VirtualLightEngine:
         is_far = nearest > 2 * self.tessellator.reach / FEW_SENSORS
         return pilot_of(self.capture, FEW_SENSORS) if is_far else pilot
 
-    def render(self, batch: Batch, budget: Budget, progress: Progress = lambda fraction: None) -> Histogram:
+    def render(self, batch: Batch, budget: Budget, passes: Passes | None = None) -> Histogram:
         """Render one batch; as ``PathEngine.render``, whose errors it raises.
 
         The variance of the third bounce is the square of its estimated discretisation error.
         """
-        begun = time.perf_counter()
+        begun, passes = time.perf_counter(), passes or Passes()
         budget = self.settle(budget)
         fineness = budget.fineness or FIRST_COARSENESS
-        coarse, fine = self.third.pair(batch, fineness)
-        progress(0.5 if self.has_further_bounces else 1.0)
+        shared = 0.5 if self.has_further_bounces else 1.0
+        coarse, fine = self.third.pair(batch, fineness, passes.stage("third bounce", 0, shared))
         left = budget.time_limit_s
         if left is not None:
             left = max(0.0, left - (time.perf_counter() - begun))
-        result = self._further_bounces(
-            batch, replace(budget, time_limit_s=left), fine, lambda share: progress((1 + share) / 2)
-        )
+        rest = passes.stage("further bounces", shared, 1)
+        result = self._further_bounces(batch, replace(budget, time_limit_s=left), fine, rest)
         if self.misses_light:
             np.add(result.variance, np.square(MISSED * result.mean), out=result.variance)
         slot, scale = self.options.bounces.slot(THIRD_BOUNCE), self.paths.scale
@@ -203,18 +203,25 @@ class VirtualLightEngine:
             raise RenderError("the gather produced a value that is not finite; please report the configuration")
         return result
 
-    def _further_bounces(self, batch: Batch, budget: Budget, third: Gathered, progress: Progress) -> Histogram:
+    def _further_bounces(self, batch: Batch, budget: Budget, third: Gathered, passes: Passes) -> Histogram:
         if self.further is None:
             known_squares = third.squares if self.has_further_bounces else 0.0
-            return self.paths.render(batch, budget, progress, known_squares=known_squares)
+            return self.paths.render(batch, budget, passes, known_squares=known_squares)
         known_squares = third.squares
         histogram = self.further.histogram(batch, self.options.replicas)
-        begun = time.perf_counter()
-        done = 0
+        done, skipped, before = 0, 0, 0.0
+        if (earlier := passes.resumed("sums")) is not None:
+            histogram.sums = on_device(mi.Float64, earlier.arrays["sums"])
+            done, skipped, before = (earlier.numbers[name] for name in ("done", "skipped", "seconds"))
+        begun, share = time.perf_counter() - before, 0.0
+
+        def told(skipped: int) -> None:
+            numbers = {"done": done, "skipped": skipped, "seconds": time.perf_counter() - begun}
+            passes.between(share, lambda: Snapshot({"sums": histogram.sums.numpy()}, numbers))
+
         while True:
-            self.further.accumulate(batch, histogram, done)
-            dr.sync_thread()
-            done += 1
+            self.further.accumulate(batch, histogram, done, told, skipped)
+            done, skipped = done + 1, 0
             if budget.rounds is not None:
                 share = done / budget.rounds
             else:
@@ -222,9 +229,9 @@ class VirtualLightEngine:
                 if budget.target_error is not None:
                     error = histogram.relative_error(done, known_squares) / (REST_OF_MANY * budget.target_error)
                     share = max(share, 1 / max(error, 1e-9) ** 2)
-            progress(min(share, 1.0))
             if share >= 1:
                 break
+            told(0)
         bounces = self.options.bounces
         first = bounces.slot(THIRD_BOUNCE + 1)
         statistics = histogram.statistics(done, self.paths.scale, range(-first, bounces.n_slots - first))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -14,6 +15,7 @@ from nlosrender.capture.bounces import THIRD_BOUNCE
 from nlosrender.capture.plan import Batch
 from nlosrender.engine.device_arrays import laser_points, on_device
 from nlosrender.engine.histogram import DeviceHistogram, HistogramShape
+from nlosrender.engine.passes import PassSize
 from nlosrender.engine.path_engine import PathEngine
 from nlosrender.engine.pilot import Pilot, spread
 from nlosrender.engine.transport import Transport
@@ -30,6 +32,7 @@ CONFOCAL_IMPULSES_PER_SITE = 2
 TRIED_PER_AXIS = 2  # laser points by which the vertices of walks are judged
 MOST_VALUES = 2**24  # impulses of a round times lasers, for memory
 WALKS_PER_SITE = (16, 64)  # walks are cheap beside the gather when many sensor points share them
+FIRST_PAIRS = 2**26  # of impulses with sensor and laser points in the first kernel, whose speed is not known
 MOST_ROUNDS = 2**20  # of a target that is out of reach
 # Of the target error: what the third bounce may take, and the squares of the third bounce and of the rest together.
 SHARES_OF_THIRD, SQUARES = (0.65, 0.5, 0.35), 0.9
@@ -116,8 +119,25 @@ class FurtherBounces:
         slots = bounces.n_slots - bounces.slot(THIRD_BOUNCE + 1) if bounces.split else 1
         return DeviceHistogram(replace(self.paths.shape(batch, slots), replicas=replicas))
 
-    def accumulate(self, batch: Batch | Pilot, histogram: DeviceHistogram, number: int) -> None:
-        """Add round ``number`` to ``histogram``; a round is the same for every batch of a capture."""
+    def accumulate(
+        self,
+        batch: Batch | Pilot,
+        histogram: DeviceHistogram,
+        number: int,
+        told: Callable[[int], None] = lambda done: None,
+        skipped: int = 0,
+    ) -> None:
+        """Add round ``number`` to ``histogram``; a round is the same for every batch of a capture.
+
+        Parameters
+        ----------
+        batch, histogram, number
+            What is rendered, where to; which round.
+        told
+            Called between kernels with the sites that every replica is done with.
+        skipped
+            Sites that every replica is done with already.
+        """
         shape = histogram.shape
         plan = self.plan(shape.replicas)
         if self.sampler.is_empty:
@@ -136,10 +156,22 @@ class FurtherBounces:
         slots = dr.full(mi.UInt32, 0, impulses.count) + slots
         dr.eval(slots)
         needs_visibility = self.clearances is not None
-        _gather_impulses(
-            transport, needs_visibility, self.is_confocal, outlook, table, impulses, slots, shape, histogram
-        )
-        dr.eval(histogram.sums)
+        longest = int(np.diff(np.array(table.first)).max())
+        pairs_per_step = shape.lanes * self.impulses_per_site * (shape.lasers + self.is_confocal)
+        size, done = PassSize(max(1, FIRST_PAIRS // pairs_per_step)), skipped
+        while done < longest:
+            steps = min(size.steps, longest - done)
+            cut = tuple(dr.opaque(mi.UInt32, count) for count in (done, steps))
+            size.begin()
+            _gather_impulses(
+                transport, needs_visibility, self.is_confocal, outlook, table, cut, impulses, slots, shape, histogram
+            )
+            dr.eval(histogram.sums)
+            dr.sync_thread()
+            size.end()
+            done += steps
+            if done < longest:
+                told(done)
 
     def _table(self, plan: WalkPlan, sites: Sites, impulses: Impulses, outlook: Outlook) -> SiteTable:
         used, starts = np.unique(impulses.sites, return_index=True)
@@ -165,12 +197,16 @@ def _gather_impulses(
     is_confocal: bool,
     outlook: Outlook,
     table: SiteTable,
+    cut: tuple[mi.UInt32, mi.UInt32],
     impulses: Impulses,
     slots: mi.UInt32,
     shape: HistogramShape,
     histogram: DeviceHistogram,
 ) -> None:
-    """Deposit what leaves the sites: lane by lane over the sites of its replica, site by site over the impulses."""
+    """Deposit what leaves the sites: lane by lane over the sites of its replica, site by site over the impulses.
+
+    Of the sites of a replica so many are skipped, and so many are gathered at most, as ``cut`` says (opaque).
+    """
     built, sensors = transport.built, transport.sensors
     sensor, wall_bsdf, context = sensors.interaction, built.wall_bsdf, mi.BSDFContext()
     lane = dr.arange(mi.UInt32, shape.lanes)
@@ -179,8 +215,8 @@ def _gather_impulses(
     count = dr.opaque(mi.UInt32, impulses.count)
     scale = transport.bins_per_unit
     own_laser = transport.lasers.gather(transport.first_laser)
-    site = dr.gather(mi.UInt32, table.first, replica)
-    end = dr.gather(mi.UInt32, table.first, replica + 1)
+    site = dr.gather(mi.UInt32, table.first, replica) + cut[0]
+    end = dr.minimum(dr.gather(mi.UInt32, table.first, replica + 1), site + cut[1])
     tile = outlook.tile_bit(mi.UInt32(0), sensor.p)
 
     while dr.hint(

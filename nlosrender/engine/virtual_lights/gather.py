@@ -27,8 +27,10 @@ def gather_third_bounce(
     lane: mi.UInt32,
     part: mi.UInt32,
     tile: mi.UInt64,
+    skipped: mi.UInt32,
+    most: mi.UInt32,
 ) -> None:
-    """Deposit the third bounce: lane by lane over the patches of its part.
+    """Deposit the third bounce: lane by lane over ``most`` patches of its part, after the first ``skipped`` ones.
 
     Several lanes may share the patches of one sensor point, each into rows of its own.
 
@@ -42,6 +44,8 @@ def gather_third_bounce(
         The part of ``lights`` that each lane gathers.
     tile
         The bit of the tile that its sensor point lies in, see ``Outlook``.
+    skipped, most
+        Opaque.
     """
     built, sensors = transport.built, transport.sensors
     sensor, wall_bsdf = sensors.interaction, built.wall_bsdf
@@ -52,7 +56,8 @@ def gather_third_bounce(
     end = dr.gather(mi.UInt32, lights.first, part + 1)
 
     # ---- State ---------------------------------------------------------------------------------------------------
-    patch = dr.gather(mi.UInt32, lights.first, part)
+    patch = dr.gather(mi.UInt32, lights.first, part) + skipped
+    end = dr.minimum(end, patch + most)
 
     while dr.hint(
         patch < end,

@@ -13,13 +13,14 @@ from numpy.typing import NDArray
 from nlosrender.capture.plan import Batch
 from nlosrender.engine.device_arrays import on_device
 from nlosrender.engine.histogram import HistogramShape, relative_l2_error
+from nlosrender.engine.passes import Passes, Snapshot
 from nlosrender.engine.path_engine import PathEngine
 from nlosrender.engine.pilot import Pilot
 from nlosrender.engine.transport import Transport
 from nlosrender.engine.virtual_lights.block_histogram import BlockHistogram
 from nlosrender.engine.virtual_lights.clearance import Clearances, Outlook, count_sensors
 from nlosrender.engine.virtual_lights.device_patches import Places, upload_patches
-from nlosrender.engine.virtual_lights.gather import gather_third_bounce
+from nlosrender.engine.virtual_lights.gather_passes import GatherPasses
 from nlosrender.engine.virtual_lights.lights import (
     ROWS,
     Clearing,
@@ -109,13 +110,17 @@ class ThirdBounce:
         self.clearances = Clearances(paths.built)
         self._kept: dict[float, Illuminated] = {}  # per coarseness
 
-    def gather(self, batch: Batch | Pilot, coarseness: float) -> Gathered:
+    def gather(self, batch: Batch | Pilot, coarseness: float, passes: Passes | None = None) -> Gathered:
         """Gather a batch at one resolution."""
+        passes = passes or Passes()
         patches = self.tessellator.patches(coarseness)  # made once: large ones are not kept
-        if self.is_reciprocal and isinstance(batch, Batch):
-            values = self._by_reciprocity(batch, coarseness, patches)
+        if (earlier := passes.resumed("values")) is not None:
+            values = earlier.arrays["values"]
+        elif self.is_reciprocal and isinstance(batch, Batch):
+            values = self._by_reciprocity(batch, coarseness, patches, passes)
         else:
-            values = self._sums(batch, coarseness, patches).on_host()
+            values = self._sums(batch, coarseness, patches, passes.stage("sums")).on_host()
+        passes.finish(Snapshot({"values": values}))
         # of the shared ones: how a capture is cut must not show in the error it states
         merged = float(patches.areas[patches.is_cluster].sum() / max(patches.areas.sum(), 1e-300))
         count = len(patches) if self.tessellator.regions is None else self.tessellator.count(coarseness)
@@ -125,24 +130,36 @@ class ThirdBounce:
         """Light patches anew from now on, as an engine would that has gathered nothing yet."""
         self._kept = {}
 
-    def _by_reciprocity(self, batch: Batch, coarseness: float, patches: Patches) -> NDArray[np.float64]:
+    def _by_reciprocity(self, batch: Batch, coarseness: float, patches: Patches, passes: Passes) -> NDArray[np.float64]:
         """Gather from every two points once: the one with the higher index stands for the sensor point.
 
         Whatever the batch, so that how a capture is cut does not show. A batch of other lasers than sensor points is
         gathered in two parts, the second with their roles exchanged.
         """
         sensors, lasers = self.paths.sensor_indices(batch), self.paths.laser_indices(batch)
-        sums = self._sums(batch, coarseness, patches, np.searchsorted(lasers, sensors, side="right"))
-        if np.array_equal(sensors, lasers):
-            return sums.on_host(is_symmetric=True)
-        values = sums.on_host()
+        is_symmetric = np.array_equal(sensors, lasers)
+        one = passes.stage("one way", 0, 1 if is_symmetric else 0.5)
+        if (earlier := one.resumed("values")) is not None:
+            values = earlier.arrays["values"]
+        else:
+            sums = self._sums(batch, coarseness, patches, one, np.searchsorted(lasers, sensors, side="right"))
+            if is_symmetric:
+                return sums.on_host(is_symmetric=True)
+            values = sums.on_host()
+        one.finish(Snapshot({"values": values}))
         exchanged = Batch(sensors=batch.lasers, lasers=batch.sensors)
-        others = self._sums(exchanged, coarseness, patches, np.searchsorted(sensors, lasers))
+        other = passes.stage("other way", 0.5, 1)
+        others = self._sums(exchanged, coarseness, patches, other, np.searchsorted(sensors, lasers))
         values += others.on_host().swapaxes(2, 3)
         return values
 
     def _sums(
-        self, batch: Batch | Pilot, coarseness: float, patches: Patches, lasers: NDArray[np.int64] | None = None
+        self,
+        batch: Batch | Pilot,
+        coarseness: float,
+        patches: Patches,
+        passes: Passes,
+        lasers: NDArray[np.int64] | None = None,
     ) -> BlockHistogram:
         """Gather the ``patches`` that all sensor points share, then what regions have of their own.
 
@@ -151,11 +168,12 @@ class ThirdBounce:
         shape = self.shape(batch)
         lanes = self._lanes(batch, shape, lasers)
         histogram = BlockHistogram(shape, lanes.order)
+        work = GatherPasses(self.settings, histogram, passes)
         if len(patches):
             outlook = self._outlook(batch)
             lights = self._shared_lights(lanes.transport, shape, coarseness, patches, outlook)
             tile = outlook.tile_bit(mi.UInt32(0), lanes.transport.sensors.interaction.p)
-            gather_third_bounce(self.settings, lanes.transport, lights, histogram, lanes.index, lanes.replica, tile)
+            work.gather(lanes.transport, lights, lanes.index, lanes.replica, tile)
         for labels, near in self.tessellator.regional_patches(coarseness, np.unique(lanes.regions).tolist()):
             places = Places.of([len(one) for one in near])
             if not len(places.numbers):  # nothing is close to the wall there
@@ -167,7 +185,7 @@ class ThirdBounce:
             illuminated = self._illuminate(some, shape, Patches.joined(near), places, outlook)
             lights = lights_of(self.settings, some, illuminated, shape.replicas, shape.lasers)
             tile = outlook.tile_bit(on_device(mi.UInt32, part // shape.replicas), some.sensors.interaction.p)
-            gather_third_bounce(self.settings, some, lights, histogram, index, on_device(mi.UInt32, part), tile)
+            work.gather(some, lights, index, on_device(mi.UInt32, part), tile)
         return histogram
 
     def lit_patches(self, batch: Batch | Pilot, coarseness: float) -> LitPatches:
@@ -214,9 +232,11 @@ class ThirdBounce:
         groups = [points[labels == label] for label in regions]
         return Outlook.around(groups, count_sensors(capture, batch) // len(self.tessellator.regions.near))
 
-    def pair(self, batch: Batch | Pilot, fineness: float) -> tuple[Gathered, Gathered]:
+    def pair(self, batch: Batch | Pilot, fineness: float, passes: Passes | None = None) -> tuple[Gathered, Gathered]:
         """Gather a batch at ``fineness`` and at the coarser resolution it is compared with."""
-        return self.gather(batch, self.coarser(fineness)), self.gather(batch, fineness)
+        passes = passes or Passes()
+        coarse = self.gather(batch, self.coarser(fineness), passes.stage("coarse", 0, 1 / (1 + REFINEMENT)))
+        return coarse, self.gather(batch, fineness, passes.stage("fine", 1 / (1 + REFINEMENT), 1))
 
     def settle(self, pilot: Pilot, target: float) -> tuple[float, Gathered]:
         """Return the fineness whose estimated error is at most ``target``, and the pilot's third bounce at it."""

@@ -1,0 +1,89 @@
+"""The unit that is being rendered: its state is kept on the disk now and then, and when the render has to stop."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import asdict
+from typing import TYPE_CHECKING, Any
+
+from nlosrender.capture.plan import Unit
+from nlosrender.engine.passes import Kept, Passes, Snapshot
+from nlosrender.errors import FileError
+from nlosrender.files.partial_capture import PartialCapture
+from nlosrender.interruption import StopRequest
+from nlosrender.rendering.report import Progress, Warn
+
+if TYPE_CHECKING:
+    from nlosrender.engine.path_engine import Budget
+
+KEEP_SECONDS = 30.0  # between two states, so that a kill costs no more than about a minute; quick units never keep one
+KEEP_COST = 0.1  # share of the time that keeping may take: states may have gigabytes
+SOON_SECONDS = 5.0  # a unit that ends so soon after a signal is finished
+OF_UNIT = "unit"  # stage of what is noted here
+
+
+class UnitStopped(Exception):
+    """A stop was requested, and the unit in flight has come to the end of a pass."""
+
+
+class UnitInFlight:
+    """Keeps the state of a unit while it is rendered.
+
+    Parameters
+    ----------
+    partial, unit, budget
+        Where states go; of what; when it is done (a limit of time does not count: it is another one every time).
+    stop
+        When it comes the unit has ``SOON_SECONDS`` to end; then it is kept as it is.
+    progress, warn
+        Told the share that is done, and what cannot be kept.
+    """
+
+    def __init__(
+        self,
+        partial: PartialCapture,
+        unit: Unit,
+        budget: Budget,
+        stop: StopRequest,
+        progress: Progress,
+        warn: Warn,
+    ):
+        self._partial, self._stop, self._warn = partial, stop, warn
+        self._key = (unit.sensors, unit.lasers)
+        self._budget: Mapping[str, Any] = asdict(budget) | {"time_limit_s": budget.time_limit_s is not None}
+        kept = partial.kept_state(*self._state_of) or {}
+        self.earlier_seconds = float(kept[OF_UNIT].numbers["seconds"]) if OF_UNIT in kept else 0.0
+        self.passes = Passes(progress, self._look, kept)
+        self._begun = self._kept_at = time.perf_counter()
+        self._pause = KEEP_SECONDS
+        self._signal_at: float | None = None  # when the stop was noticed
+
+    @property
+    def seconds(self) -> float:
+        """Spent rendering the unit, by earlier runs and this one."""
+        return self.earlier_seconds + time.perf_counter() - self._begun
+
+    @property
+    def _state_of(self) -> tuple[Any, Mapping[str, Any]]:
+        return self._key, self._budget
+
+    def _look(self, take: Callable[[], Kept]) -> None:
+        now = time.perf_counter()
+        if self._stop.came:
+            self._signal_at = self._signal_at or now
+            if now - self._signal_at >= SOON_SECONDS:
+                self._keep(take())
+                raise UnitStopped
+        elif now - self._kept_at >= self._pause:
+            self._keep(take())
+            self._kept_at = time.perf_counter()
+            self._pause = max(self._pause, KEEP_SECONDS, (self._kept_at - now) / KEEP_COST)
+
+    def _keep(self, kept: Kept) -> None:
+        noted = Snapshot(numbers={"seconds": self.seconds})
+        try:
+            self._partial.keep_state(*self._state_of, kept | {OF_UNIT: noted})
+        except FileError as error:  # a full disk: what an earlier state holds is left
+            self._warn(f"{error} What is done of the unit in flight cannot be kept.")
+            self._pause *= 4

@@ -1,0 +1,139 @@
+"""A unit that is stopped between passes, and gone on from by another process, has the bits of an undisturbed one."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from rendering import configured, flat_wall
+from views import view_config
+
+from nlosrender import pipeline
+from nlosrender.capture.plan import Batch, Unit
+from nlosrender.capture.tile import Tile
+from nlosrender.engine.backend import start_backend
+from nlosrender.engine.passes import Kept, Passes, Snapshot
+from nlosrender.files.unit_state import read_state, write_state
+from nlosrender.rendering.units import render_unit
+
+PLATE = {"type": "rectangle", "width": 0.8, "height": 0.6, "center": [0.1, 0, 1.0], "normal": [0, 0, -1]}
+BEFORE = PLATE | {"width": 0.3, "height": 0.4, "center": [0.3, 0.1, 0.6], "normal": [0.2, 0.1, -1]}
+GLOSSY = BEFORE | {"bsdf": {"type": "roughconductor", "alpha": 0.3}}
+LIGHTS = {"engine": "virtual_lights", "spp": None, "target_error": 0.05}
+GRID = {"nx": 5, "ny": 3, "width": 1.5, "height": 1.2}
+SAME = {"laser_grid": GRID, "sensor_grid": GRID}
+SEEN = {"type": "rectangle", "width": 1, "height": 1, "center": [0, 0, 0], "normal": [0, 0, 1]}
+SLOW = ("confocal paths in any direction", "confocal walks", "lights and paths")
+STOPS = 2
+LAMP = {"type": "point", "position": [0, 1, 3], "intensity": 1}
+SCENES: dict[str, Any] = {
+    "paths": flat_wall(PLATE, BEFORE, max_bounces=5, spp=500),
+    "confocal paths in any direction": flat_wall(PLATE, scan="confocal", max_bounces=4, hidden_geometry_sampling=False),
+    "paths to an error": flat_wall(PLATE, max_bounces=4, spp=None, target_error=0.05),
+    "third bounce": flat_wall(PLATE, BEFORE, **LIGHTS),
+    "confocal third bounce": flat_wall(PLATE, BEFORE, scan="confocal", **LIGHTS),
+    "walks": flat_wall(PLATE, BEFORE, scan="exhaustive", **LIGHTS | {"max_bounces": 5, "target_error": 0.3}),
+    "confocal walks": flat_wall(PLATE, BEFORE, scan="confocal", **LIGHTS | {"max_bounces": 5}),
+    "lights and paths": flat_wall(PLATE, GLOSSY, **LIGHTS | {"max_bounces": 4, "target_error": 0.5}),
+    "half of the pairs": flat_wall(
+        PLATE, scan="exhaustive", capture={"laser_grid": GRID, "sensor_grid": GRID}, **LIGHTS
+    ),
+    "two batches": flat_wall(PLATE, max_bounces=4, spp=200),
+    "line of sight": view_config(SEEN, emitters=[LAMP]),
+}
+
+
+class StoppedError(Exception):
+    """The render was ended between two passes."""
+
+
+def stopping(path: Path, tag: str) -> Callable[[Callable[[], Kept]], None]:
+    """Return what keeps the state and ends the render after the next pass."""
+
+    def look(take: Callable[[], Kept]) -> None:
+        write_state(path, tag, take())
+        raise StoppedError
+
+    return look
+
+
+def prepared(scene: dict[str, Any]) -> Callable[[Passes], Any]:
+    """Return what renders all of a capture as one unit, every time as a process that has just been started."""
+    config = configured(scene)
+    backend = start_backend("llvm", colored=config.is_colored)
+    from nlosrender.engine.path_engine import Budget
+
+    def render(passes: Passes) -> Any:
+        plan, engine, _ = pipeline.set_up_engine(config, backend)
+        budget = pipeline.settled_budget(config, engine)
+        assert isinstance(budget, Budget)
+        (unit,) = plan.units
+        if scene is SCENES["two batches"]:
+            upper, lower = Tile(0, 1, 0, 5), Tile(1, 3, 0, 5)
+            unit = Unit(unit.sensors, unit.lasers, (Batch(upper, unit.lasers), Batch(lower, unit.lasers)))
+        return render_unit(engine, unit, budget, passes)
+
+    return render
+
+
+@pytest.fixture(autouse=True)
+def _short_passes(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Passes of a few paths, patches and sites."""
+    start_backend("llvm")
+    from nlosrender.engine import sampling
+    from nlosrender.engine.virtual_lights import further_bounces, gather_passes
+
+    monkeypatch.setattr(sampling, "MOST_AT_FIRST", 2**9)
+    monkeypatch.setattr(sampling, "PASS_SECONDS", math.inf)
+    monkeypatch.setattr(gather_passes, "FIRST_PAIRS", 2**6)
+    monkeypatch.setattr(further_bounces, "FIRST_PAIRS", 2**17)
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=pytest.mark.slow) if name in SLOW else name for name in SCENES]
+)
+def test_going_on_from_any_pass_changes_no_bit(name: str, tmp_path: Path) -> None:
+    """The state that is kept is all that a render has: the sums, the random numbers, and what has been found out."""
+    render, path = prepared(SCENES[name]), tmp_path / "state"
+    whole = render(Passes())
+    for _ in range(STOPS):
+        with pytest.raises(StoppedError):
+            render(Passes(look=stopping(path, name), kept=read_state(path, name)))
+    result = render(Passes(kept=read_state(path, name)))
+    assert whole.samples == result.samples
+    for values in ("mean", "variance", "outside"):
+        np.testing.assert_array_equal(getattr(result, values), getattr(whole, values))
+    assert whole.mean.any()
+
+
+def test_what_is_damaged_or_of_another_render_means_nothing(tmp_path: Path) -> None:
+    """A flipped bit anywhere, a cut at any byte, a link, another tag: there is no state."""
+    path, kept = tmp_path / "state", {"a": Snapshot({"sums": np.arange(5.0)}, {"done": 3})}
+    write_state(path, "tag", kept)
+    content = path.read_bytes()
+    whole = read_state(path, "tag")
+    assert whole is not None
+    assert whole["a"].numbers == {"done": 3}
+    np.testing.assert_array_equal(whole["a"].arrays["sums"], np.arange(5.0))
+    assert read_state(path, "other") is None
+    for place in range(len(content)):
+        path.write_bytes(content[:place])
+        assert read_state(path, "tag") is None, place
+        path.write_bytes(content[:place] + bytes([content[place] ^ 4]) + content[place + 1 :])
+        assert read_state(path, "tag") is None, place
+    path.write_bytes(content)
+    (tmp_path / "link").symlink_to(path)
+    assert read_state(tmp_path / "link", "tag") is None
+
+
+def test_a_state_is_not_written_through_a_link(tmp_path: Path) -> None:
+    """What a link of that name points to is left as it is."""
+    (tmp_path / "precious").write_text("precious")
+    (tmp_path / "state.new").symlink_to(tmp_path / "precious")
+    write_state(tmp_path / "state", "tag", {"a": Snapshot()})
+    assert (tmp_path / "precious").read_text() == "precious"
+    assert read_state(tmp_path / "state", "tag") is not None
