@@ -22,7 +22,8 @@ def line_of_sight_faults(scene: SceneConfig, capture: CaptureConfig, render: Ren
         if scene.mitsuba is None:
             yield Fault(("capture", "camera"), f"missing, a line_of_sight capture needs it, {example}", needs=needs)
         elif read_mitsuba_xml(scene.mitsuba)[1] is None:
-            message = f"missing, and {scene.mitsuba.name} has no perspective sensor; need a camera, {example}"
+            lacking = "has no perspective sensor with a whole film"
+            message = f"missing, and {scene.mitsuba.name} {lacking}; need a camera, {example}"
             yield Fault(("capture", "camera"), message, needs=needs)
     if render.engine == "virtual_lights":
         message = "got virtual_lights, which need a relay wall; a line_of_sight capture needs auto or path."

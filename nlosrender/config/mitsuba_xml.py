@@ -7,8 +7,7 @@ files, or is known to end the process. Integrators and samplers are left out, an
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Annotated
 from xml.etree.ElementTree import Element, SubElement
@@ -26,18 +25,19 @@ from nlosrender.config.bsdf_table import (
 from nlosrender.config.fields import Checked
 from nlosrender.config.plugin_check import config_folder, existing_file, mitsuba_file
 from nlosrender.config.refusal import Fault, listed, refuse
+from nlosrender.config.xml_expansion import LEFT_OUT, START, Expansion, told_by_place
 from nlosrender.config.xml_numbers import check_numbers
-from nlosrender.config.xml_shapes import at_line, check_xml_bsdf, check_xml_shape
+from nlosrender.config.xml_shapes import check_xml_bsdf, check_xml_shape
 from nlosrender.config.xml_transforms import check_rotation
-from nlosrender.config.xml_tree import MAX_XML_BYTES, read_xml
+from nlosrender.config.xml_tree import SceneElement
+from nlosrender.errors import nearest
 
 DEFAULT_FILM = (768, 576)  # Mitsuba's
 _PLUGINS = {  # element: the types it may have
     "scene": (),
     "bsdf": BSDF_TYPES,
     "emitter": ("area", "constant", "directional", "envmap", "point", "projector", "spot"),
-    # what Mitsuba's own readers cannot be trusted with, or the renderer cannot check, stays out
-    "shape": tuple(kind for kind in SHAPE_TYPES if kind != "serialized"),
+    "shape": SHAPE_TYPES,
     "texture": TEXTURE_TYPES,
     "spectrum": (),
     "sensor": ("perspective",),
@@ -45,8 +45,16 @@ _PLUGINS = {  # element: the types it may have
 _VALUES = ("boolean", "float", "integer", "point", "ref", "rgb", "string", "vector")
 _PLAIN = (*_VALUES, "transform", "lookat", "matrix", "rotate", "scale", "translate")
 _RULES = {"bsdf": check_xml_bsdf, "shape": check_xml_shape}
-_LEFT_OUT = ("film", "integrator", "sampler")
-_VARIABLE = re.compile(r"\$\{?(\w+)\}?")
+_LEFT_OUT = ("film", *LEFT_OUT)
+_MEDIA = "participating media are not rendered; remove it, and what refers to it"
+_ADVICE = {  # what is often found and not supported: what to do instead
+    "medium": _MEDIA,
+    "phase": _MEDIA,
+    "volume": _MEDIA,
+    "instance": "write each of the shapes out, with a <transform> of its own",
+    "shapegroup": "write each of the shapes out, with a <transform> of its own",
+    "srgb": "write <rgb> with linear values",
+}
 _COLOR = re.compile(r"[\s,]+")
 
 
@@ -70,12 +78,12 @@ def read_mitsuba_xml(path: Path) -> tuple[Element, tuple[int, int] | None]:
     ValueError
         The file is no Mitsuba scene, too large, or holds something that is not allowed; says what.
     """
-    root = read_xml(path)
-    if root.tag != "scene":
-        raise ValueError(f"its root is <{root.tag}>, need <scene>")
-    _substitute(root)
+    expansion = Expansion(path)
+    root = expansion.read()
+    if isinstance(root, SceneElement):
+        root.included = tuple(expansion.files[1:])
     size = _keep_one_sensor(root)
-    _clean(root, path.parent)
+    _clean(root, expansion.folders)
     if size is not None:
         _add_film(root, size)
     return root, size
@@ -104,49 +112,43 @@ def image_files(root: Element) -> Iterator[Path]:
 
 
 def named_files(root: Element) -> Iterator[Path]:
-    """Yield every file a scene names: meshes, images, measured materials and spectra."""
+    """Yield every file a scene names: included scenes, meshes, images, measured materials and spectra."""
+    yield from root.included if isinstance(root, SceneElement) else ()
     for element in root.iter():
         for key in _file_keys(element):
             if element.get(key) is not None:
                 yield Path(str(element.get(key)))
 
 
-def _substitute(root: Element) -> None:
-    defaults = {d.get("name", ""): d.get("value", "") for d in root.findall("default")}
-    for default in root.findall("default"):
-        root.remove(default)
-
-    def value_of(match: re.Match[str]) -> str:
-        if match[1] not in defaults:
-            raise ValueError(f"${match[1]} has no <default>")
-        return defaults[match[1]]
-
-    longest = max((len(value) for value in defaults.values()), default=0)
-    room = MAX_XML_BYTES  # for all that is put in: a short file could ask for more than there is memory
-    for element in root.iter():
-        for key, text in element.attrib.items():
-            if "$" not in text:
-                continue
-            room -= text.count("$") * longest
-            if room < 0:
-                raise ValueError("what its <default>s stand for is too large")
-            element.set(key, _VARIABLE.sub(value_of, text))
-
-
 def _keep_one_sensor(root: Element) -> tuple[int, int] | None:
-    """Leave the first perspective camera of a scene, and return the size of its film."""
-    sensors = root.findall("sensor")
-    kept = next((sensor for sensor in sensors if sensor.get("type") == "perspective"), None)
-    for sensor in sensors:
-        if sensor is not kept:
-            root.remove(sensor)
+    """Leave the first perspective camera whose film can be used, and return the size of that film."""
+    sizes = {sensor: _film_size(sensor) for sensor in root.iter("sensor") if sensor.get("type") == "perspective"}
+    kept = next((sensor for sensor in root.findall("sensor") if isinstance(sizes.get(sensor), tuple)), None)
+    for holder in list(root.iter()):
+        for sensor in holder.findall("sensor"):  # some lie in the shape that they measure
+            if sensor is not kept:
+                holder.remove(sensor)
     if kept is None:
         return None
-    film = kept.find("film")
+    for part in list(kept):
+        if part.tag not in (*_PLAIN, "film") or part.tag == "ref":  # such as the medium it lies in
+            kept.remove(part)
+    return sizes[kept]
+
+
+def _film_size(sensor: Element) -> tuple[int, int] | None:
+    """Return columns and rows of a sensor's film; None for one that is cropped, or sized by a parameter without value.
+
+    Raises
+    ------
+    ValueError
+        A size is no number of pixels.
+    """
+    film = sensor.find("film")
     size = {} if film is None else {item.get("name"): item.get("value", "") for item in film.findall("integer")}
-    if any(str(name).startswith("crop") for name in size):
-        raise ValueError("its film is cropped, which is not supported; remove the crop or give capture.camera")
     numbers = [size.get(key, str(default)) for key, default in zip(("width", "height"), DEFAULT_FILM, strict=True)]
+    if any(str(name).startswith("crop") for name in size) or any("$" in number for number in numbers):
+        return None
     if not all(number.strip().isdecimal() and len(number) < 8 and int(number) > 0 for number in numbers):
         raise ValueError(f"its film has {numbers[0]} x {numbers[1]} pixels, need two integers >= 1")
     return int(numbers[0]), int(numbers[1])
@@ -160,52 +162,52 @@ def _add_film(root: Element, size: tuple[int, int]) -> None:
             SubElement(film, "integer", name=name, value=str(pixels))
 
 
-def _clean(element: Element, folder: Path) -> None:
+def _clean(element: Element, folders: Sequence[Path]) -> None:
     """Check an element and everything in it; drop what is left out, make file names absolute."""
     for child in list(element):
         if child.tag in _LEFT_OUT:
             element.remove(child)
             continue
-        with _told_by_line(child):
-            _check(child, folder)
-        _clean(child, folder)
+        with told_by_place(child):
+            _check(child, folders)
+        _clean(child, folders)
         if child.tag in _RULES:  # after its parts, whose line is the nearer one
-            with _told_by_line(child):
-                _RULES[child.tag](child, folder)
+            with told_by_place(child):
+                _RULES[child.tag](child, folders[-1])
 
 
-@contextmanager
-def _told_by_line(element: Element) -> Iterator[None]:
-    try:
-        yield
-    except ValueError as error:
-        raise ValueError(at_line(element, error)) from error
-
-
-def _check(element: Element, folder: Path) -> None:
+def _check(element: Element, folders: Sequence[Path]) -> None:
     """Refuse an element that is not supported or lacks something, and make the file it names absolute."""
     tag, kind, allowed = element.tag, element.get("type", ""), _PLUGINS.get(element.tag, ())
     if tag not in _PLUGINS and tag not in _PLAIN:
-        raise ValueError(f"<{tag}> is not supported; need {listed(sorted((*_PLUGINS, *_PLAIN)))}")
+        need = _ADVICE.get(tag) or f"need {listed(sorted((*_PLUGINS, *_PLAIN)))}"
+        raise ValueError(f"<{tag}> is not supported; {need}")
     if allowed and kind not in allowed:
-        raise ValueError(f"<{tag} type={kind!r}> is not supported; need one of {listed(allowed)}")
+        close = nearest(kind, allowed)
+        hint = f". Did you mean {close}?" if close else ""
+        need = _ADVICE.get(kind) or f"need one of {listed(allowed)}{hint}"
+        raise ValueError(f"<{tag} type={kind!r}> is not supported; {need}")
     if kind and not allowed:
         raise ValueError(f"<{tag}> has a type {kind!r}, which is not supported")
     for name in TEXTURE_REQUIRED.get(kind, ()) if tag == "texture" else ():
         if all(item.get("name") != name for item in element):
             raise ValueError(f"<texture type={kind!r}> has no {name}")
-    if kind in ("ply", "obj", "envmap") and _string(element, "filename") is None:
+    if kind in ("ply", "obj", "serialized", "envmap") and _string(element, "filename") is None:
         raise ValueError(f"<{tag} type={kind!r}> has no filename")
     check_numbers(element)
     if tag == "rotate":
         check_rotation(element)
-    _absolute_files(element, folder)
+    if tag == "boolean":
+        element.set("value", element.get("value", "").lower())  # Mitsuba takes True for true
+    _absolute_files(element, folders)
 
 
-def _absolute_files(element: Element, folder: Path) -> None:
+def _absolute_files(element: Element, folders: Sequence[Path]) -> None:
     for key in _file_keys(element):
         if element.get(key) is not None:
-            file, problem = mitsuba_file(str(element.get(key)), folder)
+            name = str(element.get(key))
+            tried = [mitsuba_file(name, folder, START) for folder in folders]
+            file, problem = next((found for found in tried if not found[1]), tried[-1])
             if problem:
                 raise ValueError(problem.removesuffix("."))
             element.set(key, str(file))

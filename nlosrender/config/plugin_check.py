@@ -151,8 +151,11 @@ def config_folder(validation: ValidationInfo) -> Path:
     ).absolute()
 
 
-def existing_file(name: str, folder: Path) -> tuple[Path, str]:
-    """Return the absolute path of ``name`` and the problem with it; the problem is empty for a readable file."""
+def existing_file(name: str, folder: Path, start: str = "the YAML's folder") -> tuple[Path, str]:
+    """Return the absolute path of ``name`` and the problem with it; the problem is empty for a readable file.
+
+    ``start`` says in words where relative names start.
+    """
     try:
         path = (folder / name).resolve()
         if path.is_file():
@@ -163,12 +166,12 @@ def existing_file(name: str, folder: Path) -> tuple[Path, str]:
     alike = (entry.name for entry in path.parent.glob("*") if entry.suffix.lower() == path.suffix.lower())
     hint = nearest(path.name, alike) if path.parent.is_dir() else None
     advice = f" Did you mean {hint}?" if hint and found == "no file" else ""
-    return path, f"got {name}, but there is {found} at {path}. Relative names start at the YAML's folder.{advice}"
+    return path, f"got {name}, but there is {found} at {path}. Relative names start at {start}.{advice}"
 
 
-def mitsuba_file(name: str, folder: Path) -> tuple[Path, str]:
+def mitsuba_file(name: str, folder: Path, start: str = "the YAML's folder") -> tuple[Path, str]:
     """Return as ``existing_file`` does, for a file that Mitsuba opens by its name."""
-    path, problem = existing_file(name, folder)
+    path, problem = existing_file(name, folder, start)
     if not problem and not is_encodable(str(path)):
         what = f"got {shown(name)}; Mitsuba opens files with names in UTF-8 only, not {path}."
         problem = f"{what} Rename it, or its folder."

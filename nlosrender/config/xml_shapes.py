@@ -11,7 +11,6 @@ from nlosrender.config.bsdf import check_parameter
 from nlosrender.config.plugin_check import PluginCheck
 from nlosrender.config.shape_check import check_shape
 from nlosrender.config.xml_transforms import numbers_of, transform_steps, vector_of
-from nlosrender.config.xml_tree import line_of
 
 
 def shape_parameters(shape: Element) -> dict[str, Any]:
@@ -78,14 +77,9 @@ def named(element: Element) -> str:
     return f"<{element.tag} type={element.get('type')!r}{identity}>"
 
 
-def at_line(element: Element, message: object) -> str:
-    """Return a message about an element with the line it begins in."""
-    return f"line {line_of(element)}: {message}"
-
-
 def _color(item: Element) -> Any:
     numbers = numbers_of(item.get("value"), (1, 3))
-    return numbers if len(numbers) == 3 else numbers[0]
+    return numbers if len(set(numbers)) > 1 else numbers[0]
 
 
 _VALUES: Mapping[str, Callable[[Element], Any]] = {

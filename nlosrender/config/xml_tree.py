@@ -16,20 +16,34 @@ class SceneElement(Element):
     """An element and where it stands in its file."""
 
     line: int = 0  # counted from 1; 0: it does not come from a file
+    file: str = ""  # name of an included file; empty: the scene's own
+    included: tuple[Path, ...] = ()  # of a scene's root: files whose contents are in it
+
+    @classmethod
+    def like(cls, other: Element, tag: str, **attributes: str) -> SceneElement:
+        """Return a new element that stands where another one does."""
+        element = cls(tag, attributes)
+        if isinstance(other, SceneElement):
+            element.line, element.file = other.line, other.file
+        return element
 
 
-def line_of(element: Element) -> int:
-    """Return the line an element begins in, counted from 1; 0 for one that does not come from a file."""
-    return element.line if isinstance(element, SceneElement) else 0
+def place_of(element: Element) -> str:
+    """Return where an element begins: its line, counted from 1, and its file where that is an included one."""
+    if not isinstance(element, SceneElement):
+        return "line 0"
+    return f"{element.file}, line {element.line}" if element.file else f"line {element.line}"
 
 
-def read_xml(path: Path) -> Element:
+def read_xml(path: Path, name: str = "") -> Element:
     """Read an XML file; text between the elements is left out, no Mitsuba scene has any.
 
     Parameters
     ----------
     path
         The file, in any encoding that XML knows.
+    name
+        What it is called in messages; empty: not at all.
 
     Returns
     -------
@@ -48,33 +62,33 @@ def read_xml(path: Path) -> Element:
         raise ValueError(f"cannot be read: {error.strerror}") from error
     if len(content) > MAX_XML_BYTES:
         raise ValueError(f"it is larger than {MAX_XML_BYTES // 2**20} MiB; keep meshes in files of their own")
-    return _LimitedTree().read(content)
+    return _LimitedTree(name).read(content)
 
 
-def numbered_text(root: Element) -> tuple[str, list[int]]:
-    """Return an element as XML, and for each line of that text the line of the file it comes from."""
+def numbered_text(root: Element) -> tuple[str, list[Element]]:
+    """Return an element as XML, and for each line of that text the element it begins or ends."""
     lines: list[str] = []
-    sources: list[int] = []
+    sources: list[Element] = []
 
-    def write(element: Element, line: int) -> None:
-        line = line_of(element) or line  # what was added stands where its parent does
+    def write(element: Element) -> None:
         attributes = "".join(f" {key}={quoteattr(value)}" for key, value in element.attrib.items())
         lines.append(f"<{element.tag}{attributes}{'' if len(element) else '/'}>")
-        sources.append(line)
+        sources.append(element)
         for child in element:
-            write(child, line)
+            write(child)
         if len(element):
             lines.append(f"</{element.tag}>")
-            sources.append(line)
+            sources.append(element)
 
-    write(root, 1)
+    write(root)
     return "\n".join(lines), sources
 
 
 class _LimitedTree:
     """Builds a tree, or says what no scene needs while it is read, before it grows."""
 
-    def __init__(self) -> None:
+    def __init__(self, name: str) -> None:
+        self._name = name
         self._parser = expat.ParserCreate()
         self._parser.StartElementHandler = self._start
         self._parser.EndElementHandler = self._end
@@ -103,7 +117,7 @@ class _LimitedTree:
         if len(self._open) == MAX_DEPTH:
             raise ValueError(f"its elements lie in each other more than {MAX_DEPTH} deep")
         element = SceneElement(tag, attributes)
-        element.line = self._parser.CurrentLineNumber
+        element.line, element.file = self._parser.CurrentLineNumber, self._name
         if self._open:
             self._open[-1].append(element)
         else:

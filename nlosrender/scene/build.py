@@ -205,17 +205,27 @@ def _load_shape(
         plugin["emitter"] = area_emitter(radiance)
     try:
         if plugin["type"] == "serialized":
-            _check_faces(mi.load_dict({**plugin, "face_normals": True}))
+            load_flat_serialized(plugin)
         return mi.load_dict(plugin)
     except (RuntimeError, TypeError, ValueError) as error:
         raise rejected(key, f"Mitsuba rejects this shape: {first_line(error)}") from error
 
 
-def _check_faces(mesh: mi.Mesh) -> None:
-    """Look at a mesh without vertex normals, before Mitsuba computes them and reads where a wrong index leads."""
+def load_flat_serialized(plugin: Mapping[str, object]) -> mi.Mesh:
+    """Load a mesh without vertex normals, before Mitsuba computes them and reads where a wrong index leads.
+
+    Raises
+    ------
+    ValueError
+        A face refers to a vertex that is not there.
+    RuntimeError
+        Mitsuba cannot read the file.
+    """
+    mesh = mi.load_dict({**plugin, "face_normals": True})
     faces = np.asarray(mi.traverse(mesh)["faces"])
     if not len(faces) or int(faces.max()) >= mesh.vertex_count():
         raise ValueError(f"a face refers to vertex {faces.max(initial=0)}, the file has {mesh.vertex_count()}")
+    return mesh
 
 
 def _scaled(description: Mapping[str, object], unit: float) -> dict[str, object]:

@@ -75,7 +75,7 @@ def build_view(scene_config: SceneConfig, capture_config: CaptureConfig) -> Buil
     ValueError
         A pose is degenerate; the message begins with the item's key.
     """
-    whole = None if scene_config.mitsuba is None else load_xml_scene(scene_config.mitsuba)
+    whole, left_out = (None, ()) if scene_config.mitsuba is None else load_xml_scene(scene_config.mitsuba)
     plane = _image_plane(capture_config, whole)
     frame = _engine_frame(scene_config, plane)
     surfaces = tuple(_surfaces(scene_config, frame))
@@ -106,7 +106,7 @@ def build_view(scene_config: SceneConfig, capture_config: CaptureConfig) -> Buil
         frame=frame,
         unit=unit,
         n_triangles=sum(int(shape.face_count()) for shape in shapes if shape.is_mesh()),
-        warnings=read.warnings + medium_warnings(zip(keys, shapes, strict=True)),
+        warnings=left_out + read.warnings + medium_warnings(zip(keys, shapes, strict=True)),
         meshes=read.meshes,
     )
 
@@ -150,7 +150,9 @@ def _image_plane(capture_config: CaptureConfig, whole: mi.Scene | None) -> Image
     if camera is not None:
         return image_plane(camera.position, camera.look_at, camera.up, camera.fov_deg, pixels)
     if whole is None or not whole.sensors():
-        raise rejected("capture.camera", "missing, and there is no Mitsuba scene with a perspective sensor.")
+        raise rejected(
+            "capture.camera", "missing, and there is no Mitsuba scene with a perspective sensor that has a whole film."
+        )
     parameters = mi.traverse(whole.sensors()[0])
     to_world = np.array(parameters["to_world"].matrix, dtype=np.float64).reshape(4, 4)
     offset = [float(np.ravel(parameters[f"principal_point_offset_{axis}"])[0]) for axis in "xy"]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import cache, reduce
 from pathlib import Path
 from xml.etree.ElementTree import Element
@@ -13,9 +13,9 @@ import numpy as np
 
 from nlosrender.config.fields import LONGEST, SHORTEST
 from nlosrender.config.mitsuba_xml import image_files, read_mitsuba_xml
-from nlosrender.config.xml_shapes import at_line, named, placement, shape_parameters
-from nlosrender.config.xml_tree import numbered_text
-from nlosrender.scene.build import shape_bounds
+from nlosrender.config.xml_shapes import named, placement, shape_parameters
+from nlosrender.config.xml_tree import numbered_text, place_of
+from nlosrender.scene.build import load_flat_serialized, shape_bounds
 from nlosrender.scene.hidden_geometry import MESH_PLUGINS, ShapeDescription, box_corners
 from nlosrender.scene.images import check_image
 from nlosrender.scene.materials import first_line, rejected
@@ -27,11 +27,18 @@ from nlosrender.scene.triangle_mesh import TriangleMesh
 
 WHERE = "scene.mitsuba"
 _ADVICE = "Check its size and its transformation."
+_UNKNOWN = re.compile(r"string \(line (\d+), col \d+\): Found \d+ unreferenced propert")
+_PARAMETER = re.compile(r'^\s*- \w+ "([^"]+)"', re.MULTILINE)
 _LINE = re.compile(r"(?:[Ee]rror while loading |[Ww]hile loading |[Aa]t |at )?string \(line (\d+), col \d+\)")
 
 
-def load_xml_scene(path: Path) -> mi.Scene:
+def load_xml_scene(path: Path) -> tuple[mi.Scene, tuple[str, ...]]:
     """Load a Mitsuba scene; the backend has to be started before.
+
+    Returns
+    -------
+    tuple
+        The scene, and what was left out of it, a sentence each.
 
     Raises
     ------
@@ -47,19 +54,33 @@ def load_xml_scene(path: Path) -> mi.Scene:
             check_image(image)
     except ValueError as error:
         raise rejected(WHERE, f"{path}: {error}.") from error
-    scene = _loaded(root, path)
+    scene, warnings = _loaded(root, path)
     for shape in scene.shapes():
         _check_bounds(shape, path)
-    return scene
+    return scene, warnings
 
 
-def _loaded(root: Element, path: Path) -> mi.Scene:
-    text, lines = numbered_text(root)
-    try:
-        return mi.load_string(text)
-    except (RuntimeError, TypeError, ValueError) as error:
-        told = _LINE.sub(lambda found: f"line {lines[min(int(found[1]), len(lines)) - 1]}", first_line(error))
-        raise rejected(WHERE, f"{path}: Mitsuba rejects this scene: {told}.") from error
+def _loaded(root: Element, path: Path) -> tuple[mi.Scene, tuple[str, ...]]:
+    """Return the scene, and a sentence for each plugin with parameters that it does not have, which are left out."""
+    warnings: list[str] = []
+    while True:
+        text, elements = numbered_text(root)
+        try:
+            return mi.load_string(text), tuple(warnings)
+        except (RuntimeError, TypeError, ValueError) as error:
+            unknown = _UNKNOWN.search(str(error))
+            if unknown is None:
+                told = _LINE.sub(lambda found: place_of(elements[int(found[1]) - 1]), first_line(error))  # noqa: B023
+                raise rejected(WHERE, f"{path}: Mitsuba rejects this scene: {told}.") from error
+            warnings.append(_without_parameters(elements[int(unknown[1]) - 1], _PARAMETER.findall(str(error))))
+
+
+def _without_parameters(plugin: Element, names: Sequence[str]) -> str:
+    """Take parameters out of a plugin, and say so."""
+    for child in [child for child in plugin if child.get("name") in names]:
+        plugin.remove(child)
+    listed = ", ".join(names)
+    return f"{WHERE}: {place_of(plugin)}: {named(plugin)} has no parameter {listed}, which is left out."
 
 
 def _check_shape(shape: Element) -> None:
@@ -83,7 +104,7 @@ def _check_shape(shape: Element) -> None:
         if _rounded_to_nothing(mesh, corners, to_world):
             raise ValueError(f"float32 rounds it to nothing where it is. {_ADVICE}")
     except ValueError as error:
-        raise ValueError(at_line(shape, f"{named(shape)}: {error}".removesuffix("."))) from error
+        raise ValueError(f"{place_of(shape)}: {named(shape)}: {error}".removesuffix(".")) from error
 
 
 def _mesh_of(parameters: Mapping[str, object]) -> TriangleMesh | None:
@@ -91,13 +112,27 @@ def _mesh_of(parameters: Mapping[str, object]) -> TriangleMesh | None:
     kind = str(parameters["type"])
     if kind in ("cube", "disk", "rectangle"):
         return _unit_mesh(is_flat=kind != "cube")
-    if kind not in MESH_PLUGINS:
+    if kind not in (*MESH_PLUGINS, "serialized"):
         return None
     filename = str(parameters["filename"])
     try:
+        if kind == "serialized":
+            return _serialized(parameters)
         return read_mesh(filename, kind, "flat")
     except ValueError as error:
         raise ValueError(f"{filename} cannot be used as a mesh: {error}") from error
+
+
+def _serialized(parameters: Mapping[str, object]) -> TriangleMesh:
+    """Return the triangles of a mesh in Mitsuba's own format."""
+    try:
+        mesh = load_flat_serialized(parameters)
+    except RuntimeError as error:
+        raise ValueError(first_line(error)) from error
+    arrays = mi.traverse(mesh)
+    return TriangleMesh(
+        np.reshape(arrays["vertex_positions"], (-1, 3)), np.reshape(arrays["faces"], (-1, 3)).astype(np.uint32)
+    )
 
 
 @cache  # scenes may have thousands

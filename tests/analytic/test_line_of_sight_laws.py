@@ -123,7 +123,6 @@ def test_target_error_is_met() -> None:
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        ("<shape type='sphere'><float name='nonsense' value='1'/></shape>", "nonsense"),
         ("<shape type='ply'><string name='filename' value='damaged.ply'/></shape>", "damaged.ply"),
         ("<shape type='sphere'><ref id='nobody'/></shape>", "nobody"),
         (

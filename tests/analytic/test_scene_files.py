@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import gc
+import struct
+import zlib
 from pathlib import Path
 from typing import Any
 
@@ -276,12 +278,43 @@ def test_what_mitsuba_says_is_told_with_the_line_of_the_file(tmp_path: Path) -> 
     </integrator>
     <shape type='sphere'>
         <float name='radius' value='1'/>
-        <float name='nonsense' value='1'/>
+        <string name='center' value='nonsense'/>
     </shape>"""
-    with pytest.raises(ConfigError, match=r"nonsense") as caught:
+    with pytest.raises(ConfigError, match=r"center") as caught:
         seen(tmp_path, content)
     assert "[parser" not in str(caught.value)
     assert "line 7" in str(caught.value), caught.value
+
+
+def test_parameters_that_a_plugin_does_not_have_are_left_out_with_a_warning(tmp_path: Path) -> None:
+    """Exporters write some that only their own version reads; the rest of the scene is what it is without them."""
+    content = """<shape type='sphere'><float name='radius' value='1'/>{}
+    <bsdf type='diffuse'>{}</bsdf></shape>"""
+    unknown = "<float name='nonsense' value='1'/>", "\n<boolean name='odd' value='true'/>"
+    with_them, without = (seen(tmp_path, content.format(*each)) for each in (unknown, ("", "")))
+    np.testing.assert_array_equal(with_them.mean, without.mean)
+    assert without.engine.built.warnings == ()
+    first, second = sorted(with_them.engine.built.warnings)
+    assert "line 2: <shape type='sphere'> has no parameter nonsense, which is left out" in first + second
+    assert "line 3: <bsdf type='diffuse'> has no parameter odd, which is left out" in first + second
+
+
+def test_a_mesh_in_mitsubas_own_format(tmp_path: Path) -> None:
+    """A .serialized file is read in XML, too; one with an index that refers to nothing is refused with its line."""
+    corners = np.array([[-1, -1, 0], [1, -1, 0], [0, 1, 0]], dtype=np.float32)
+
+    def write(last: int) -> None:
+        body = struct.pack("<I", 0x1000) + b"mesh\0" + struct.pack("<QQ", 3, 1) + corners.tobytes()
+        body += np.array([0, 1, last], dtype=np.uint32).tobytes()
+        data = struct.pack("<HH", 0x041C, 4) + zlib.compress(body) + struct.pack("<QI", 0, 1)
+        (tmp_path / "mesh.serialized").write_bytes(data)
+
+    content = "<shape type='serialized'><string name='filename' value='mesh.serialized'/></shape>"
+    write(2)
+    assert seen(tmp_path, content).engine.built.n_triangles == 1
+    write(9)
+    with pytest.raises(ConfigError, match=r"line 2: <shape type='serialized'>: .* refers to vertex 9"):
+        seen(tmp_path, content)
 
 
 def test_the_backs_of_mirroring_transforms_are_kept(tmp_path: Path) -> None:

@@ -146,9 +146,12 @@ def test_a_relay_wall_is_missing() -> None:
         ("<scene><emitter type='point'><rgb name='intensity' value='-1'/></emitter></scene>", "need numbers >= 0"),
         ("<!DOCTYPE scene [<!ENTITY a 'b'>]><scene/>", "document type or entities"),
         ("<shape/>", "its root is <shape>"),
-        ("<scene><include filename='other.xml'/></scene>", "<include> is not supported"),
+        ("<scene><include filename='other.xml'/></scene>", "line 1: got other.xml, but there is no file at"),
         ("<scene><shape type='../../evil'/></scene>", "need one of"),
-        ("<scene><medium type='homogeneous'/></scene>", "<medium> is not supported"),
+        (
+            "<scene><medium type='homogeneous'/></scene>",
+            "<medium> is not supported; participating media are not rendered; remove it",
+        ),
         ("<scene><shape type='$kind'/></scene>", r"\$kind has no <default>"),
         ("<scene><shape type='ply'/></scene>", "has no filename"),
         (
