@@ -33,7 +33,7 @@ def register(app: typer.Typer) -> None:
     )
     app.command(
         "validate",
-        epilog="Example: nlosrender validate z.yaml --set render.spp=64 --set render.target_error=null   "
+        epilog="Example: nlosrender validate z.yaml --set render.spp=64   "
         "(creates nothing; prints ok or every mistake with its line, exit code 3)",
     )(validate)
     app.command(

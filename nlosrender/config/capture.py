@@ -23,7 +23,6 @@ from nlosrender.config.refusal import Fault
 from nlosrender.config.section import Section
 
 ScanType = Literal["single", "confocal", "exhaustive", "line_of_sight"]
-_OF_THE_WALL = ("laser_grid", "laser_point", "laser_position", "sensor_position")  # what line_of_sight has none of
 
 
 class GridConfig(Section):
@@ -89,33 +88,15 @@ class CaptureConfig(Section):
         return {**raw, "laser_point": [0.0, 0.0]} if is_single and raw.get("laser_point") is None else raw
 
     def rules(self) -> Iterator[Fault]:
-        """Yield the faults of laser points and cameras that do not fit the scan type."""
+        """Yield the faults of grids that are missing, or are none of a camera's."""
         if self.is_line_of_sight:
             yield from self._line_of_sight_rules()
             return
-        if self.camera is not None:
-            message = f"a camera is for scan_type: line_of_sight, got {self.scan_type}; remove one of the two."
-            yield Fault(("camera",), message, "key", (("scan_type",),))
         if self.scan_type == "exhaustive" and self.laser_grid is None:
             message = "missing, an exhaustive scan needs it, such as {nx: 4, ny: 3}."
             yield Fault(("laser_grid",), message, needs=(("scan_type",), ("laser_grid",)))
-        if self.scan_type != "exhaustive" and self.laser_grid is not None:
-            instead = "laser_point" if self.scan_type == "single" else "sensor_grid alone: each point is lit in turn"
-            message = f"a {self.scan_type} scan has no laser grid; use {instead}, or scan_type: exhaustive."
-            yield Fault(("laser_grid",), message, "key", (("scan_type",),))
-        if self.scan_type != "single" and self.laser_point is not None:
-            message = f"a laser point is for scan_type: single, got {self.scan_type}; remove one of the two."
-            yield Fault(("laser_point",), message, "key", (("scan_type",),))
 
     def _line_of_sight_rules(self) -> Iterator[Fault]:
-        wrong = [key for key in _OF_THE_WALL if getattr(self, key) is not None]
-        wrong += ["laser_energy"] if self.laser_energy != 1.0 else []
-        wrong += ["laser_spot_radius"] if self.laser_spot_radius != 0.0 else []
-        for key in wrong:
-            message = "a line_of_sight capture has no laser; remove it. Light comes from scene.emitters."
-            if key == "sensor_position":
-                message = "a line_of_sight capture has a camera instead; use capture.camera.position."
-            yield Fault((key,), message, "key", (("scan_type",),))
         camera, grid = self.camera, self.sensor_grid
         if grid.width or grid.height or (camera and (grid.nx, grid.ny) != (camera.width, camera.height)):
             message = "the sensor points of a line_of_sight capture are the camera's pixels; remove it, and set "

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from typing import Any
+from collections.abc import Iterable, Iterator, Mapping
+from typing import Any, Self
 
-from pydantic import Field, ValidationInfo, model_validator
+from pydantic import Field, ModelWrapValidatorHandler, PrivateAttr, ValidationInfo, model_validator
 
 from nlosrender.config.capture import CaptureConfig, TimeAxisConfig
 from nlosrender.config.fields import Name
+from nlosrender.config.idle_keys import without_idle_keys
 from nlosrender.config.line_of_sight import line_of_sight_faults, relay_wall_faults
 from nlosrender.config.mitsuba_xml import read_mitsuba_xml
 from nlosrender.config.plugin_check import config_folder
@@ -44,6 +45,27 @@ class Config(Section):
     # never set here: sweep_load makes many configs of it. No part of the capture, so no part of its hash either.
     sweep: SweepConfig | None = Field(default=None, exclude=True)
     """many captures from this file: which keys take which values"""
+
+    _notes: tuple[str, ...] = PrivateAttr(default=())  # what of the file has no effect
+
+    @model_validator(mode="wrap")
+    @classmethod
+    def _leave_out_idle_keys(cls, raw: Any, handler: ModelWrapValidatorHandler[Self]) -> Self:
+        if not isinstance(raw, Mapping):
+            return handler(raw)
+        kept, notes = without_idle_keys(raw)
+        config = handler(kept)
+        return config.noting(notes)
+
+    def noting(self, notes: Iterable[str]) -> Self:
+        """Return this config, which from now on knows what of its file has no effect."""
+        self._notes = (*self._notes, *notes)
+        return self
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """A sentence for each choice that leaves keys of the file without effect."""
+        return self._notes
 
     @model_validator(mode="before")
     @classmethod

@@ -31,10 +31,6 @@ def line_of_sight_faults(scene: SceneConfig, capture: CaptureConfig, render: Ren
     if render.temporal_kernel_opl > 0:
         message = refusal(render.temporal_kernel_opl, "0: a line_of_sight capture has plain bins")
         yield Fault(("render", "temporal_kernel_opl"), message, needs=(_SCAN, ("render", "temporal_kernel_opl")))
-    for key in ("laser_sampling", "hidden_geometry_sampling"):
-        if not getattr(render, key):
-            message = "got false, but a line_of_sight capture has no such technique; remove it."
-            yield Fault(("render", key), message, needs=(_SCAN,))
     yield from _too_few_bounces(render, 0, "0 is the emitters alone, 1 what they light.")
 
 
@@ -57,9 +53,6 @@ def relay_wall_faults(scene: SceneConfig, capture: CaptureConfig, render: Render
         message = "missing, it is required: the visible surface, told by its type; "
         message += "only scan_type: line_of_sight does without."
         yield Fault(("scene", "relay_wall"), message, needs=(_SCAN,))
-    if scene.emitters:
-        message = "a relay wall is lit by the laser alone; remove it, or use capture.scan_type: line_of_sight."
-        yield Fault(("scene", "emitters"), message, "key", (_SCAN, ("scene", "emitters")))
     if scene.mitsuba is not None:
         message = "a whole Mitsuba scene is for scan_type: line_of_sight; here its shapes go into hidden_geometry, "
         message += "one by one, as {type: mitsuba, shape: {...}, bsdf: {...}} or {type: mesh, ...}."

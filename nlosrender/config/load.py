@@ -168,7 +168,7 @@ def _validate(document: Document, context: dict[str, Any]) -> Config:
         else:
             if problems:
                 break
-            return config
+            return config.noting(document.notes)
         fresh = [detail for detail in details if not _is_echo(detail, broken)]
         problems += [problem_from(detail, document) for detail in fresh[:MOST_PROBLEMS]]
         n_untold += len(fresh[MOST_PROBLEMS:])

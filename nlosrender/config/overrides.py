@@ -11,6 +11,7 @@ from nlosrender.config.yaml_tree import MAX_DEPTH, Document, Place, read_documen
 from nlosrender.errors import ConfigError, Problem
 
 _NOTHING = ("", "~", "null", "Null", "NULL")
+_GOALS = ("spp", "target_error")  # exclude each other
 _LONGEST_PLACE = 80  # characters of an absurd override that still help
 
 
@@ -81,6 +82,7 @@ def put(document: Document, parts: Sequence[str], value: Any, place: Place) -> N
         path = (*path, step)
         if depth == len(parts) - 1:
             container[step] = value
+            _push_out(document, path)
         elif isinstance(container, list):
             container = container[step]  # type: ignore[index]
         else:
@@ -89,6 +91,16 @@ def put(document: Document, parts: Sequence[str], value: Any, place: Place) -> N
                 _own(document, path, place)
             container = container[step]
     _own(document, path, place)
+
+
+def _push_out(document: Document, path: KeyPath) -> None:
+    """Let a goal that is set over the file's win over the other one, which it excludes."""
+    section = document.tree.get("render")
+    for goal, other in (_GOALS, _GOALS[::-1]):
+        if path == ("render", goal) and section.get(goal) is not None and section.get(other) is not None:
+            note = f"render.{other} has no effect beside render.{goal}, which is set over it."
+            document.notes.append(note)
+            section[other] = None
 
 
 def _own(document: Document, path: KeyPath, place: Place) -> None:

@@ -201,7 +201,14 @@ def _told(problem: Problem, indices: list[int], settings: tuple[tuple[_Setting, 
 
 def _capture_document(base: Document, settings: tuple[_Setting, ...], index: int) -> Document:
     """Return the document of one capture: the base with the swept values in place and an output of its own."""
-    document = Document(base.source, copy.deepcopy(base.tree), dict(base.places), list(base.problems), set(base.unread))
+    document = Document(
+        base.source,
+        copy.deepcopy(base.tree),
+        dict(base.places),
+        list(base.problems),
+        list(base.notes),
+        set(base.unread),
+    )
     for setting in settings:
         place = Place(base.place(setting.key_at, "key"), base.place(setting.at))
         try:

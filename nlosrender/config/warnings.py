@@ -21,8 +21,15 @@ from nlosrender.config.vectors import length
 def config_warnings(config: Config) -> tuple[str, ...]:
     """Return one sentence for each thing in a valid config that is pointless or surprising."""
     if config.capture.is_line_of_sight:
-        return (*_dark_view(config), *_budget(config))
-    return (*_dark_scene(config), *_behind_the_wall(config), *_bounces(config), *_budget(config), *_file(config))
+        return (*config.notes, *_dark_view(config), *_budget(config))
+    return (
+        *config.notes,
+        *_dark_scene(config),
+        *_behind_the_wall(config),
+        *_bounces(config),
+        *_budget(config),
+        *_file(config),
+    )
 
 
 def _dark_view(config: Config) -> Iterator[str]:

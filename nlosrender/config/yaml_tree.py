@@ -47,6 +47,7 @@ class Document:
     tree: Any
     places: dict[KeyPath, Place] = field(default_factory=dict)
     problems: list[Problem] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)  # what of the text has no effect
     unread: set[KeyPath] = field(default_factory=set)  # paths whose value is a stand-in for one that is no value
 
     def place(self, path: KeyPath, at: str = "value") -> str:

@@ -163,7 +163,7 @@ def test_an_override_can_repair_the_file() -> None:
             "scene.hidden_geometry.0.center",
             "missing, it is required",
         ),
-        ("capture.laser_grid.nx=4", "capture.laser_grid.ny", "missing, it is required"),
+        ("scene.hidden_geometry.0.bsdf.x=4", "scene.hidden_geometry.0.bsdf.type", "missing"),
     ],
 )
 def test_a_wrong_override_is_placed_at_the_override(override: str, key: str, message: str) -> None:
@@ -253,6 +253,9 @@ def test_the_examples_in_the_starter_are_valid(tmp_path: Path) -> None:
         ("render.time_limit_s=3", "time_limit_s alone"),
         ("render={max_bounces: null, russian_roulette: false}", "may take for ever. Limit max_bounces"),
         ("capture.sensor_grid.nx=6", r"sensor_grid\.nx is 6: y-tal's converter"),
+        ("capture.laser_grid={nx: 2, ny: 2}", r"^capture\.laser_grid has no effect with .* single; it is for exh"),
+        ("scene.hidden_geometry.0.size=[1, 1, 1]", r"^scene\.hidden_geometry\.0\.size has no effect with .*: sphere"),
+        ("scene.relay_wall.radius=1", r"^scene\.relay_wall\.radius has no effect with .*: rectangle; it is for sphere"),
     ],
 )
 def test_what_is_legal_but_pointless_is_said(override: str, match: str) -> None:
