@@ -26,6 +26,8 @@ from nlosrender.scene.transforms import transform_matrix
 from nlosrender.scene.triangle_mesh import TriangleMesh
 
 WHERE = "scene.mitsuba"
+SAME_AREA = 0.01  # float32, and bent quadrangles cut along the other diagonal
+_AS_ITEM = "Write it as triangles, or take it as an item of scene.hidden_geometry."
 _ADVICE = "Check its size and its transformation."
 _UNKNOWN = re.compile(r"string \(line (\d+), col \d+\): Found \d+ unreferenced propert")
 _PARAMETER = re.compile(r'^\s*- \w+ "([^"]+)"', re.MULTILINE)
@@ -118,7 +120,9 @@ def _mesh_of(parameters: Mapping[str, object]) -> TriangleMesh | None:
     try:
         if kind == "serialized":
             return _serialized(parameters)
-        return read_mesh(filename, kind, "flat")
+        mesh = read_mesh(filename, kind, "flat")
+        _check_reading(filename, kind, mesh)
+        return mesh
     except ValueError as error:
         raise ValueError(f"{filename} cannot be used as a mesh: {error}") from error
 
@@ -133,6 +137,17 @@ def _serialized(parameters: Mapping[str, object]) -> TriangleMesh:
     return TriangleMesh(
         np.reshape(arrays["vertex_positions"], (-1, 3)), np.reshape(arrays["faces"], (-1, 3)).astype(np.uint32)
     )
+
+
+def _check_reading(filename: str, kind: str, mesh: TriangleMesh) -> None:
+    """Refuse a file of which Mitsuba, whose reader a scene file goes through, makes another surface than ours."""
+    try:
+        theirs = mi.load_dict({"type": kind, "filename": filename, "face_normals": True})
+        area = float(np.ravel(theirs.surface_area())[0])
+    except RuntimeError as error:
+        raise ValueError(f"Mitsuba cannot read it: {first_line(error)}. {_AS_ITEM}") from error
+    if abs(area - mesh.area) > SAME_AREA * mesh.area:
+        raise ValueError(f"Mitsuba reads {area:.4g} of its {mesh.area:.4g} square units. {_AS_ITEM}")
 
 
 @cache  # scenes may have thousands

@@ -212,6 +212,19 @@ def test_a_shape_that_is_not_there_is_refused(shape: str, message: str, tmp_path
     assert caught.value.problems[0].key == "scene.mitsuba"
 
 
+def test_a_mesh_that_mitsuba_reads_otherwise_is_refused(tmp_path: Path) -> None:
+    """An L as one polygon: Mitsuba cuts a fan of 1.5 times its area; as triangles it is taken."""
+    corners = [(0, 0.8), (0.24, 0.8), (0.24, 0.24), (0.8, 0.24), (0.8, 0), (0, 0)]
+    lines = [f"v {x} {y} 3" for x, y in corners]
+    shape = "<shape type='obj'><string name='filename' value='ell.obj'/></shape>"
+    (tmp_path / "ell.obj").write_text("\n".join([*lines, "f 1 2 3 4 5 6"]))
+    message = r"line 2: <shape type='obj'>: .*ell\.obj cannot be used as a mesh: Mitsuba reads .* of its 0\.3264 square"
+    with pytest.raises(ConfigError, match=message):
+        seen(tmp_path, shape)
+    (tmp_path / "ell.obj").write_text("\n".join([*lines, "f 1 2 6", "f 2 3 6", "f 3 4 6", "f 4 5 6"]))
+    assert seen(tmp_path, shape).mean.any()
+
+
 def test_a_flat_shape_is_told_without_a_renderer(tmp_path: Path) -> None:
     """What the numbers of the file tell, ``validate`` tells."""
     write_scene(tmp_path, "<shape type='disk'><transform name='to_world'><scale value='0'/></transform></shape>")
