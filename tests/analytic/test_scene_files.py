@@ -215,13 +215,13 @@ def test_a_shape_that_is_not_there_is_refused(shape: str, message: str, tmp_path
 def test_a_mesh_that_mitsuba_reads_otherwise_is_refused(tmp_path: Path) -> None:
     """An L as one polygon: Mitsuba cuts a fan of 1.5 times its area; as triangles it is taken."""
     corners = [(0, 0.8), (0.24, 0.8), (0.24, 0.24), (0.8, 0.24), (0.8, 0), (0, 0)]
-    lines = [f"v {x} {y} 3" for x, y in corners]
+    lines = [f"v {x} {y} -1" for x, y in corners]
     shape = "<shape type='obj'><string name='filename' value='ell.obj'/></shape>"
     (tmp_path / "ell.obj").write_text("\n".join([*lines, "f 1 2 3 4 5 6"]))
     message = r"line 2: <shape type='obj'>: .*ell\.obj cannot be used as a mesh: Mitsuba reads .* of its 0\.3264 square"
     with pytest.raises(ConfigError, match=message):
         seen(tmp_path, shape)
-    (tmp_path / "ell.obj").write_text("\n".join([*lines, "f 1 2 6", "f 2 3 6", "f 3 4 6", "f 4 5 6"]))
+    (tmp_path / "ell.obj").write_text("\n".join([*lines, "f 1 6 2", "f 2 6 3", "f 3 6 4", "f 4 6 5"]))
     assert seen(tmp_path, shape).mean.any()
 
 
