@@ -30,7 +30,7 @@ from nlosrender.files.capture_file import CaptureHeader
 from nlosrender.files.chunks import sensor_tile
 from nlosrender.files.identity import capture_identity, files_read, identity_attributes
 from nlosrender.files.kinds import CAPTURE
-from nlosrender.files.part_attributes import part_attributes, summed_attributes
+from nlosrender.files.part_attributes import MISSED, part_attributes, summed_attributes
 from nlosrender.files.partial_capture import PartialCapture
 from nlosrender.files.provenance import provenance_attributes
 from nlosrender.files.replacement import check_writable
@@ -52,6 +52,8 @@ if TYPE_CHECKING:
     from nlosrender.rendering.units import Engine
     from nlosrender.scene.build import BuiltScene
     from nlosrender.scene.view import BuiltView
+
+MISSED_BY = 1.1  # times the target: the estimate has an error of its own
 
 
 def render_capture(
@@ -147,6 +149,10 @@ def render_capture(
             missing = tuple(paths.summary for paths in unsampled)
             zero = () if tally.sums.squares else zero_capture(engine, unsampled, tally.sums, warnings)
             results = summed_attributes(tally.sums, bounces, stopwatch.report(), missing, zero)
+            missed = missed_target(config, tally.sums.stated_error(missing))
+            if missed and selection == WHOLE:
+                results[MISSED] = missed
+            warnings.say([missed] if missed else [])
             if selection != WHOLE:
                 results |= part_attributes(plan.part, plan.tiling, tally)
             partial.publish(results)
@@ -196,6 +202,18 @@ def zero_capture(
     reasons = zero_reasons(engine, unsampled, float(sums.outside))
     warnings.say([f"H is zero everywhere: {'; '.join(reasons)}."])
     return reasons
+
+
+def missed_target(config: Config, stated: float) -> str | None:
+    """Return a warning where the stated error is above the asked-for one; None where it is not, or not known."""
+    asked = config.render.target_error
+    if asked is None or not stated > MISSED_BY * asked:
+        return None
+    limit = config.render.time_limit_s
+    why = "surfaces and paths cost more than the engine can take, or a pilot of a few points saw less than there is"
+    if limit is not None:
+        why = f"render.time_limit_s is {limit:g}, or {why}"
+    return f"render.target_error: {asked:.3g} was asked for, the error that is stated is {stated:.3g} ({why})."
 
 
 def started_backend(config: Config) -> Backend:

@@ -160,7 +160,8 @@ class PathEngine:
         batch, budget, passes
             What to render, when to stop; who is told between two launches how far it is.
         known_squares
-            Sum of the squares of H known from elsewhere, which ``target_error`` counts in [(engine unit)^-4].
+            Sum of the squares of H known from elsewhere, which ``target_error`` counts in [(engine unit)^-4]; those of
+            the second bounce not among them.
 
         Returns
         -------
@@ -180,6 +181,8 @@ class PathEngine:
             )
         if self._has_bounces:
             transport = self._of_paths(batch, shape, self._further_every(budget))
+            if budget.target_error is not None:
+                known_squares += self.second_squares(batch)
             schedule = Schedule(budget, shape.replicas, known_squares, shape.lanes * shape.lasers)
             mean, variance, per_lane = self._accumulate(batch, shape, transport, schedule, passes or Passes())
         else:
@@ -201,7 +204,7 @@ class PathEngine:
         budget
             What is asked for.
         known_squares
-            Sum of the squares of H over the pilot's points known from elsewhere [(engine unit)^-4].
+            As for ``render``, over the pilot's points.
         """
         if budget.is_settled:
             return budget
@@ -216,7 +219,7 @@ class PathEngine:
         def look(schedule: Schedule) -> int:
             return self._accumulate(pilot, shape, transport, schedule, Passes())[2]
 
-        return settled_by_pilot(budget, shape.replicas, look, known_squares)
+        return settled_by_pilot(budget, shape.replicas, look, known_squares + self.second_squares(pilot))
 
     @property
     def n_slots(self) -> int:
@@ -345,7 +348,13 @@ class PathEngine:
         self.integrator.accumulate(transport, histogram, random, strata, PILOT_SAMPLES)
         return float(histogram.on_host(histogram.statistics(PILOT_SAMPLES)[1])[..., :-1].sum())
 
-    def second_bounce(self, batch: Batch) -> np.ndarray:
+    def second_squares(self, batch: Batch | Pilot) -> float:
+        """Return the sum of the squares of the second bounce, which a target error counts in [(engine unit)^-4]."""
+        if self.built.wall.is_planar:
+            return 0.0
+        return float(np.square(self.second_bounce(batch)[..., :-1] / self.scale).sum())
+
+    def second_bounce(self, batch: Batch | Pilot) -> np.ndarray:
         """Return the second bounce (channel, 1, laser, sensor, row): exact, so one replica computes it."""
         shape = replace(self.shape(batch, 1), replicas=1)
         histogram = DeviceHistogram(shape)

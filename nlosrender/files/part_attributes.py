@@ -15,7 +15,7 @@ from nlosrender.files.sums import Sums
 from nlosrender.files.unit_log import Tally
 
 PART, SUMS, CHECKSUMS, NOTE = "part", "part_sums", "part_checksums", "incomplete"
-UNSAMPLED, ZERO = "unsampled_paths", "zero_because"
+UNSAMPLED, ZERO, MISSED = "unsampled_paths", "zero_because", "target_missed"
 
 
 @dataclass(frozen=True)

@@ -150,6 +150,7 @@ class VirtualLightEngine:
         if self.further is None:
             return replace(budget, fineness=fineness)
         goal, squares = REST_OF_MANY * target, third.squares * (pilot.sensors.size / few.sensors.size)
+        squares += self.paths.second_squares(pilot)
         replicas = max(2, PILOT_LANES // pilot.sensors.size // 2 * 2)
         histogram = self.further.histogram(pilot, replicas)
         done, error = 0, math.inf
@@ -207,7 +208,7 @@ class VirtualLightEngine:
         if self.further is None:
             known_squares = third.squares if self.has_further_bounces else 0.0
             return self.paths.render(batch, budget, passes, known_squares=known_squares)
-        known_squares = third.squares
+        known_squares = third.squares + self.paths.second_squares(batch)
         histogram = self.further.histogram(batch, self.options.replicas)
         done, skipped, before = 0, 0, 0.0
         if (earlier := passes.resumed("sums")) is not None:
@@ -248,13 +249,13 @@ class VirtualLightEngine:
         lasers = pilot.lasers.size if self.capture.scan_type == "exhaustive" else 1
         more = pairs / (pilot.sensors.size * lasers)
         fineness = FIRST_COARSENESS
-        coarse = self.third.gather(pilot, fineness)
+        coarse, second = self.third.gather(pilot, fineness), self.paths.second_squares(pilot)
         while True:
             finer = self.third.finer(fineness, REFINEMENT)
             begun = time.perf_counter()
             fine = self.third.gather(pilot, finer)
             predicted = (time.perf_counter() - begun) * more * 4
-            error = estimated_error(coarse, fine)
+            error = estimated_error(coarse, fine, second)
             if error <= target or predicted > (budget.time_limit_s or 0.0) / 2:
                 return finer if error <= target else fineness
             fineness, coarse = finer, fine

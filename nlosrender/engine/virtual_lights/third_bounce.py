@@ -239,7 +239,11 @@ class ThirdBounce:
         return coarse, self.gather(batch, fineness, passes.stage("fine", 1 / (1 + REFINEMENT), 1))
 
     def settle(self, pilot: Pilot, target: float) -> tuple[float, Gathered]:
-        """Return the fineness whose estimated error is at most ``target``, and the pilot's third bounce at it."""
+        """Return the fineness whose estimated error is at most ``target``, and the pilot's third bounce at it.
+
+        The error is that of the second and third bounce together.
+        """
+        second = self.paths.second_squares(pilot)
         tried = [(self.gather(pilot, FIRST_COARSENESS), math.inf)]  # and its error, coarse to fine
         fineness = self.finer(FIRST_COARSENESS, REFINEMENT)
         while True:
@@ -247,11 +251,11 @@ class ThirdBounce:
             # None nearer: two that differ in few patches only differ by more than either errs, by how they are cut.
             tried = tried[_last_at_most(tried, fine.n_patches / APART) :]
             coarse = tried[0][0]
-            error = estimated_error(coarse, fine)
+            error = estimated_error(coarse, fine, second)
             coarser = self.coarser(fineness)
             if error <= target and not math.isclose(coarse.coarseness, coarser, rel_tol=SAME):
                 # as the render will estimate it, from the pair of resolutions that it has
-                error = max(error, estimated_error(self.gather(pilot, coarser), fine))
+                error = max(error, estimated_error(self.gather(pilot, coarser), fine, second))
             needed = fine.n_patches * error / target
             # float32 path lengths and grazing contacts leave an error that no refinement takes away
             earlier = tried[_last_at_most(tried, fine.n_patches / 2)][1]
@@ -313,10 +317,10 @@ def _last_at_most(tried: list[tuple[Gathered, float]], n_patches: float) -> int:
     return max((index for index, (gathered, _) in enumerate(tried) if gathered.n_patches <= n_patches), default=0)
 
 
-def estimated_error(coarse: Gathered, fine: Gathered) -> float:
-    """Return the relative L2 error of the finer resolution."""
+def estimated_error(coarse: Gathered, fine: Gathered, known_squares: float = 0.0) -> float:
+    """Return the relative L2 error of the finer resolution, with ``known_squares`` of other bounces beside it."""
     noise = _squares(fine.values - coarse.values) / difference_divisor(coarse, fine) ** 2
-    return relative_l2_error(noise, fine.squares + noise)
+    return relative_l2_error(noise, fine.squares + noise + known_squares)
 
 
 def difference_divisor(coarse: Gathered, fine: Gathered) -> float:
