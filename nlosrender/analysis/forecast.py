@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -14,10 +14,13 @@ from nlosrender.engine.backend import Backend, scene_memory
 from nlosrender.files.capture_file import CaptureHeader
 from nlosrender.files.size import FileSize, forecast_size
 from nlosrender.scene.mesh_report import MeshReport
+from nlosrender.units import readable_duration
 
 if TYPE_CHECKING:
     from nlosrender.engine.engines import Engine
     from nlosrender.engine.skipped import Skipped
+
+LONGEST_WAIT = 30 * 86_400.0  # s
 
 
 @dataclass(frozen=True)
@@ -89,7 +92,7 @@ def forecast_render(
     budget = Budget(render.spp, render.target_error, render.time_limit_s)
     rendering = estimate_render_time(engine, plan, budget, backend.lanes)
     size = forecast_file(config, header, engine, rendering.lit_shares)
-    around = seconds_before + size.write_seconds
+    seconds = None if rendering.seconds is None else rendering.seconds + seconds_before + size.write_seconds
     return Forecast(
         engine=engine.name,
         reason=engine.reason,
@@ -107,12 +110,30 @@ def forecast_render(
         scene_bytes=scene_memory(engine.built.n_triangles),
         output=Path(config.output.path),
         file=size,
-        seconds_estimate=None if rendering.seconds is None else rendering.seconds + around,
+        seconds_estimate=seconds,
         estimate_basis=rendering.basis,
-        warnings=warnings,
+        warnings=(*warnings, *duration_warnings(config, seconds)),
         meshes=engine.built.meshes,
         unsampled_paths=unsampled,
     )
+
+
+def duration_warnings(config: Config, seconds: float | None) -> Iterator[str]:
+    """Yield what to do about a render that takes longer than anybody waits.
+
+    Parameters
+    ----------
+    config
+        What is rendered.
+    seconds
+        It takes [s]; None: not known.
+    """
+    if seconds is not None and seconds > LONGEST_WAIT:
+        goal = "a larger render.target_error" if config.render.spp is None else "a lower render.spp"
+        yield (
+            f"this takes about {readable_duration(seconds)} on this machine: ask for {goal}, fewer points or bins, or "
+            "set render.time_limit_s."
+        )
 
 
 def forecast_file(

@@ -10,6 +10,7 @@ import typer
 
 from nlosrender.capture.bounces import LINE_OF_SIGHT
 from nlosrender.cli.json_output import OUTPUT
+from nlosrender.units import readable_duration
 
 if TYPE_CHECKING:
     from nlosrender.analysis.forecast import Forecast
@@ -84,9 +85,9 @@ def _lines(forecast: Forecast) -> Iterator[str]:
         f"{readable_size(size.disk_bytes_estimate)} on disk ({size.assumption})"
     )
     if forecast.seconds_estimate is None:
-        yield f"seconds  cannot be told ({forecast.estimate_basis})"
+        yield f"takes    a time that cannot be told ({forecast.estimate_basis})"
     else:
-        yield f"seconds  about {forecast.seconds_estimate:.2g} ({forecast.estimate_basis})"
+        yield f"takes    about {readable_duration(forecast.seconds_estimate)} ({forecast.estimate_basis})"
 
 
 def _scan(forecast: Forecast) -> str:

@@ -10,6 +10,7 @@ import typer
 from nlosrender.cli.file_commands import CaptureFile
 from nlosrender.cli.json_output import OUTPUT
 from nlosrender.cli.progress import progress_bar
+from nlosrender.units import readable_duration
 
 if TYPE_CHECKING:
     from nlosrender.analysis.reconstruction.reconstruct import Reconstruction
@@ -158,4 +159,4 @@ def _print_report(found: Reconstruction, score: Score | None, written: list[Path
             f"  score    correlation {score.correlation:.3f}, IoU {score.iou:.3f} with the true silhouette "
             f"(threshold {score.threshold:.2f} of the largest value)"
         )
-    typer.echo(f"  seconds  {found.seconds:.2f}")
+    typer.echo(f"  took     {readable_duration(found.seconds)}")

@@ -12,6 +12,7 @@ import typer
 
 from nlosrender.capture.bounces import LINE_OF_SIGHT
 from nlosrender.cli.json_output import OUTPUT
+from nlosrender.units import readable_duration
 
 if TYPE_CHECKING:
     from nlosrender.capture.part import Selection
@@ -200,5 +201,5 @@ def _print_report(report: RenderReport) -> None:
     energies = ", ".join(f"{name}: {energy:.4g}" for name, energy in report.energy.items())
     counted = "interactions" if is_view else "bounce"
     typer.echo(f"  energy          {counted} {energies}; outside the time window: {report.out_of_window:.4g}")
-    stages = ", ".join(f"{stage} {spent:.2f}" for stage, spent in seconds.items() if stage != "total")
-    typer.echo(f"  seconds         {seconds['total']:.2f} ({stages})")
+    stages = ", ".join(f"{stage} {readable_duration(spent)}" for stage, spent in seconds.items() if stage != "total")
+    typer.echo(f"  took            {readable_duration(seconds['total'])} ({stages})")

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import typer
 
 from nlosrender.cli.json_output import OUTPUT
+from nlosrender.units import readable_duration
 
 if TYPE_CHECKING:
     from nlosrender.analysis.forecast import Forecast
@@ -62,7 +63,7 @@ def render_all(
     elif not quiet:
         typer.echo(f"wrote {report.index}: {report.captures} captures")
         typer.echo(f"  rendered        {report.rendered}, finished by earlier runs {report.earlier}")
-        typer.echo(f"  seconds         {report.seconds:.2f}")
+        typer.echo(f"  took            {readable_duration(report.seconds)}")
     if report.failed:
         listed = "\n".join(f"{entry.file}: {entry.message}" for entry in report.failed)
         raise RenderError(f"{listed}\n{len(report.failed)} of {report.captures} captures failed.")
@@ -97,7 +98,8 @@ def plan_all(sweep: Sweep, overrides: Sequence[str], as_json: bool) -> None:
     logical, disk = readable_size(total["logical_bytes"]), readable_size(total["disk_bytes_estimate"])
     typer.echo(f"files    {logical} for a reader, about {disk} on disk ({basis})")
     seconds = total["seconds_estimate"]
-    typer.echo(f"seconds  {'cannot be told' if seconds is None else f'about {seconds:.2g} ({basis})'}")
+    told = "a time that cannot be told" if seconds is None else f"about {readable_duration(seconds)}"
+    typer.echo(f"takes    {told} ({basis})")
     for warning in dict.fromkeys(warning for forecast in forecasts for warning in forecast.warnings):
         typer.echo(f"warning: {warning}", err=True)
 

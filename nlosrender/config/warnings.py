@@ -17,6 +17,8 @@ from nlosrender.config.hidden_geometry import (
 from nlosrender.config.relay_wall import RectangleWallConfig
 from nlosrender.config.vectors import length
 
+FLOAT32_ROUNDING = 2.0**-24  # relative, at most
+
 
 def config_warnings(config: Config) -> tuple[str, ...]:
     """Return one sentence for each thing in a valid config that is pointless or surprising."""
@@ -87,6 +89,12 @@ def _bounces(config: Config) -> Iterator[str]:
 
 
 def _budget(config: Config) -> Iterator[str]:
+    target = config.render.target_error
+    if target is not None and target < FLOAT32_ROUNDING:
+        yield (
+            f"render.target_error is {target:g}: the samples of the file are 32-bit numbers, rounded by "
+            f"{FLOAT32_ROUNDING:.0e}; no render gets there."
+        )
     if config.render.spp is None and config.render.target_error is None and config.render.time_limit_s is not None:
         yield "render.time_limit_s alone: the error is whatever the time allows; the file says how large it is."
     if config.render.max_bounces is None and not config.render.russian_roulette:

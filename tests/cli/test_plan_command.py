@@ -118,7 +118,7 @@ def test_the_plan_is_readable():
         "time",
         "memory",
         "file",
-        "seconds",
+        "takes",
     ]
     assert result.stderr == ""
 
@@ -155,6 +155,17 @@ def test_walks_take_all_the_time_there_is(bounces: str, takes_all: bool) -> None
     plan = planned(write_config(), *changes, "--set", f"render.max_bounces={bounces}")
     assert plan["engine"] == "virtual_lights"
     assert (plan["seconds_estimate"] >= 1000) == takes_all  # the start counts, too
+
+
+def test_the_impossible_is_told_in_years():
+    """1e-12 takes (1e-2 / 1e-12)^2 = 1e20 times what 1 % does: years, with what to do, and why it is never reached."""
+    changes = ["--set", "render.engine=path", "--set", "render.target_error=1e-12"]
+    result = run("plan", write_config(), *changes)
+    line = next(line for line in result.stdout.splitlines() if line.startswith("takes"))
+    years = float(re.match(r"takes    about ([\d.e+]+) years \(", line)[1])
+    assert 1e8 < years < 1e18  # 1e20 times something between a microsecond and minutes
+    assert "ask for a larger render.target_error" in result.stderr
+    assert "no render gets there" in result.stderr
 
 
 def test_impossible_sizes_end_in_an_error():
