@@ -36,7 +36,8 @@ def with_normals(mesh: TriangleMesh, normals: Normals) -> tuple[TriangleMesh, st
     own = _unit(np.zeros_like(mesh.vertices) if mesh.normals is None else mesh.normals)
     has = _are_there(own)[mesh.faces]  # (m, 3)
     if normals == "file" and not has.all():
-        raise ValueError(f"{int((~has).any(axis=1).sum())} of its {len(has)} triangles have no normals")
+        lacking = int((~has).any(axis=1).sum())
+        raise ValueError(f"{lacking} of its {len(has)} triangles have no normals; normals: auto takes these for flat")
     if normals == "flat" or (normals == "auto" and not has.any()):
         return TriangleMesh(mesh.vertices, mesh.faces, mesh.uvs), "flat"
     if normals == "smooth":

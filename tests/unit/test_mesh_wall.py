@@ -41,6 +41,13 @@ def refused(folder: Path, vertices: Any, uvs: Any, faces: Any, **capture: Any) -
     return str(caught.value)
 
 
+def _mesh_wall(name: str, **keys: Any) -> dict[str, Any]:
+    """Configuration with a mesh as its wall."""
+    config = flat_wall()
+    config["scene"]["relay_wall"] = {"type": "mesh", "filename": name, **keys}
+    return config
+
+
 @pytest.mark.parametrize("suffix", ["ply", "obj"])
 def test_a_flat_mesh_is_the_rectangle(tmp_path: Path, suffix: str) -> None:
     """Wall coordinates of a flat mesh are the rectangle's, whatever its file format; it lies in z = 0 exactly."""
@@ -62,6 +69,25 @@ def test_a_pose_moves_the_wall_and_leaves_its_frame(tmp_path: Path) -> None:
     np.testing.assert_allclose(there.positions(2 * xy), 2 * here.positions(xy), atol=1e-12)
     np.testing.assert_allclose(there.normals(2 * xy), here.normals(xy), atol=1e-12)
     assert not here.is_planar
+
+
+def test_a_mirrored_wall_keeps_its_front(tmp_path: Path) -> None:
+    """Scales along the axes, one of them negative: points and normals are those of the wall, mirrored and stretched."""
+    scale = np.array([-1.0, 1.5, 1.0])
+    name = write_ply(tmp_path / "wall.ply", *sheet(wavy(WIDTH, HEIGHT, 0.1), 7, 5))
+    here, there = (
+        mesh_wall_from_config(configured(_mesh_wall(name, scale=factors), folder=tmp_path).scene.wall)  # type: ignore[arg-type]
+        for factors in (1.0, scale.tolist())
+    )
+    uv = np.random.default_rng(4).random((40, 2)) - 0.5
+    points, normals = [], []
+    for wall in (here, there):
+        xy = uv * [wall.width, wall.height]
+        points.append(wall.pose.to_scene(wall.positions(xy)))
+        normals.append(wall.pose.direction_to_scene(wall.normals(xy)))
+    np.testing.assert_allclose(points[1], points[0] * scale, atol=1e-12)
+    expected = normals[0] / scale  # inverse transpose
+    np.testing.assert_allclose(normals[1], expected / np.linalg.norm(expected, axis=1, keepdims=True), atol=1e-12)
 
 
 def test_points_lie_on_the_surface_that_the_mesh_stands_for(tmp_path: Path) -> None:
