@@ -24,6 +24,7 @@ from nlosrender.scene.hidden_geometry import (
     joined_bounds,
 )
 from nlosrender.scene.materials import area_emitter, check_surface, first_line, load_bsdf, medium_warnings, rejected
+from nlosrender.scene.mesh_attributes import VERTEX_COLOR, attribute_uses
 from nlosrender.scene.mesh_report import MeshReport
 from nlosrender.scene.mesh_surfaces import read_surfaces
 from nlosrender.scene.pictures import upright_bsdf
@@ -150,12 +151,25 @@ def load_surface(surface: Surface, shape: TriangleMesh | ShapeDescription, unit:
     ConfigError
         Mitsuba rejects the shape or its BSDF, or float32 rounds it to nothing.
     """
+    colors = shape.colors if isinstance(shape, TriangleMesh) else None
+    _check_attributes(surface, {} if colors is None else {VERTEX_COLOR: colors})
     if isinstance(shape, TriangleMesh):
         loaded = _load_mesh(shape, surface, unit)
     else:
         loaded = _load_shape(shape.description, surface.bsdf, surface.key, surface.name, unit, surface.radiance)
     check_surface(loaded, f"{surface.key}.bsdf")
     return loaded
+
+
+def _check_attributes(surface: Surface, attributes: Mapping[str, Float64]) -> None:
+    """Refuse textures that read what the surface does not have: Mitsuba takes it for black."""
+    for use in attribute_uses(surface.bsdf):
+        try:
+            if surface.name == WALL_ID:
+                raise ValueError(f"{use.parameter}: a relay wall's points have no attribute {use.name}; use a bitmap")
+            use.check(attributes)
+        except ValueError as error:
+            raise rejected(f"{surface.key}.bsdf", f"{error}.") from error
 
 
 def _load_mesh(mesh: TriangleMesh, surface: Surface, unit: float) -> mi.Mesh:
@@ -186,6 +200,8 @@ def _load_mesh(mesh: TriangleMesh, surface: Surface, unit: float) -> mi.Mesh:
     if mesh.uvs is not None:
         parameters["vertex_texcoords"] = np.ravel(mesh.uvs).astype(np.float32)
     parameters.update()
+    if mesh.colors is not None and any(attribute_uses(surface.bsdf)):
+        shape.add_attribute(VERTEX_COLOR, 3, np.ravel(mesh.colors).astype(np.float32))
     return shape
 
 

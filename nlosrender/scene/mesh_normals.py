@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Literal
 
 import numpy as np
@@ -39,7 +40,7 @@ def with_normals(mesh: TriangleMesh, normals: Normals) -> tuple[TriangleMesh, st
         lacking = int((~has).any(axis=1).sum())
         raise ValueError(f"{lacking} of its {len(has)} triangles have no normals; normals: auto takes these for flat")
     if normals == "flat" or (normals == "auto" and not has.any()):
-        return TriangleMesh(mesh.vertices, mesh.faces, mesh.uvs), "flat"
+        return replace(mesh, normals=None), "flat"
     if normals == "smooth":
         return _torn(mesh, smooth_normals(mesh, joined=True)), "smoothed"
     if normals == "mitsuba" and not _are_there(own).all():
@@ -48,7 +49,7 @@ def with_normals(mesh: TriangleMesh, normals: Normals) -> tuple[TriangleMesh, st
         return _torn(mesh, own), "file" if has.any() else "smoothed"
     mesh = _torn(mesh, own)
     if normals == "auto" and normal_cosines(mesh).min() > SAME_NORMAL:
-        return TriangleMesh(mesh.vertices, mesh.faces, mesh.uvs), "flat"
+        return replace(mesh, normals=None), "flat"
     return mesh, "file"
 
 
@@ -101,7 +102,7 @@ def _torn(mesh: TriangleMesh, normals: Float64) -> TriangleMesh:
     """Return the mesh with these normals, and with their face's where they are zero."""
     torn = ~_are_there(normals)[mesh.faces]
     if not torn.any():
-        return TriangleMesh(mesh.vertices, mesh.faces, mesh.uvs, normals)
+        return replace(mesh, normals=normals)
     # Faces that share such a vertex may disagree: each gets one of its own.
     owners = mesh.faces[torn]
     faces = mesh.faces.astype(np.int64)
@@ -111,4 +112,5 @@ def _torn(mesh: TriangleMesh, normals: Float64) -> TriangleMesh:
         faces,
         None if mesh.uvs is None else np.concatenate([mesh.uvs, mesh.uvs[owners]]),
         np.concatenate([normals, mesh.face_normals()[np.nonzero(torn)[0]]]),
+        None if mesh.colors is None else np.concatenate([mesh.colors, mesh.colors[owners]]),
     )

@@ -26,6 +26,7 @@ from nlosrender.scene.triangle_mesh import TriangleMesh
 
 POSITION, NORMAL = ("x", "y", "z"), ("nx", "ny", "nz")
 TEXTURE_COORDINATES = (("u", "v"), ("s", "t"), ("texture_u", "texture_v"))
+COLORS = (("red", "green", "blue"), ("r", "g", "b"))
 FACE_LISTS = ("vertex_indices", "vertex_index")
 MATERIALS = ("texnumber", "material_index")  # of a face
 FACES, STRIPS = "face", "tristrips"
@@ -73,7 +74,7 @@ def read_ply(content: bytes) -> FileMesh:
     uvs = next((_columns(vertices, names) for names in TEXTURE_COORDINATES if set(names) <= set(vertices)), None)
     normals = _columns(vertices, NORMAL) if set(NORMAL) <= set(vertices) else None
     faces, corner_uvs = np.concatenate([part.faces for part in parts]), _joined_uvs(parts)
-    mesh = TriangleMesh(positions, faces, uvs, normals)
+    mesh = TriangleMesh(positions, faces, uvs, normals, _colors(vertices, header))
     if corner_uvs is not None:
         mesh = with_corner_uvs(mesh, corner_uvs)
     columns = elements[FACES][0] if FACES in elements else {}
@@ -112,6 +113,17 @@ def _columns(columns: Mapping[str, NDArray], names: Sequence[str]) -> NDArray[np
     return np.column_stack([columns[name].astype(np.float64) for name in names])
 
 
+def _colors(vertices: Columns, header: PlyHeader) -> NDArray[np.float64] | None:
+    """Return the colours of the vertices, (n, 3); whole numbers stand for 0 to 1, and -1 for what is no number."""
+    names = next((names for names in COLORS if set(names) <= set(vertices)), None)
+    if names is None:
+        return None
+    types = [np.dtype(header.written_as("vertex", name)) for name in names]
+    whole = [np.iinfo(dtype).max if dtype.kind in "iu" else 1 for dtype in types]
+    colors = _columns(vertices, names) / whole
+    return np.where(np.isfinite(colors), colors, -1.0)
+
+
 def _joined_uvs(parts: Sequence[TriangleCorners]) -> CornerUvs | None:
     uvs = [part.uvs for part in parts if part.uvs is not None]
     return np.concatenate(uvs) if uvs and len(uvs) == len(parts) else None
@@ -127,8 +139,10 @@ def _dropped(header: PlyHeader) -> tuple[str, ...]:
     """Return what the file has beside its surface, in a few words each."""
     pair = next((names for names in TEXTURE_COORDINATES if set(names) <= set(header.names("vertex"))), ())
     normal = NORMAL if set(NORMAL) <= set(header.names("vertex")) else ()
-    read = {"vertex": {*POSITION, *normal, *pair}, FACES: {*FACE_LISTS, "texcoord", *MATERIALS}, STRIPS: {*FACE_LISTS}}
-    found = []
+    color = next((names for names in COLORS if set(names) <= set(header.names("vertex"))), ())
+    read = {FACES: {*FACE_LISTS, "texcoord", *MATERIALS}, STRIPS: {*FACE_LISTS}}
+    read |= {"vertex": {*POSITION, *normal, *pair, *color}}
+    found = [f"{', '.join(color)} of element vertex unless a mesh_attribute reads them"] if color else []
     for element in header.elements:
         if element.name not in read:
             found += [f"{element.count} of element {element.name}"] * bool(element.count)

@@ -106,7 +106,8 @@ def with_corner_uvs(mesh: TriangleMesh, uvs: CornerUvs) -> TriangleMesh:
     first = np.empty(int(which.max(initial=-1)) + 1, np.int64)
     first[which] = np.arange(len(which))
     normals = None if mesh.normals is None else mesh.normals[vertices[first]]
-    return TriangleMesh(mesh.vertices[vertices[first]], which.reshape(-1, 3), flat[first], normals)
+    colors = None if mesh.colors is None else mesh.colors[vertices[first]]
+    return TriangleMesh(mesh.vertices[vertices[first]], which.reshape(-1, 3), flat[first], normals, colors)
 
 
 def whole_numbers(values: NDArray) -> Int64:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -24,6 +24,7 @@ class PlyProperty:
     name: str
     dtype: str
     count_dtype: str | None  # of a list's length; None: one value
+    written_as: str = ""  # type of the value in the header, which an ASCII file is not read as
 
 
 @dataclass(frozen=True)
@@ -71,6 +72,11 @@ class PlyHeader:
         """Return the names of the properties of an element; none if there is no such element."""
         return tuple(prop.name for own in self.elements if own.name == element for prop in own.properties)
 
+    def written_as(self, element: str, name: str) -> str:
+        """Return the type of a value of an element as the header has it, such as u1."""
+        properties = [prop for own in self.elements if own.name == element for prop in own.properties]
+        return next(prop.written_as for prop in properties if prop.name == name)
+
     def promised(self) -> str:
         """Return how many of which elements there are, for messages."""
         return ", ".join(f"{element.count} of element {element.name}" for element in self.elements)
@@ -105,7 +111,7 @@ def read_header(content: bytes) -> PlyHeader:
             case ["property", "list", length, kind, name] if elements and {length, kind} <= set(TYPES):
                 elements[-1][2].append(PlyProperty(name, TYPES[kind], TYPES[length]))
             case ["property", kind, name] if elements and kind in TYPES:
-                elements[-1][2].append(PlyProperty(name, TYPES[kind], None))
+                elements[-1][2].append(PlyProperty(name, TYPES[kind], None, TYPES[kind]))
             case _:
                 raise ValueError(f"line {number} of its header means nothing: {line[:60]!r}")
     if not order:
@@ -119,6 +125,6 @@ def read_header(content: bytes) -> PlyHeader:
 def _ordered(prop: PlyProperty, byte_order: str) -> PlyProperty:
     """Return the property as it stands in the body; in an ASCII file, everything has been read as float64."""
     if byte_order == "=":
-        return PlyProperty(prop.name, "=f8", None if prop.count_dtype is None else "=f8")
+        return replace(prop, dtype="=f8", count_dtype=None if prop.count_dtype is None else "=f8")
     count = None if prop.count_dtype is None else byte_order + prop.count_dtype
-    return PlyProperty(prop.name, byte_order + prop.dtype, count)
+    return replace(prop, dtype=byte_order + prop.dtype, count_dtype=count)

@@ -28,6 +28,8 @@ class TriangleMesh:
         (n, 2) texture coordinates, or None.
     normals
         (n, 3) shading normals, or None for flat faces.
+    colors
+        (n, 3) reflectances of the vertices, linear r, g, b from 0 to 1; or None.
 
     Raises
     ------
@@ -39,6 +41,7 @@ class TriangleMesh:
     faces: NDArray[np.integer]
     uvs: Float64 | None = None
     normals: Float64 | None = None
+    colors: Float64 | None = None
 
     def __post_init__(self) -> None:
         vertices = _per_vertex("vertices", self.vertices, 3, None)
@@ -53,7 +56,7 @@ class TriangleMesh:
             raise ValueError(f"face {bad[0]} is {face}: indices must lie between 0 and {len(vertices) - 1}")
         object.__setattr__(self, "vertices", _frozen(vertices))
         object.__setattr__(self, "faces", _frozen(faces.astype(np.uint32)))
-        for name, width in (("uvs", 2), ("normals", 3)):
+        for name, width in (("uvs", 2), ("normals", 3), ("colors", 3)):
             rows = getattr(self, name)
             if rows is not None:
                 object.__setattr__(self, name, _frozen(_per_vertex(name, rows, width, len(vertices))))
@@ -115,12 +118,12 @@ class TriangleMesh:
             length = np.linalg.norm(normals, axis=1, keepdims=True)
             normals = np.divide(normals, length, out=np.zeros_like(normals), where=length > 0)
         faces = self.faces if determinant > 0 else self.faces[:, ::-1]
-        return TriangleMesh(self.vertices @ linear.T + matrix[:3, 3], faces, self.uvs, normals)
+        return TriangleMesh(self.vertices @ linear.T + matrix[:3, 3], faces, self.uvs, normals, self.colors)
 
     def turned_round(self) -> TriangleMesh:
         """Return the mesh seen from the other side: faces run the other way, normals point the other way."""
         normals = None if self.normals is None else -self.normals
-        return TriangleMesh(self.vertices, self.faces[:, ::-1], self.uvs, normals)
+        return TriangleMesh(self.vertices, self.faces[:, ::-1], self.uvs, normals, self.colors)
 
     def subset(self, mask: ArrayLike) -> TriangleMesh:
         """Return the faces where ``mask`` (m,) is true, without the vertices they do not use.
@@ -139,6 +142,7 @@ class TriangleMesh:
             indices.reshape(-1, 3).astype(np.uint32),
             None if self.uvs is None else self.uvs[used],
             None if self.normals is None else self.normals[used],
+            None if self.colors is None else self.colors[used],
         )
 
     def with_area_only(self) -> TriangleMesh:
@@ -151,6 +155,8 @@ class TriangleMesh:
     @staticmethod
     def merged(meshes: Sequence[TriangleMesh]) -> TriangleMesh:
         """Return one mesh with the faces of all, in order; uvs and normals are kept when every part has them.
+
+        Colours are not kept: nothing that is merged has any.
 
         Raises
         ------

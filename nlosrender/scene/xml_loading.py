@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import cache, reduce
 from pathlib import Path
 from xml.etree.ElementTree import Element
@@ -19,6 +19,7 @@ from nlosrender.scene.build import load_flat_serialized, shape_bounds
 from nlosrender.scene.hidden_geometry import MESH_PLUGINS, ShapeDescription, box_corners
 from nlosrender.scene.images import check_image
 from nlosrender.scene.materials import first_line, rejected
+from nlosrender.scene.mesh_attributes import AttributeUse
 from nlosrender.scene.mesh_file import read_mesh
 from nlosrender.scene.pose import Float64
 from nlosrender.scene.primitives import box_mesh, rectangle_mesh
@@ -28,6 +29,7 @@ from nlosrender.scene.triangle_mesh import TriangleMesh
 WHERE = "scene.mitsuba"
 SAME_AREA = 0.01  # float32, and bent quadrangles cut along the other diagonal
 _AS_ITEM = "Write it as triangles, or take it as an item of scene.hidden_geometry."
+OWN_BUFFERS = ("vertex_positions", "vertex_normals", "vertex_texcoords", "vertex_count", "face_count")
 _ADVICE = "Check its size and its transformation."
 _UNKNOWN = re.compile(r"string \(line (\d+), col \d+\): Found \d+ unreferenced propert")
 _PARAMETER = re.compile(r'^\s*- \w+ "([^"]+)"', re.MULTILINE)
@@ -50,8 +52,10 @@ def load_xml_scene(path: Path) -> tuple[mi.Scene, tuple[str, ...]]:
     """
     try:
         root, _ = read_mitsuba_xml(path)
+        with_id = {part.get("id", ""): part for part in root.iter() if part.tag in ("bsdf", "texture")}
         for shape in root.iter("shape"):
             _check_shape(shape)
+            _check_attributes(shape, with_id)
         for image in image_files(root):
             check_image(image)
     except ValueError as error:
@@ -71,10 +75,12 @@ def _loaded(root: Element, path: Path) -> tuple[mi.Scene, tuple[str, ...]]:
             return mi.load_string(text), tuple(warnings)
         except (RuntimeError, TypeError, ValueError) as error:
             unknown = _UNKNOWN.search(str(error))
-            if unknown is None:
+            names = _PARAMETER.findall(str(error))
+            plugin = elements[int(unknown[1]) - 1] if unknown else None
+            if plugin is None or not any(child.get("name") in names for child in plugin):
                 told = _LINE.sub(lambda found: place_of(elements[int(found[1]) - 1]), first_line(error))  # noqa: B023
                 raise rejected(WHERE, f"{path}: Mitsuba rejects this scene: {told}.") from error
-            warnings.append(_without_parameters(elements[int(unknown[1]) - 1], _PARAMETER.findall(str(error))))
+            warnings.append(_without_parameters(plugin, names))
 
 
 def _without_parameters(plugin: Element, names: Sequence[str]) -> str:
@@ -107,6 +113,39 @@ def _check_shape(shape: Element) -> None:
             raise ValueError(f"float32 rounds it to nothing where it is. {_ADVICE}")
     except ValueError as error:
         raise ValueError(f"{place_of(shape)}: {named(shape)}: {error}".removesuffix(".")) from error
+
+
+def _check_attributes(shape: Element, with_id: Mapping[str, Element]) -> None:
+    """Refuse textures that read what a shape does not have, or takes for reflectances above 1: Mitsuba says nothing."""
+    uses = list(_attribute_uses(shape, with_id))
+    if not uses:
+        return
+    attributes: dict[str, Float64] = {}
+    if shape.get("type") in MESH_PLUGINS:
+        filename = str(shape_parameters(shape)["filename"])
+        parameters = mi.traverse(mi.load_dict({"type": shape.get("type"), "filename": filename}))
+        names = [name for name in parameters.keys() if name.split("_")[0] in ("vertex", "face")]  # noqa: SIM118
+        attributes = {name: np.asarray(parameters[name]) for name in names if name not in OWN_BUFFERS}
+    for use in uses:
+        try:
+            use.check(attributes)
+        except ValueError as error:
+            raise ValueError(f"{place_of(shape)}: {named(shape)}: {error}") from error
+
+
+def _attribute_uses(
+    element: Element, with_id: Mapping[str, Element], parameter: str = "", within: tuple[str, ...] = ()
+) -> Iterator[AttributeUse]:
+    """Yield the textures in an element, and in what it refers to as ``parameter``, that read attributes."""
+    for texture in element.iter("texture"):
+        if texture.get("type") == "mesh_attribute":
+            values = shape_parameters(texture)
+            scale = values.get("scale", 1.0)
+            yield AttributeUse(texture.get("name") or parameter or "texture", str(values.get("name")), float(scale))
+    for reference in element.iter("ref"):
+        name = reference.get("id", "")
+        if name in with_id and name not in within:
+            yield from _attribute_uses(with_id[name], with_id, reference.get("name", ""), (*within, name))
 
 
 def _mesh_of(parameters: Mapping[str, object]) -> TriangleMesh | None:
