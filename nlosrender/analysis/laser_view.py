@@ -124,9 +124,9 @@ def _bands(capture: StoredCapture, laser: tuple[int, int]) -> Iterator[tuple[sli
     """Yield (bounce, rows, Nx, bin) for a few rows at a time, colour averaged."""
     n_rows = capture.header.sensor_grid[0]
     step = max(BAND_BYTES // _row_bytes(capture), 1)
-    chunks = capture.header.chunks
-    if chunks is not None and chunks[3] <= step:
-        step -= step % chunks[3]  # whole chunks, or each would be unpacked twice
+    chunks = dict(zip(capture.header.axes, capture.header.chunks or (), strict=False))
+    if chunks.get("sensor_y", step + 1) <= step:
+        step -= step % chunks["sensor_y"]  # whole chunks, or each would be unpacked twice
     for start in range(0, n_rows, step):
         rows = slice(start, min(start + step, n_rows))
         block = capture.read_block(lasers=laser, sensors=(rows, None))

@@ -21,8 +21,7 @@ def _rows(summary: dict[str, object]) -> list[tuple[str, str]]:
     """Return label and text of every line; an empty text means that the file does not say."""
     legs = {True: "included in time", False: "NOT included in time"}
     is_view = summary["scan_type"] == LINE_OF_SIGHT
-    checked = summary.get("violations")
-    verdict = "matches the Z-NLOS layout, all samples finite" if checked == [] else "FAILED, see below"
+    differences = _sequence(summary.get("deviations") or [])
     return [
         ("file", f"{summary['file']} ({_bytes(summary['size_on_disk'])})"),
         ("PART ONLY", _part(summary["part"])),
@@ -51,8 +50,20 @@ def _rows(summary: dict[str, object]) -> list[tuple[str, str]]:
         ("written by", _text(summary["written_by"])),
         *(("mesh", line) for line in _meshes(summary["meshes"])),
         ("versions", _named(summary["versions"])),
-        ("check", "" if checked is None else verdict),
+        ("check", _verdict(summary)),
+        *(("differs", str(difference)) for difference in differences),
     ]
+
+
+def _verdict(summary: dict[str, object]) -> str:
+    """Return the outcome of a check in words; empty without one."""
+    if "violations" not in summary:
+        return ""
+    if summary["violations"]:
+        return "FAILED, see below"
+    if summary["complete"]:
+        return "matches the Z-NLOS layout, all samples finite"
+    return "readable Z-NLOS by another writer, all samples finite; from what nlosrender writes it"
 
 
 def _part(part: object) -> str:

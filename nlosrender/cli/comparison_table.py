@@ -16,6 +16,7 @@ INFINITE = "infinite"  # something against nothing in the reference
 def comparison_table(report: dict[str, Any]) -> str:
     """Return a report (``analysis.comparison.report.comparison_report``) as lines."""
     lines = [f"capture      {report['file']}", f"reference    {report['reference']}"]
+    lines += [printable(f"aligned      {note}") for note in report["aligned"]]
     if report["structure"]:
         lines.append("not comparable, these differ:")
         lines += [

@@ -20,8 +20,8 @@ def register(app: typer.Typer) -> None:
     app.command(
         "info",
         epilog="Example: `nlosrender info z.hdf5 --check` prints the grids, the time axis, the bounces and "
-        "where the file comes from, then reads all samples to see that third-party loaders will accept it. It creates "
-        "nothing.",
+        "where the file comes from, then reads all samples to see that third-party loaders will accept it, or, for a "
+        "file by another program, that it is read right. It creates nothing.",
     )(info)
     app.command(
         "plot",
@@ -42,24 +42,30 @@ def info(
     from nlosrender.errors import EXIT_BAD_INPUT, EXIT_OK, FileError
 
     if is_unfinished(file):
-        found = summarise_unfinished(file)
-        lines = (f"{label.replace('_', ' '):<16}{printable(value)}" for label, value in found.items())
+        unfinished = summarise_unfinished(file)
+        lines = (f"{label.replace('_', ' '):<16}{printable(value)}" for label, value in unfinished.items())
         if json_output:
-            OUTPUT.print(found)
+            OUTPUT.print(unfinished)
         else:
             typer.echo("\n".join(lines))
         return
-    summary = summarise(file)
+    summary, violations = summarise(file), ()  # type: dict[str, object], tuple[str, ...]
     if check:
-        from nlosrender.files.validation import validate_file
+        from nlosrender.files.validation import check_file
 
-        summary["violations"] = validate_file(file)
-    violations = summary.get("violations")
+        found = check_file(file)
+        violations = found.violations
+        summary |= {
+            "violations": list(violations),
+            "deviations": list(found.deviations),
+            "readable": found.is_ours or not violations,
+            "complete": not (violations or found.deviations),
+        }
     if json_output:
         OUTPUT.print(summary, EXIT_BAD_INPUT if violations else EXIT_OK)
     else:
         typer.echo(summary_table(summary))
-    if violations and isinstance(violations, list):
+    if violations:
         listed = "\n".join(f"{file}: {printable(violation)}" for violation in violations)
         raise FileError(f"{listed}\nThe file deviates from the Z-NLOS layout: other loaders may refuse or misread it.")
 

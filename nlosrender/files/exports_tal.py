@@ -106,7 +106,9 @@ def _write_grids(file: h5py.File, ordered: OrderedCapture) -> None:
         file[f"{name}_xyz"] = h5py.Empty(float) if position is None else position.astype(np.float32)
         file[f"{name}_grid_xyz"] = _x_first(points)
         # normals go by the inverse's transpose
-        file[f"{name}_grid_normals"] = _x_first(order.sorted(normals) @ scan.wall_to_file[:3, :3])
+        file[f"{name}_grid_normals"] = (
+            h5py.Empty(float) if normals is None else _x_first(order.sorted(normals) @ scan.wall_to_file[:3, :3])
+        )
         _write_enum(file, f"{name}_grid_format", GridFormat.X_Y_3)
 
 

@@ -17,7 +17,9 @@ from numpy.typing import NDArray
 from nlosrender.errors import FileError
 from nlosrender.files import layout
 from nlosrender.files.locking import open_for_reading
-from nlosrender.files.stored_header import StoredHeader, header_of, samples_of, stored_points
+from nlosrender.files.stored_axes import in_memory_order
+from nlosrender.files.stored_header import StoredHeader, header_of, samples_of
+from nlosrender.files.stored_points import dataset_in, plane_normal, stored_points
 
 Part = int | slice | None  # of one axis; None: all of it
 TILE_AXES = ("channel", "sensor_y", "sensor_x", "bin")  # what one read of one laser and one bounce returns
@@ -25,12 +27,15 @@ TILE_AXES = ("channel", "sensor_y", "sensor_x", "bin")  # what one read of one l
 
 @dataclass(frozen=True, eq=False)
 class StoredPositions:
-    """Points and unit normals of both grids, (rows, columns, 3) float64 [m], in the file's frame."""
+    """Points and unit normals of both grids, (rows, columns, 3) float64 [m], in the file's frame.
+
+    Normals are None where the file has none and the points lie in no plane.
+    """
 
     sensor_positions: NDArray[np.float64]
-    sensor_normals: NDArray[np.float64]
+    sensor_normals: NDArray[np.float64] | None
     laser_positions: NDArray[np.float64]
-    laser_normals: NDArray[np.float64]
+    laser_normals: NDArray[np.float64] | None
 
 
 class StoredCapture:
@@ -50,10 +55,23 @@ class StoredCapture:
         FileError
             The file does not have them, or not one per point.
         """
-        sizes = layout.grid_sizes(self.header.sizes, self.header.confocal)
-        names = ("cameraGridPositions", "cameraGridNormals", "laserGridPositions", "laserGridNormals")
         with explained_read(self.path):
-            return StoredPositions(*(stored_points(self._file, self.path, name, sizes) for name in names))
+            sensors, lasers = (self._points(f"{grid}GridPositions") for grid in ("camera", "laser"))
+            both = np.concatenate([sensors.reshape(-1, 3), lasers.reshape(-1, 3)])
+            sensor_normals = self._normals("camera", sensors, both)
+            return StoredPositions(sensors, sensor_normals, lasers, self._normals("laser", lasers, both))
+
+    def _points(self, name: str, like: str | None = None) -> NDArray[np.float64]:
+        sizes = layout.grid_sizes(self.header.sizes, self.header.confocal)
+        return stored_points(self._file, self.path, name, sizes, self.header.row_major, like)
+
+    def _normals(self, grid: str, points: NDArray[np.float64], wall: NDArray[np.float64]) -> NDArray[np.float64] | None:
+        name = f"{grid}GridNormals"
+        if dataset_in(self._file, self.path, name) is not None:
+            return self._points(name, like=f"{grid}GridPositions")
+        place = self.header.hidden_volume_position or self.header.sensor_position
+        normal = plane_normal(wall, place if place is not None and len(place) == layout.THREE else None)
+        return None if normal is None else np.broadcast_to(normal, points.shape)
 
     def read_block(
         self,
@@ -103,12 +121,14 @@ class StoredCapture:
         block = np.empty([lengths[axis] for axis in layout.MEMORY_AXES], dtype=np.float32)
         tile: dict[str, int | slice] = {"channel": slice(None), "bin": slice(None)}
         tile |= {axis: where[axis] for axis in ("sensor_y", "sensor_x")}
+        read_axes = tuple(axis for axis in self.header.axes if axis in TILE_AXES)
         # laser by laser, bounce by bounce: chunks hold one of each, and HDF5 copies across them element by element
         for row, column in np.ndindex(lengths["laser_y"], lengths["laser_x"]):
             laser = {"laser_y": where["laser_y"].start + row, "laser_x": where["laser_x"].start + column}
             for slot, bounce in enumerate(bounces):
-                stored = samples[layout.in_file_order({**tile, **laser, "bounce": bounce}, self.header.confocal)]
-                block[:, slot, row, column] = layout.from_file_order(stored, TILE_AXES, self.header.confocal)
+                where_stored = {**tile, **laser, "bounce": bounce}
+                stored = samples[tuple(where_stored[axis] for axis in self.header.axes)]
+                block[:, slot, row, column] = in_memory_order(stored, read_axes, TILE_AXES)
         return block
 
     def _range(self, part: Part, axis: str) -> slice:

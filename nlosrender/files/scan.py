@@ -11,17 +11,17 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from nlosrender.capture.bounces import FIRST_BOUNCE, LINE_OF_SIGHT, THIRD_BOUNCE
+from nlosrender.capture.bounces import LINE_OF_SIGHT
 from nlosrender.errors import FileError
 from nlosrender.files.layout import ZNLOS_FROM_LOCAL, Float64
 from nlosrender.files.reader import StoredCapture
-from nlosrender.files.stored_header import Numbers, StoredHeader, intensity
+from nlosrender.files.stored_header import StoredHeader, intensity
+from nlosrender.files.stored_points import FLATNESS, Numbers
 from nlosrender.scene.hidden_geometry import Bounds, box_corners
 from nlosrender.scene.pose import euler_xyz
 
 Float32 = NDArray[np.float32]
 
-FLATNESS = 1e-4  # distance from the plane over the grid's extent: float32 positions of a scene far from its origin
 BAND_BYTES = 128 * 2**20  # of samples read at a time
 
 
@@ -129,7 +129,13 @@ def chosen_bounces(header: StoredHeader, bounces: str | None) -> tuple[int, ...]
             f"{header.path}: holds the sum of all bounces, not the third alone. Use --bounces all, or render it "
             "with render.split_bounces: true."
         )
-    return (THIRD_BOUNCE - FIRST_BOUNCE,)
+    if header.third_index is None:
+        stored = header.data_attributes.get("third_bounce", "missing")
+        raise FileError(
+            f"{header.path}: attribute third_bounce of data is {stored!r}, need the third bounce's index from 0 to "
+            f"{header.sizes['bounce'] - 1}. Use --bounces all, or correct it."
+        )
+    return (header.third_index,)
 
 
 def light_bands(

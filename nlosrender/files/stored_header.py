@@ -12,12 +12,13 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from nlosrender.capture.bounces import FILE_BOUNCES, LINE_OF_SIGHT, first_bounce_of
+from nlosrender.capture.bounces import FILE_BOUNCES, FIRST_BOUNCE, LINE_OF_SIGHT, THIRD_BOUNCE, first_bounce_of
 from nlosrender.errors import FileError
 from nlosrender.files import layout
 from nlosrender.files.attributes import get_attributes
+from nlosrender.files.stored_axes import BY_RANK, stored_axes
+from nlosrender.files.stored_points import NOT_ZNLOS, Numbers, dataset_in, small_numbers
 
-Numbers = tuple[float, ...]
 T = TypeVar("T", np.float32, np.float64)
 MAX_CHUNK_BYTES = 2**30  # unpacked; a few kilobytes in a file may claim 4 GiB
 MOST_BOUNCES = 64  # on the axis of a file from elsewhere; ours have 6
@@ -30,8 +31,11 @@ class StoredHeader:
     path: Path
     scan_type: str
     data_shape: tuple[int, ...]  # as h5py shows it
-    confocal: bool  # no laser axes
+    axes: tuple[str, ...]  # in-memory names of the axes of ``data_shape``
+    row_major: bool  # whether every dataset has its axes in reverse order
+    confocal: bool  # laser and sensor points are the same
     sizes: Mapping[str, int]  # length of every axis, by its in-memory name
+    third_index: int | None  # of the third bounce on the bounce axis; None: the file has none, or says nonsense
     bin_width_opl: float  # m
     start_opl: float  # m
     bounce_indices: tuple[int, ...]  # of the bounce axis that hold light; all of them when the file does not say
@@ -55,7 +59,9 @@ class StoredHeader:
     @property
     def first_bounce(self) -> int:
         """The bounce that index 0 of the bounce axis holds."""
-        return first_bounce_of(self.scan_type)
+        if self.scan_type == LINE_OF_SIGHT or self.third_index is None:
+            return first_bounce_of(self.scan_type)
+        return THIRD_BOUNCE - self.third_index
 
     @property
     def n_bins(self) -> int:
@@ -96,25 +102,28 @@ def header_of(file: h5py.File, path: Path) -> StoredHeader:
     samples = samples_of(file, path)
     for name in layout.SPECS:  # read or not: a file that names others is refused as a whole
         dataset_in(file, path, name)
-    confocal = samples.ndim == len(layout.CONFOCAL_AXES)
-    sizes = {"laser_y": 1, "laser_x": 1} | dict(zip(layout.file_axes(confocal), samples.shape, strict=True))
     attributes, data_attributes = get_attributes(file), get_attributes(samples)
+    axes = stored_axes(file, path, samples, attributes)
+    sizes = axes.sizes
     if sizes["bounce"] > MOST_BOUNCES:
-        raise FileError(f"{path}: has {sizes['bounce']} bounces, a capture has {FILE_BOUNCES}. {_NOT_ZNLOS}")
+        raise FileError(f"{path}: has {sizes['bounce']} bounces, a capture has {FILE_BOUNCES}. {NOT_ZNLOS}")
     indices = _bounce_indices(data_attributes, sizes["bounce"])
     split = attributes.get("split_bounces")
     width = _exact_or_stored(file, path, "deltaT")
     if width is None:
-        raise FileError(f"{path}: has no dataset deltaT (the bin width in m of optical path). {_NOT_ZNLOS}")
+        raise FileError(f"{path}: has no dataset deltaT (the bin width in m of optical path). {NOT_ZNLOS}")
     if not (np.isfinite(width) and width > 0):
         raise FileError(f"{path}: deltaT is {width}, need a length > 0 [m of optical path]")
     edges = small_numbers(file, path, "hiddenVolumeSize", exact=True)
     return StoredHeader(
         path=path,
-        scan_type=_scan_type(attributes, confocal, sizes),
+        scan_type=_scan_type(attributes, axes.confocal, sizes),
         data_shape=tuple(samples.shape),
-        confocal=confocal,
+        axes=axes.names,
+        row_major=axes.row_major,
+        confocal=axes.confocal,
         sizes=sizes,
+        third_index=_third_index(data_attributes, sizes["bounce"]),
         bin_width_opl=width,
         start_opl=_exact_or_stored(file, path, "t0") or 0.0,
         bounce_indices=tuple(range(sizes["bounce"])) if indices is None else indices,
@@ -137,27 +146,6 @@ def header_of(file: h5py.File, path: Path) -> StoredHeader:
     )
 
 
-def dataset_in(file: h5py.File, path: Path, name: str) -> h5py.Dataset | None:
-    """Return the dataset ``name`` at the root of a file, or None when there is none.
-
-    Raises
-    ------
-    FileError
-        Its numbers lie in another file: a capture must not make this program open whatever it names.
-    """
-    link = file.get(name, getlink=True)
-    if link is None:
-        return None
-    dataset = file.get(name) if isinstance(link, h5py.HardLink) else None
-    if not isinstance(link, h5py.HardLink) or (
-        isinstance(dataset, h5py.Dataset) and (dataset.external or dataset.is_virtual)
-    ):
-        raise FileError(
-            f"{path}: {name} lies in another place or file. Copy it into the file itself, as with h5repack."
-        )
-    return dataset if isinstance(dataset, h5py.Dataset) else None
-
-
 def samples_of(file: h5py.File, path: Path, name: str = layout.DATA) -> h5py.Dataset:
     """Return the dataset ``data`` (or ``variance``) once it is sure to hold a capture's samples.
 
@@ -169,66 +157,21 @@ def samples_of(file: h5py.File, path: Path, name: str = layout.DATA) -> h5py.Dat
     samples = dataset_in(file, path, name)
     if samples is None:
         found = ", ".join(sorted(file)[:8]) or "nothing"
-        raise FileError(f"{path}: has no dataset {name} (found: {found}). {_NOT_ZNLOS}")
+        raise FileError(f"{path}: has no dataset {name} (found: {found}). {NOT_ZNLOS}")
     if samples.dtype.kind not in "iuf":
-        raise FileError(f"{path}: {name} holds {samples.dtype}, need numbers. {_NOT_ZNLOS}")
-    if samples.ndim not in (len(layout.CONFOCAL_AXES), len(layout.PAIR_AXES)):
+        raise FileError(f"{path}: {name} holds {samples.dtype}, need numbers. {NOT_ZNLOS}")
+    # without a channel the number of axes alone makes no capture
+    if samples.ndim not in BY_RANK or (samples.ndim % 2 == 0 and dataset_in(file, path, "deltaT") is None):
         confocal, pairs = " ".join(layout.CONFOCAL_AXES), " ".join(layout.PAIR_AXES)
         raise FileError(
-            f"{path}: {name} has {samples.ndim} axes {samples.shape or ''}, need 5 ({confocal}) or 7 ({pairs}). "
-            f"{_NOT_ZNLOS}"
+            f"{path}: {name} has {samples.ndim} axes {samples.shape or ''}, need 5 ({confocal}) or 7 ({pairs}), or one "
+            f"less without a channel. {NOT_ZNLOS}"
         )
     if 0 in samples.shape:
         raise FileError(f"{path}: {name} is empty: its shape is {samples.shape}")
     if samples.chunks is not None and prod(samples.chunks) * samples.dtype.itemsize > MAX_CHUNK_BYTES:
         raise FileError(f"{path}: {name} has chunks of shape {samples.chunks}, need at most 1 GiB each. Use h5repack.")
     return samples
-
-
-def small_numbers(file: h5py.File, path: Path, name: str, exact: bool = False) -> Numbers | None:
-    """Return the few numbers of the dataset ``name``; None when it is missing.
-
-    Parameters
-    ----------
-    file, path
-        The open file and its path.
-    name
-        Dataset at the file's root.
-    exact
-        Prefer the float64 attribute ``exact`` to the float32 the layout asks for.
-
-    Raises
-    ------
-    FileError
-        The dataset holds something else.
-    """
-    if name not in file:
-        return None
-    dataset = dataset_in(file, path, name)
-    # checked before reading: a dataset may claim any size without taking any
-    if dataset is None or dataset.dtype.kind not in "biuf" or not 0 < (dataset.size or 0) <= 16:
-        raise FileError(f"{path}: {name} is not what a capture has there. {_NOT_ZNLOS}")
-    values = dataset[()]
-    if exact and "exact" in dataset.attrs and np.asarray(dataset.attrs["exact"]).dtype.kind in "iuf":
-        values = dataset.attrs["exact"]
-    return tuple(float(value) for value in np.ravel(values))
-
-
-def stored_points(file: h5py.File, path: Path, name: str, sizes: Mapping[str, int]) -> np.ndarray:
-    """Return a grid of positions or normals as (rows, columns, 3) float64, in the file's frame.
-
-    Raises
-    ------
-    FileError
-        The dataset is missing, not numeric, or does not have one entry per point.
-    """
-    dataset = dataset_in(file, path, name)
-    need = layout.resolve_shape(layout.SPECS[name], sizes)
-    if dataset is None:
-        raise FileError(f"{path}: has no dataset {name}. {_NOT_ZNLOS}")
-    if dataset.dtype.kind not in "iuf" or dataset.size != prod(need):
-        raise FileError(f"{path}: {name} is {dataset.dtype} {dataset.shape}, need numbers of shape {need}")
-    return layout.axes_last(np.asarray(dataset[()], dtype=np.float64).reshape(need))
 
 
 def _exact_or_stored(file: h5py.File, path: Path, name: str) -> float | None:
@@ -254,4 +197,9 @@ def _scan_type(attributes: Mapping[str, object], confocal: bool, sizes: Mapping[
     return str(stored) if stored in ("exhaustive", LINE_OF_SIGHT) else "single"
 
 
-_NOT_ZNLOS = "Is this a Z-NLOS capture, as `nlosrender render` writes it?"
+def _third_index(data_attributes: Mapping[str, object], n_bounces: int) -> int | None:
+    stored = data_attributes.get("third_bounce", THIRD_BOUNCE - FIRST_BOUNCE)
+    if isinstance(stored, list) and len(stored) == 1:  # MATLAB knows no scalars
+        stored = stored[0]
+    usable = isinstance(stored, (int, float)) and stored in range(n_bounces)
+    return int(stored) if usable else None  # type: ignore[call-overload]

@@ -1,8 +1,12 @@
-"""Checks a file against the Z-NLOS layout as strictly as the strictest of its loaders."""
+"""Checks a file against the Z-NLOS layout as strictly as the strictest of its loaders.
+
+A file by another writer may deviate and still be read right: what it lacks of that is a violation, the rest is told.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 
 import h5py
@@ -10,11 +14,15 @@ import numpy as np
 
 from nlosrender.capture.bounces import FILE_BOUNCES, LINE_OF_SIGHT, THIRD_BOUNCE
 from nlosrender.capture.bounces import FIRST_BOUNCE as FIRST
+from nlosrender.errors import FileError
 from nlosrender.files import layout
 from nlosrender.files.attributes import get_attributes
 from nlosrender.files.energy_check import wrong_energies
-from nlosrender.files.reader import explained_read, open_hdf5
-from nlosrender.files.stored_header import dataset_in, samples_of, small_numbers, stored_points
+from nlosrender.files.reader import StoredCapture, explained_read, open_hdf5
+from nlosrender.files.scan import read_scan
+from nlosrender.files.stored_axes import BY_RANK, stored_axes
+from nlosrender.files.stored_header import samples_of
+from nlosrender.files.stored_points import dataset_in, small_numbers, stored_points
 
 CLASSES = {layout.FLOAT: h5py.h5t.FLOAT, layout.INTEGER: h5py.h5t.INTEGER}
 WORDS = {h5py.h5t.FLOAT: "floating point", h5py.h5t.INTEGER: "integer"}
@@ -22,8 +30,39 @@ NORMAL_TOLERANCE = 1e-5  # three float32 components: 1e-7, with room for other w
 PLANE_TOLERANCE = 1e-5  # m, a wall a few metres wide in float32
 
 
+@dataclass(frozen=True)
+class FileCheck:
+    """What a file is, after all of it has been read.
+
+    Attributes
+    ----------
+    is_ours
+        Whether it says that this program wrote it; then every deviation from the layout is a violation.
+    violations
+        What makes the file wrong, or impossible to read right.
+    deviations
+        How a readable file by another writer differs from what this program writes; other loaders may mind.
+    """
+
+    is_ours: bool
+    violations: tuple[str, ...]
+    deviations: tuple[str, ...]
+
+
 def validate_file(path: str | Path) -> list[str]:
     """Return every way in which a file deviates from the layout; an empty list for a flawless one.
+
+    Raises
+    ------
+    FileError
+        As ``check_file``.
+    """
+    check = check_file(path)
+    return [*check.violations, *check.deviations]
+
+
+def check_file(path: str | Path) -> FileCheck:
+    """Check a file against the layout, and one by another writer for what is needed to read it right.
 
     Reads all samples, chunk by chunk; chunks that were never written are skipped.
 
@@ -35,26 +74,66 @@ def validate_file(path: str | Path) -> list[str]:
     path = Path(path)
     with open_hdf5(path) as file, explained_read(path):
         samples = samples_of(file, path)
-        confocal = samples.ndim == len(layout.CONFOCAL_AXES)
-        sizes = layout.grid_sizes(dict(zip(layout.file_axes(confocal), samples.shape, strict=True)), confocal)
-        missing = layout.missing_datasets(file)
-        found = [f"{name}: missing" for name in missing]
-        found += _samples(samples, sizes)
-        for spec in layout.DATASETS:
-            if spec.name not in missing:
-                found += _dataset(dataset_in(file, path, spec.name), spec, sizes)
-        if not found:  # values mean something only where types and shapes are right
-            found += _values(file, path, sizes, confocal) + _points(file, path, sizes, confocal)
-        found += _attributes(file, samples)
+        attributes = get_attributes(file)
+        found = _layout(file, path, samples)
         damaged = _finite(samples, layout.DATA)
-        found += damaged or wrong_energies(
-            samples, _stored_parts(samples), get_attributes(file), get_attributes(samples)
-        )
+        damaged = damaged or wrong_energies(samples, _stored_parts(samples), attributes, get_attributes(samples))
         if dataset_in(file, path, layout.VARIANCE) is not None:
             variance = samples_of(file, path, layout.VARIANCE)
             if variance.shape != samples.shape:
-                found.append(f"variance: shape {variance.shape}, need that of data, {samples.shape}")
-            found += _finite(variance, layout.VARIANCE)
+                damaged.append(f"variance: shape {variance.shape}, need that of data, {samples.shape}")
+            damaged += _finite(variance, layout.VARIANCE)
+        if attributes.get("engine") == layout.ROOT_TEXT["engine"]:
+            return FileCheck(True, (*found, *damaged), ())
+        unreadable = [text for text in _unreadable(file, path) if text not in found]
+        return FileCheck(False, (*unreadable, *damaged), tuple(found))
+
+
+def _layout(file: h5py.File, path: Path, samples: h5py.Dataset) -> list[str]:
+    """Return how a file deviates from the layout, its samples aside."""
+    names, axis_sizes, confocal = _axes(file, path, samples)
+    sizes = layout.grid_sizes(axis_sizes, confocal)
+    missing = layout.missing_datasets(file)
+    found = [f"{name}: missing" for name in missing]
+    if names != layout.file_axes(confocal):
+        found.append(f"data: axes {' '.join(names)}, need {' '.join(layout.file_axes(confocal))}")
+    found += _samples(samples, sizes)
+    for spec in layout.DATASETS:
+        if spec.name not in missing:
+            found += _dataset(dataset_in(file, path, spec.name), spec, sizes)
+    if not found:  # values mean something only where types and shapes are right
+        found += _values(file, path, sizes, confocal) + _points(file, path, sizes, confocal)
+    return found + _attributes(file, samples)
+
+
+def _axes(file: h5py.File, path: Path, samples: h5py.Dataset) -> tuple[tuple[str, ...], Mapping[str, int], bool]:
+    """Return names and lengths of the axes of ``data``, and whether the capture is confocal."""
+    try:
+        axes = stored_axes(file, path, samples, get_attributes(file))
+    except FileError:  # it contradicts itself, and ``_unreadable`` says how
+        names = BY_RANK[samples.ndim]
+        sizes = dict.fromkeys(layout.MEMORY_AXES, 1) | dict(zip(names, samples.shape, strict=True))
+        return names, sizes, samples.ndim <= len(layout.CONFOCAL_AXES)
+    return axes.names, axes.sizes, axes.confocal
+
+
+def _unreadable(file: h5py.File, path: Path) -> list[str]:
+    """Return what keeps a file by another writer from being read right."""
+    try:
+        capture = StoredCapture(file, path)
+        if capture.header.scan_type != LINE_OF_SIGHT:
+            read_scan(capture)
+    except FileError as error:
+        return [str(error).removeprefix(f"{path}: ")]
+    header, found = capture.header, []
+    n_bins = small_numbers(file, path, "t")
+    if n_bins is not None and n_bins != (header.n_bins,):
+        found.append(f"t: {_listed(n_bins)}, but data has {header.n_bins} bins")
+    if header.third_index is None:
+        stored = header.data_attributes.get("third_bounce")
+        found.append(
+            f"attribute 'third_bounce' of data: {stored}, need an index from 0 to {header.sizes['bounce'] - 1}"
+        )
     return found
 
 

@@ -12,6 +12,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
+from nlosrender.analysis.comparison.alignment import GridTurn
 from nlosrender.errors import FileError
 from nlosrender.files import layout
 from nlosrender.files.reader import StoredCapture, explained_read, open_hdf5
@@ -23,7 +24,7 @@ BLOCK_SAMPLES = 2**21  # of one dataset at a time: 8 MiB as read, and about 20 t
 LARGEST_CHUNK = 8  # blocks; larger ones, by other writers, are unpacked more than once
 MAX_POINTS = 2**24  # of one grid; 4096 x 4096 is beyond any scan
 MAX_PER_POINT = 2**26  # samples of one sensor point and laser: 11 million bins of six bounces
-LASER = 3  # where the laser axes begin among those after channel and bin
+STORED = ("bounce", "sensor_y", "sensor_x", "laser_y", "laser_x")  # axes along which parts may never be written
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,34 +64,66 @@ class OpenCapture:
                 "Check the file with `nlosrender info`."
             )
         samples = samples_of(file, path)
-        self._chunks = samples.chunks
-        self._written = set() if self._chunks is None else _written_chunks(samples)
-        self._lasers = {chunk[LASER:] for chunk in self._written}
+        # of one chunk, along every axis; none for a file without chunks, all of which counts as written
+        self._steps = dict(zip(self.header.axes, samples.chunks or (), strict=False))
+        self._written = self._written_chunks(samples) if self._steps else set()
+        self._lasers = {chunk[-2:] for chunk in self._written}
+        self.sensors, self.lasers = GridTurn(self.header.sensor_grid), GridTurn(self._laser_grid())
+        self._lead, self._n_bins = 0, self.header.n_bins
+
+    def align(self, sensors: GridTurn, lasers: GridTurn, lead: int, n_bins: int) -> None:
+        """Take points in another order and time from ``lead`` bins earlier on, ``n_bins`` long, from now on."""
+        self.sensors = sensors
+        self.lasers = GridTurn(self._laser_grid()) if self.header.confocal else lasers
+        self._lead, self._n_bins = lead, n_bins
+
+    def _laser_grid(self) -> tuple[int, int]:
+        return self.header.sizes["laser_y"], self.header.sizes["laser_x"]
 
     @property
     def tile(self) -> tuple[int, int]:
         """Rows and columns of sensor points in one chunk; the whole grid for a file without chunks."""
-        return self.header.sensor_grid if self._chunks is None else (self._chunks[3], self._chunks[4])
+        if not self._steps:
+            return self.sensors.turned_shape
+        height, width = self._steps["sensor_y"], self._steps["sensor_x"]
+        return (width, height) if self.sensors.transposed else (height, width)
 
     def stores_laser(self, laser: tuple[int, int]) -> bool:
         """Return whether any sample of a laser may differ from zero, without reading it."""
-        return self._chunks is None or self._laser_chunk(laser) in self._lasers
+        return not self._steps or self._laser_chunk(self._stored_laser(laser)) in self._lasers
 
     def stores(self, bounce: int, laser: tuple[int, int], rows: slice, columns: slice) -> bool:
         """Return whether any sample of the part may differ from zero, without reading it."""
-        if self._chunks is None:
+        if not self._steps:
             return True
-        _, _, per_bounce, height, width, *_ = self._chunks
-        at = self._laser_chunk(laser)
+        rows, columns = self.sensors.stored(rows, columns)
+        height, width = self._steps["sensor_y"], self._steps["sensor_x"]
+        at = self._laser_chunk(self._stored_laser(laser))
         return any(
-            (bounce // per_bounce, y, x, *at) in self._written
+            (bounce // self._steps["bounce"], y, x, *at) in self._written
             for y in range(rows.start // height, -(-rows.stop // height))
             for x in range(columns.start // width, -(-columns.stop // width))
         )
 
-    def _laser_chunk(self, laser: tuple[int, int]) -> tuple[int, ...]:
-        per_laser = (self._chunks or ())[2 + LASER :]  # none in a confocal capture
-        return tuple(index // step for index, step in zip(laser, per_laser, strict=False))
+    def _stored_laser(self, laser: tuple[int, int]) -> tuple[int, int]:
+        row, column = self.lasers.stored(*(slice(index, index + 1) for index in laser))
+        return row.start, column.start
+
+    def _laser_chunk(self, laser: tuple[int, int]) -> tuple[int, int]:
+        row, column = laser
+        return row // self._steps.get("laser_y", 1), column // self._steps.get("laser_x", 1)
+
+    def _written_chunks(self, samples: h5py.Dataset) -> set[tuple[int, ...]]:
+        """Return where, along ``STORED``, a chunk was written: numbers of chunks, not of samples."""
+        written: set[tuple[int, ...]] = set()
+        places = [self.header.axes.index(axis) if axis in self.header.axes else None for axis in STORED]
+
+        def note(chunk: h5py.h5d.StoreInfo) -> None:
+            at = chunk.chunk_offset
+            written.add(tuple(0 if place is None else at[place] // samples.chunks[place] for place in places))
+
+        samples.id.chunk_iter(note)
+        return written
 
     def read(
         self, dataset: str, bounces: tuple[int, ...], laser: tuple[int, int], rows: slice, columns: slice
@@ -102,7 +135,9 @@ class OpenCapture:
         FileError
             The file is damaged, or holds a sample that is not finite or a negative variance.
         """
-        block = self.capture.read_block(laser, (rows, columns), bounces, dataset)[:, :, 0, 0]
+        laser = self._stored_laser(laser)
+        stored = self.capture.read_block(laser, self.sensors.stored(rows, columns), bounces, dataset)[:, :, 0, 0]
+        block = self._aligned(stored)
         if not np.isfinite(block).all():
             raise FileError(
                 f"{self.capture.path}: {dataset} holds a value that is not finite (laser {laser[0]}, {laser[1]}); "
@@ -113,6 +148,14 @@ class OpenCapture:
                 f"{self.capture.path}: variance is negative (laser {laser[0]}, {laser[1]}). Render it again."
             )
         return block
+
+    def _aligned(self, stored: Float32) -> Float32:
+        """Return samples (channel, bounce, y, x, bin) in the order and on the time axis of the reference."""
+        turned: Float32 = self.sensors.turned(stored, axis=2)
+        if (self._lead, self._n_bins) == (0, self.header.n_bins):
+            return turned
+        after = self._n_bins - self._lead - self.header.n_bins
+        return np.pad(turned, ((0, 0),) * 4 + ((self._lead, after),))
 
 
 @contextmanager
@@ -138,7 +181,7 @@ def blocks(a: OpenCapture, b: OpenCapture, with_variance: bool) -> Iterator[Bloc
     FileError
         A file is damaged.
     """
-    lasers = (1, 1) if a.header.confocal else a.header.laser_grid
+    lasers = b.lasers.turned_shape
     read_variance = [with_variance and capture.header.has_variance for capture in (a, b)]
     for row, column in np.ndindex(*lasers):
         laser = (row, column)
@@ -163,7 +206,7 @@ def blocks(a: OpenCapture, b: OpenCapture, with_variance: bool) -> Iterator[Bloc
 def _tiles(capture: OpenCapture) -> Iterator[tuple[slice, slice]]:
     """Cut the sensor grid into tiles of about ``BLOCK_SAMPLES``, whole chunks unless these are far larger."""
     header = capture.header
-    n_rows, n_columns = header.sensor_grid
+    n_rows, n_columns = capture.sensors.turned_shape
     points = max(BLOCK_SAMPLES // (header.sizes["channel"] * len(header.bounce_indices) * header.n_bins), 1)
     height, width = capture.tile
     if height * width > LARGEST_CHUNK * points:
@@ -174,15 +217,3 @@ def _tiles(capture: OpenCapture) -> Iterator[tuple[slice, slice]]:
     for y in range(0, n_rows, rows):
         for x in range(0, n_columns, columns):
             yield slice(y, min(y + rows, n_rows)), slice(x, min(x + columns, n_columns))
-
-
-def _written_chunks(samples: h5py.Dataset) -> set[tuple[int, ...]]:
-    """Return where, on the axes after channel and bin, a chunk was written: numbers of chunks, not of samples."""
-    written: set[tuple[int, ...]] = set()
-
-    def note(chunk: h5py.h5d.StoreInfo) -> None:
-        position = (at // step for at, step in zip(chunk.chunk_offset, samples.chunks, strict=True))
-        written.add(tuple(position)[2:])
-
-    samples.id.chunk_iter(note)
-    return written

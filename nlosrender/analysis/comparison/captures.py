@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+from nlosrender.analysis.comparison.alignment import align
 from nlosrender.analysis.comparison.blocks import OpenCapture, blocks, open_for_comparison
 from nlosrender.analysis.comparison.differences import Differences
 from nlosrender.analysis.comparison.shift import TimeShift
@@ -72,7 +73,8 @@ class Comparison:
     path: Path
     reference: Path
     structure: tuple[StructureDifference, ...]
-    header: StoredHeader  # of the reference
+    aligned: tuple[str, ...]  # what was in another order or at another time, in sentences
+    header: StoredHeader  # of the reference, with a time axis that both fit into
     differences: Differences
     shift: TimeShift
     test: ZTest | None
@@ -105,14 +107,18 @@ def compare_captures(path: str | Path, reference: str | Path, tolerances: Tolera
         One of them is missing, damaged or not a capture, or the Z-test finds no variance in either.
     """
     with open_for_comparison(Path(path)) as a, open_for_comparison(Path(reference)) as b:
-        structure = structure_differences(a.capture, b.capture)
-        differences, shift = Differences(b.header), TimeShift(b.header)
+        alignment = align(a.capture, b.capture)
+        structure = structure_differences(a.capture, b.capture, alignment)
+        header = alignment.header
+        differences, shift = Differences(header), TimeShift(header)
         test, findings = None, ()  # type: ZTest | None, tuple[Finding, ...]
         if not structure:
-            test = None if tolerances.significance is None else _z_test(a, b, tolerances.significance)
+            a.align(alignment.sensors, alignment.lasers, alignment.lead, header.n_bins)
+            b.align(b.sensors, b.lasers, alignment.reference_lead, header.n_bins)
+            test = None if tolerances.significance is None else _z_test(a, b, header, tolerances.significance)
             _look_at_samples(a, b, differences, shift, test)
-            findings = tuple(_findings(b.header, differences, shift, test, tolerances))
-        return Comparison(a.path, b.path, structure, b.header, differences, shift, test, findings)
+            findings = tuple(_findings(header, differences, shift, test, tolerances))
+        return Comparison(a.path, b.path, structure, alignment.notes, header, differences, shift, test, findings)
 
 
 def _look_at_samples(
@@ -127,13 +133,13 @@ def _look_at_samples(
         test.finish()
 
 
-def _z_test(a: OpenCapture, b: OpenCapture, significance: float) -> ZTest:
+def _z_test(a: OpenCapture, b: OpenCapture, header: StoredHeader, significance: float) -> ZTest:
     if not (a.header.has_variance or b.header.has_variance):
         raise FileError(
             f"{a.path}: neither it nor {b.path} has a dataset variance, which the Z-test needs. "
             "Render with output.variance: true (the default)."
         )
-    return ZTest(a.header, b.header, significance)
+    return ZTest(a.header, header, significance)
 
 
 def _findings(

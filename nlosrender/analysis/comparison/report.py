@@ -21,6 +21,7 @@ def comparison_report(comparison: Comparison) -> dict[str, Any]:
         "agrees": not comparison.failures,
         "failures": list(comparison.failures),
         "structure": [asdict(difference) for difference in comparison.structure],
+        "aligned": list(comparison.aligned),
     }
     if comparison.structure:
         return report

@@ -14,7 +14,6 @@ from nlosrender.analysis.reconstruction.phasor import phasor_field, refuse_curve
 from nlosrender.analysis.reconstruction.pulse import DEFAULT_CYCLES, Pulse, default_wavelength, pulse_warnings
 from nlosrender.analysis.reconstruction.threads import Progress
 from nlosrender.analysis.reconstruction.voxel_grid import VoxelGrid, expected_box, voxel_grid
-from nlosrender.capture.bounces import FIRST_BOUNCE
 from nlosrender.config.fields import LONGEST
 from nlosrender.errors import OptionError
 from nlosrender.files.layout import Float64
@@ -165,7 +164,7 @@ def reconstruct_capture(
         method=settings.method,
         wavelength=wavelength,
         cycles=settings.cycles,
-        bounces=_bounce_numbers(indices),
+        bounces=tuple(index + header.first_bounce for index in indices),
         source=Path(path),
         source_attributes=dict(header.attributes),
         wall_to_file=scan.wall_to_file,
@@ -184,10 +183,6 @@ def settings_text(reconstruction: Reconstruction) -> str:
         parts.append(f"wavelength {1000 * reconstruction.wavelength:.4g} mm, {reconstruction.cycles:g} cycles")
     parts.append(f"{nx} x {ny} x {nz} voxels of {1000 * grid.voxel_size:.4g} mm")
     return SEPARATOR.join(parts)
-
-
-def _bounce_numbers(indices: tuple[int, ...]) -> tuple[int, ...]:
-    return tuple(index + FIRST_BOUNCE for index in indices)
 
 
 def _listed(lengths: tuple[float, ...]) -> str:
