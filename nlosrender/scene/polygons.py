@@ -107,10 +107,15 @@ def _clipped(local: Float64, normal: Float64, name: str) -> Int64:
     while len(kept) > 2:
         ear = _ear(flat[kept])
         if ear is None:
-            raise ValueError(f"{name} is a polygon that cannot be cut into triangles: triangulate it")
+            break
         triangles[count] = kept[ear - 1], kept[ear], kept[(ear + 1) % len(kept)]
         count += 1
         del kept[ear]
+    # Triangles between corners of a polygon cover each point as often as it runs around it, backward ones negatively:
+    # where none is backward, none overlap.
+    areas = _turn(*np.moveaxis(flat[triangles], 1, 0))
+    if len(kept) > 2 or areas.min() < -len(flat) * SLIVER:
+        raise ValueError(f"{name} is a polygon that cannot be cut into triangles: triangulate it")
     return triangles
 
 
@@ -122,14 +127,15 @@ def _ear(flat: Float64) -> int | None:
         return 1
     inwards = flat[areas < SLIVER]  # an ear holds one of these, if it holds any corner
     lengths = np.linalg.norm(after - before, axis=1) + np.linalg.norm(flat - before, axis=1)
-    for ear in np.argsort(-areas / np.maximum(lengths, 1e-300) ** 2, kind="stable"):
-        if areas[ear] < -SLIVER:
-            continue
-        a, b, c = before[ear], flat[ear], after[ear]
-        inside = (_turn(a, b, inwards) >= 0) & (_turn(b, c, inwards) >= 0) & (_turn(c, a, inwards) >= 0)
-        at_corner = np.any([(inwards == corner).all(axis=1) for corner in (a, b, c)], axis=0)
-        if not (inside & ~at_corner).any() or areas[ear] <= SLIVER:
-            return int(ear)
+    roundest = np.argsort(-areas / np.maximum(lengths, 1e-300) ** 2, kind="stable")
+    for margin in (SLIVER, 0.0):  # cut along a corner that all but touches, rounding makes the rest cross itself
+        for ear in roundest:
+            a, b, c = before[ear], flat[ear], after[ear]
+            sides = [_turn(a, b, inwards), _turn(b, c, inwards), _turn(c, a, inwards)]
+            at_corner = np.any([(np.abs(inwards - corner) <= SLIVER).all(axis=1) for corner in (a, b, c)], axis=0)
+            blocks = (np.min(sides, axis=0) >= -margin) & ~at_corner
+            if areas[ear] >= -SLIVER and (areas[ear] <= SLIVER or not blocks.any()):
+                return int(ear)
     return None
 
 

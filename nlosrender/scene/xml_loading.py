@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import cache, reduce
 from pathlib import Path
 from xml.etree.ElementTree import Element
@@ -19,17 +19,16 @@ from nlosrender.scene.build import load_flat_serialized, shape_bounds
 from nlosrender.scene.hidden_geometry import MESH_PLUGINS, ShapeDescription, box_corners
 from nlosrender.scene.images import check_image
 from nlosrender.scene.materials import first_line, rejected
-from nlosrender.scene.mesh_attributes import AttributeUse
 from nlosrender.scene.mesh_file import read_mesh
 from nlosrender.scene.pose import Float64
 from nlosrender.scene.primitives import box_mesh, rectangle_mesh
 from nlosrender.scene.transforms import transform_matrix
 from nlosrender.scene.triangle_mesh import TriangleMesh
+from nlosrender.scene.xml_textures import check_attributes, picture_warnings
 
 WHERE = "scene.mitsuba"
 SAME_AREA = 0.01  # float32, and bent quadrangles cut along the other diagonal
 _AS_ITEM = "Write it as triangles, or take it as an item of scene.hidden_geometry."
-OWN_BUFFERS = ("vertex_positions", "vertex_normals", "vertex_texcoords", "vertex_count", "face_count")
 _ADVICE = "Check its size and its transformation."
 _UNKNOWN = re.compile(r"string \(line (\d+), col \d+\): Found \d+ unreferenced propert")
 _PARAMETER = re.compile(r'^\s*- \w+ "([^"]+)"', re.MULTILINE)
@@ -42,7 +41,7 @@ def load_xml_scene(path: Path) -> tuple[mi.Scene, tuple[str, ...]]:
     Returns
     -------
     tuple
-        The scene, and what was left out of it, a sentence each.
+        The scene, and what was left out of it or is hardly meant, a sentence each.
 
     Raises
     ------
@@ -50,12 +49,14 @@ def load_xml_scene(path: Path) -> tuple[mi.Scene, tuple[str, ...]]:
         It is not allowed, a shape has no extent or no bounds in float32, a file it names cannot be used, or Mitsuba
         rejects it; the line is named where there is one.
     """
+    told: list[str] = []
     try:
         root, _ = read_mitsuba_xml(path)
         with_id = {part.get("id", ""): part for part in root.iter() if part.tag in ("bsdf", "texture")}
         for shape in root.iter("shape"):
-            _check_shape(shape)
-            _check_attributes(shape, with_id)
+            mesh = _check_shape(shape)
+            check_attributes(shape, with_id)
+            told += picture_warnings(shape, with_id, mesh)
         for image in image_files(root):
             check_image(image)
     except ValueError as error:
@@ -63,7 +64,7 @@ def load_xml_scene(path: Path) -> tuple[mi.Scene, tuple[str, ...]]:
     scene, warnings = _loaded(root, path)
     for shape in scene.shapes():
         _check_bounds(shape, path)
-    return scene, warnings
+    return scene, (*told, *warnings)
 
 
 def _loaded(root: Element, path: Path) -> tuple[mi.Scene, tuple[str, ...]]:
@@ -91,8 +92,8 @@ def _without_parameters(plugin: Element, names: Sequence[str]) -> str:
     return f"{WHERE}: {place_of(plugin)}: {named(plugin)} has no parameter {listed}, which is left out."
 
 
-def _check_shape(shape: Element) -> None:
-    """Refuse a shape that float32 rounds to nothing, and read its mesh before Mitsuba does.
+def _check_shape(shape: Element) -> TriangleMesh | None:
+    """Refuse a shape that float32 rounds to nothing; return its mesh, if it is one, which is read before Mitsuba does.
 
     Mitsuba's own readers end the process on a wrong index.
     """
@@ -102,7 +103,7 @@ def _check_shape(shape: Element) -> None:
         mesh = _mesh_of(parameters)
         box = ShapeDescription(parameters).bounds() if mesh is None else mesh.bounds()
         if box is None:
-            return  # only Mitsuba knows its extent
+            return None  # only Mitsuba knows its extent
         corners = box_corners(box) @ to_world[:3, :3].T + to_world[:3, 3]
         extent, reach = float(np.ptp(corners, axis=0).max()), float(np.abs(corners).max())
         if not extent >= SHORTEST:
@@ -111,41 +112,9 @@ def _check_shape(shape: Element) -> None:
             raise ValueError(f"it reaches {reach:.4g} m from the origin, need at most {LONGEST:g} m. {_ADVICE}")
         if _rounded_to_nothing(mesh, corners, to_world):
             raise ValueError(f"float32 rounds it to nothing where it is. {_ADVICE}")
+        return mesh
     except ValueError as error:
         raise ValueError(f"{place_of(shape)}: {named(shape)}: {error}".removesuffix(".")) from error
-
-
-def _check_attributes(shape: Element, with_id: Mapping[str, Element]) -> None:
-    """Refuse textures that read what a shape does not have, or takes for reflectances above 1: Mitsuba says nothing."""
-    uses = list(_attribute_uses(shape, with_id))
-    if not uses:
-        return
-    attributes: dict[str, Float64] = {}
-    if shape.get("type") in MESH_PLUGINS:
-        filename = str(shape_parameters(shape)["filename"])
-        parameters = mi.traverse(mi.load_dict({"type": shape.get("type"), "filename": filename}))
-        names = [name for name in parameters.keys() if name.split("_")[0] in ("vertex", "face")]  # noqa: SIM118
-        attributes = {name: np.asarray(parameters[name]) for name in names if name not in OWN_BUFFERS}
-    for use in uses:
-        try:
-            use.check(attributes)
-        except ValueError as error:
-            raise ValueError(f"{place_of(shape)}: {named(shape)}: {error}") from error
-
-
-def _attribute_uses(
-    element: Element, with_id: Mapping[str, Element], parameter: str = "", within: tuple[str, ...] = ()
-) -> Iterator[AttributeUse]:
-    """Yield the textures in an element, and in what it refers to as ``parameter``, that read attributes."""
-    for texture in element.iter("texture"):
-        if texture.get("type") == "mesh_attribute":
-            values = shape_parameters(texture)
-            scale = values.get("scale", 1.0)
-            yield AttributeUse(texture.get("name") or parameter or "texture", str(values.get("name")), float(scale))
-    for reference in element.iter("ref"):
-        name = reference.get("id", "")
-        if name in with_id and name not in within:
-            yield from _attribute_uses(with_id[name], with_id, reference.get("name", ""), (*within, name))
 
 
 def _mesh_of(parameters: Mapping[str, object]) -> TriangleMesh | None:

@@ -14,6 +14,7 @@ import pytest
 from numpy.typing import ArrayLike
 from quadrature import Array, Frame, Setup, grid_points, rectangle_cells, third_bounces
 from rendering import configured, flat_wall, render
+from views import view_config
 
 from nlosrender import pipeline
 from nlosrender.engine.backend import start_backend
@@ -24,6 +25,7 @@ CENTER = np.array([0.2, -0.1, 1.1])
 TURNED = {"normal": [0.3, -0.4, -1.0], "up": [0.5, 1.0, 0.2]}
 WALL_POSE = {"center": [0.3, 0.2, -0.1], "normal": [0.1, 0.2, 1.0], "up": [0.3, 1.0, 0.1]}
 X, Y, Z = np.eye(3)
+LAMP = {"type": "point", "position": [0, 0, 4], "intensity": 1.0}
 
 # Where a surface is, as a function of (s, t) in [0, 1]: s from the left to the right, t from the top down, both as seen
 # from the front. It returns the point and the unit normal of the front.
@@ -181,6 +183,65 @@ def test_an_obj_quad_shows_what_a_rectangle_shows(picture: dict[str, Any], tmp_p
     built = pipeline.load_scene(configured(flat_wall(item), folder=tmp_path))
     place = flat(CENTER, TURNED["normal"], TURNED["up"], 0.9, 0.5)
     np.testing.assert_allclose(seen(built, built.hidden_shapes[0], place, np.asarray), TEXELS, rtol=1e-6)
+
+
+@pytest.mark.parametrize("kind", ["item", "scene file"])
+def test_mitsubas_own_rectangle_keeps_its_convention(kind: str, picture: dict[str, Any], tmp_path: Path) -> None:
+    """v grows upwards there, so the first row of a picture lies at the lower edge."""
+    if kind == "item":
+        shape = {"type": "rectangle", "to_world": [{"translate": [0, 0, 1]}]}
+        built = pipeline.load_scene(configured(flat_wall({"type": "mitsuba", "shape": shape, "bsdf": picture})))
+    else:
+        (tmp_path / "scene.xml").write_text(
+            "<scene version='3.0.0'><shape type='rectangle'><transform name='to_world'><translate z='1'/></transform>"
+            "<bsdf type='diffuse'><texture type='bitmap' name='reflectance'><boolean name='raw' value='true'/>"
+            "<string name='filter_type' value='nearest'/><string name='filename' value='texels.exr'/></texture></bsdf>"
+            "</shape></scene>"
+        )
+        view = view_config(emitters=[LAMP], color="grey", scene={"mitsuba": "scene.xml"})
+        built = pipeline.load_view(configured(view, folder=tmp_path))
+    place = flat([0, 0, 1], Z, Y, 2.0, 2.0)
+    np.testing.assert_allclose(seen(built, built.hidden_shapes[0], place, np.asarray), TEXELS[::-1], rtol=1e-6)
+
+
+@pytest.mark.parametrize("name", ["quad.obj", "quad.ply"])
+def test_a_picture_on_a_mesh_wall_lies_as_the_file_says(name: str, picture: dict[str, Any], tmp_path: Path) -> None:
+    """The first row is at v = 1 of an .obj and at v = 0 of a .ply; wall coordinates grow with the file's u and v."""
+    places, coordinates = flat([0, 0, 0], Z, Y, 2.0, 1.6), ((0, 0), (1, 0), (1, 1), (0, 1))
+    corners = np.array([places(u, 1 - v)[0] for u, v in coordinates]).tolist()
+    if name.endswith("obj"):
+        lines = [f"v {x} {y} {z}" for x, y, z in corners] + [f"vt {u} {v}" for u, v in coordinates]
+        lines += ["f 1/1 2/2 3/3 4/4"]
+    else:
+        lines = ["ply", "format ascii 1.0", "element vertex 4", *(f"property float {x}" for x in "xyzuv")]
+        lines += ["element face 1", "property list uchar int vertex_indices", "end_header"]
+        lines += [f"{x} {y} {z} {u} {v}" for (x, y, z), (u, v) in zip(corners, coordinates, strict=True)]
+        lines += ["4 0 1 2 3"]
+    (tmp_path / name).write_text("\n".join(lines) + "\n", encoding="utf-8")
+    config = flat_wall()
+    config["scene"]["relay_wall"] = {"type": "mesh", "filename": name, "bsdf": picture}
+    built = pipeline.load_scene(configured(config, folder=tmp_path))
+    expected = TEXELS if name.endswith("obj") else TEXELS[::-1]
+    np.testing.assert_allclose(seen(built, built.wall_shape, places, built.wall.pose.to_local), expected, rtol=1e-6)
+    np.testing.assert_allclose(built.wall.positions([0.3, 0.4]), [0.3, 0.4, 0], atol=1e-6)
+
+
+def test_a_picture_in_a_scene_file_on_a_mesh_without_texture_coordinates_is_told(
+    picture: dict[str, Any], tmp_path: Path
+) -> None:
+    """Mitsuba puts it on every triangle; with coordinates nothing is said."""
+    texture = "<texture type='bitmap' name='reflectance'><string name='filename' value='texels.exr'/></texture>"
+    content = f"""<scene version='3.0.0'><bsdf type='diffuse' id='b'>{texture}</bsdf>
+      <shape type='obj'><string name='filename' value='a.obj'/><ref id='b'/></shape></scene>"""
+    (tmp_path / "scene.xml").write_text(content, encoding="utf-8")
+    config = view_config(emitters=[LAMP], color="grey", scene={"mitsuba": "scene.xml"})
+    told = []
+    for corners in ("1 2 3", "1/1 2/1 3/1"):
+        (tmp_path / "a.obj").write_text(f"v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nf {corners}\n", encoding="utf-8")
+        told.append(pipeline.load_view(configured(config, folder=tmp_path)).warnings)
+    assert told[1] == ()
+    (warning,) = told[0]
+    assert "line 2: <shape type='obj'> has a picture, but its file no texture coordinates at every corner" in warning
 
 
 WALLS = {

@@ -1,6 +1,7 @@
 """Thirty scenes from seeds, ten kinds of three: what light does beyond matt plates that stand apart.
 
-Everything is drawn from ``numpy.random.default_rng(seed)``; files (pictures, meshes) are written into a folder.
+Of each kind one is single, one confocal, one exhaustive with first and last legs. Everything is drawn from
+``numpy.random.default_rng(seed)``; files (pictures, meshes) are written into a folder.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from PIL import Image
 
 Item = dict[str, Any]
 SEEDS = range(30)
+_DEVICES = {"laser_position": [-0.5, 0.0, 0.25], "sensor_position": [-0.4, 0.1, 0.35]}
 
 
 def configuration(seed: int, folder: Path) -> Item:
@@ -22,22 +24,26 @@ def configuration(seed: int, folder: Path) -> Item:
     rng = np.random.default_rng(seed)
     make = KINDS[seed % len(KINDS)]
     bounces, items = make(rng, folder)
-    laser = [round(float(x), 3) for x in rng.uniform(-0.4, 0.4, 2)]
     return {
         "name": name(seed),
         "scene": {"relay_wall": {"type": "rectangle", "width": 2.0, "height": 1.8}, "hidden_geometry": items},
-        "capture": {
-            "scan_type": "single",
-            "sensor_grid": {"nx": 5, "ny": 4},
-            "laser_point": laser,
-            "laser_position": [-0.5, 0.0, 0.25],
-            "sensor_position": [-0.5, 0.0, 0.25],
-            "account_first_and_last_bounces": False,
-        },
+        "capture": {**_scan(rng, seed), **_DEVICES},
         "time_axis": {"start_opl": 0.0, "bin_width_opl": 0.04, "n_bins": 200},
         "render": {"max_bounces": bounces, "target_error": 0.04, "seed": seed, "color": "grey"},
         "output": {"frame": "scene"},
     }
+
+
+def _scan(rng: Generator, seed: int) -> Item:
+    if seed < 10:
+        laser = _vector(rng, (-0.4, -0.4), (0.4, 0.4))
+        grids: Item = {"scan_type": "single", "sensor_grid": {"nx": 5, "ny": 4}, "laser_point": laser}
+    elif seed < 20:
+        grids = {"scan_type": "confocal", "sensor_grid": {"nx": 5, "ny": 4, "width": 1.6, "height": 1.2}}
+    else:
+        lasers = {"nx": 3, "ny": 2, "width": 1.5, "height": 1.0}
+        grids = {"scan_type": "exhaustive", "sensor_grid": {"nx": 3, "ny": 4}, "laser_grid": lasers}
+    return grids | {"account_first_and_last_bounces": seed >= 20}
 
 
 def name(seed: int) -> str:

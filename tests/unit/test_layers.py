@@ -14,7 +14,9 @@ STAGES = ("config", "scene", "capture", "engine", "sensor", "files", "rendering"
 SHARED = ("units", "errors", "interruption")
 MODULES = sorted(PACKAGE.rglob("*.py"))
 IN_STAGES = [path for path in MODULES if path.relative_to(PACKAGE).parts[0] in STAGES]
-BUILDERS = tuple(PACKAGE / "scene" / name for name in ("build.py", "materials.py", "view.py", "xml_loading.py"))
+BUILDERS = tuple(
+    PACKAGE / "scene" / name for name in ("build.py", "materials.py", "view.py", "xml_loading.py", "xml_textures.py")
+)
 MUST_NOT_RENDER = [
     path for path in MODULES if path.relative_to(PACKAGE).parts[0] not in ("engine", "bench") and path not in BUILDERS
 ]

@@ -1,0 +1,78 @@
+"""Textures in a Mitsuba scene that ask more of a shape than it has: attributes of its mesh, texture coordinates."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from xml.etree.ElementTree import Element
+
+import mitsuba as mi
+import numpy as np
+
+from nlosrender.config.xml_shapes import named, shape_parameters
+from nlosrender.config.xml_tree import place_of
+from nlosrender.scene.hidden_geometry import MESH_PLUGINS
+from nlosrender.scene.mesh_attributes import AttributeUse
+from nlosrender.scene.pictures import TEXTURES_WITH_A_PLACE
+from nlosrender.scene.pose import Float64
+from nlosrender.scene.triangle_mesh import TriangleMesh
+
+OWN_BUFFERS = ("vertex_positions", "vertex_normals", "vertex_texcoords", "vertex_count", "face_count")
+
+
+def check_attributes(shape: Element, with_id: Mapping[str, Element]) -> None:
+    """Refuse textures that read what a shape does not have, or take for reflectances what cannot be any.
+
+    Mitsuba says nothing: the first are black, and 8-bit colours 0 to 255.
+
+    Parameters
+    ----------
+    shape
+        A ``<shape>`` whose file, if it has one, has been read and found sound.
+    with_id
+        The BSDFs and textures of the scene that a shape may refer to, by their ids.
+
+    Raises
+    ------
+    ValueError
+        Says which shape, by its place, and what it has.
+    """
+    textures = [each for each in _textures(shape, with_id) if each[1].get("type") == "mesh_attribute"]
+    if not textures:
+        return
+    attributes: dict[str, Float64] = {}
+    if shape.get("type") in MESH_PLUGINS:
+        filename = str(shape_parameters(shape)["filename"])
+        parameters = mi.traverse(mi.load_dict({"type": shape.get("type"), "filename": filename}))
+        names = [name for name in parameters.keys() if name.split("_")[0] in ("vertex", "face")]  # noqa: SIM118
+        attributes = {name: np.asarray(parameters[name]) for name in names if name not in OWN_BUFFERS}
+    for parameter, texture in textures:
+        values = shape_parameters(texture)
+        try:
+            AttributeUse(parameter, str(values.get("name")), float(values.get("scale", 1.0))).check(attributes)
+        except ValueError as error:
+            raise ValueError(f"{place_of(shape)}: {named(shape)}: {error}") from error
+
+
+def picture_warnings(shape: Element, with_id: Mapping[str, Element], mesh: TriangleMesh | None) -> list[str]:
+    """Return a sentence for a mesh file without texture coordinates that has a picture: it lies on every triangle."""
+    if mesh is None or mesh.uvs is not None or shape.get("type") not in MESH_PLUGINS:
+        return []
+    textures = (texture for _, texture in _textures(shape, with_id))
+    if not any(texture.get("type") in TEXTURES_WITH_A_PLACE for texture in textures):
+        return []
+    return [
+        f"scene.mitsuba: {place_of(shape)}: {named(shape)} has a picture, but its file no texture coordinates at every "
+        "corner: Mitsuba puts the picture on each triangle. Give the file some, or take a plain reflectance."
+    ]
+
+
+def _textures(
+    element: Element, with_id: Mapping[str, Element], parameter: str = "", within: tuple[str, ...] = ()
+) -> Iterator[tuple[str, Element]]:
+    """Yield the textures in an element, and in what it refers to as ``parameter``, with what each is used as."""
+    for texture in element.iter("texture"):
+        yield texture.get("name") or parameter or "texture", texture
+    for reference in element.iter("ref"):
+        name = reference.get("id", "")
+        if name in with_id and name not in within:
+            yield from _textures(with_id[name], with_id, reference.get("name", ""), (*within, name))
