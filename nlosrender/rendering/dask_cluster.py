@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import logging
 import os
 import signal
 from collections.abc import Callable, Iterator
@@ -66,6 +67,7 @@ def joined_cluster(scheduler: str | None = None, workers: int | None = None) -> 
     except ImportError as error:
         message = f"--executor dask: {error}. Install it with: pip install 'nlosrender[dask]'"
         raise BackendError(message) from error
+    _silence_tracebacks()
     if scheduler is not None:
         with _connected(scheduler) as client:
             yield Cluster(lambda: client, Sharing(workers=_awaited(client, scheduler, workers)), threads=None)
@@ -86,6 +88,19 @@ def joined_cluster(scheduler: str | None = None, workers: int | None = None) -> 
 
         # the process that writes takes a share of the memory, too
         yield Cluster(connect, Sharing(workers=count, memory_shares=count + 1), threads=max(1, cores // count))
+
+
+def _silence_tracebacks() -> None:
+    """Keep the tracebacks of dask's own threads out of the log: what a lost connection means is said by the error."""
+    names = [name for name in logging.Logger.manager.loggerDict if name.split(".")[0] in ("distributed", "tornado")]
+    for name in (*names, "asyncio"):
+        logger = logging.getLogger(name)
+        if _has_no_traceback not in logger.filters:
+            logger.addFilter(_has_no_traceback)
+
+
+def _has_no_traceback(record: logging.LogRecord) -> bool:
+    return not record.exc_info
 
 
 @contextmanager

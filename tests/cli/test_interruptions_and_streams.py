@@ -60,6 +60,29 @@ def test_an_interrupted_command_says_so(after: str, expected: tuple[int, str]) -
     assert (done.returncode, done.stderr, done.stdout) == (*expected, "")
 
 
+def test_a_command_is_interrupted_while_it_is_imported() -> None:
+    """Ctrl-C in the first fifth of a second: exit code 130 and one word, no traceback out of an import."""
+    code = (
+        "import signal, sys\n"
+        "class Finder:\n"
+        "    def find_spec(self, name, path=None, target=None):\n"
+        "        if name == 'typer':\n"
+        "            signal.raise_signal(signal.SIGINT)\n"
+        "sys.meta_path.insert(0, Finder())\n"
+        "from nlosrender.__main__ import main\n"
+        "main()\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], timeout=60, check=False, capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (EXIT_INTERRUPTED, "interrupted\n")
+
+
+def test_a_command_is_interrupted_while_python_ends() -> None:
+    """Its work is done: the process ends by the signal, without a word."""
+    code = "import atexit, signal\natexit.register(signal.raise_signal, signal.SIGINT)\nmain()\n"
+    done = run_process(code, "--version")
+    assert (done.returncode, done.stderr) == (-signal.SIGINT, "")
+
+
 class CutOffMitsuba(ModuleType):
     """A Mitsuba during whose start Ctrl-C is pressed."""
 
