@@ -6,7 +6,7 @@ from pathlib import Path
 
 from nlosrender.errors import FileError
 from nlosrender.files.journal import read_records
-from nlosrender.files.partial_capture import JOURNAL
+from nlosrender.files.partial_folder import JOURNAL
 from nlosrender.files.reader import explained_read
 from nlosrender.files.unit_log import UnfinishedRender
 

@@ -14,7 +14,6 @@ from __future__ import annotations
 import os
 import shutil
 import socket
-import stat
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import suppress
@@ -28,17 +27,11 @@ from nlosrender.errors import FileError
 from nlosrender.files.capture_file import CaptureHeader
 from nlosrender.files.header_writer import root_attributes
 from nlosrender.files.identity import differences
-from nlosrender.files.journal import Journal, JournalInUseError
+from nlosrender.files.journal import Journal
 from nlosrender.files.kinds import CAPTURE, Kind, same_capture
+from nlosrender.files.partial_folder import claimed_journal
 from nlosrender.files.pieces import Cutter, PackedChunk
-from nlosrender.files.replacement import (
-    check_writable,
-    explained_write,
-    new_partial,
-    partial_folder,
-    publish,
-    synchronise,
-)
+from nlosrender.files.replacement import check_writable, explained_write, publish, synchronise
 from nlosrender.files.sink import CaptureSink, new_capture, sample_names
 from nlosrender.files.stored_bytes import StoredBytes, stored_bytes
 from nlosrender.files.sums import Sums
@@ -54,9 +47,7 @@ from nlosrender.files.unit_log import (
 from nlosrender.files.unit_state import PREFIX, has_states, read_state, state_path, write_state
 from nlosrender.interruption import uninterrupted
 
-JOURNAL = "journal"
 MOST_DIFFERENCES = 6  # that are listed
-ATTEMPTS = 10  # to open a folder that another render is just removing
 
 
 class PartialCapture:
@@ -130,7 +121,7 @@ class PartialCapture:
         """
         path = Path(path)
         target = check_writable(path, CAPTURE)
-        partial = cls(path, target, _journal(path, target))
+        partial = cls(path, target, claimed_journal(path, target))
         try:
             partial._begin(dict(identity), resume)
         except BaseException:
@@ -249,6 +240,10 @@ class PartialCapture:
         """
         with uninterrupted(), explained_write(self.path):
             write_state(state_path(self.folder, unit), self._tag(budget), kept)
+
+    def has_state(self, unit: UnitKey) -> bool:
+        """Return whether something was kept of a unit in flight, usable or not."""
+        return state_path(self.folder, unit).exists()
 
     def kept_state(self, unit: UnitKey, budget: Mapping[str, Any]) -> Kept | None:
         """Return what an earlier render has kept of a unit with the same budget, if it is whole."""
@@ -417,47 +412,6 @@ class PartialCapture:
 
     def _samples(self) -> Path:
         return self.folder / f"samples.{self._state.generation}.hdf5"
-
-
-def _journal(path: Path, target: Path) -> Journal:
-    folder = partial_folder(target)
-    with explained_write(path):
-        probe = new_partial(target)
-        owner = probe.lstat().st_uid  # of what this process makes there: network file systems have their own idea of it
-        probe.unlink()
-        for attempt in range(ATTEMPTS):
-            with suppress(FileExistsError):
-                folder.mkdir()
-            _refuse_foreign(path, folder, owner)
-            try:
-                return Journal(folder / JOURNAL)
-            except JournalInUseError as error:
-                message = f"{path}: another render is writing it now. Wait for it, or name another output."
-                raise FileError(message) from error
-            except FileNotFoundError:
-                if attempt == ATTEMPTS - 1:
-                    raise
-    raise FileError(f"{path}: cannot be written: its folder {folder} vanishes.")
-
-
-def _refuse_foreign(path: Path, folder: Path, owner: int) -> None:
-    """Make sure that the folder is our own and holds no links: what is written there must not end up elsewhere.
-
-    Raises
-    ------
-    FileError
-        It is not, or does.
-    """
-    hint = "Remove it, or name another output."
-    found = folder.lstat()
-    if not stat.S_ISDIR(found.st_mode):
-        raise FileError(f"{path}: {folder} is a link or a file, need a folder of unfinished renders. {hint}")
-    if found.st_uid != owner:
-        raise FileError(f"{path}: {folder} belongs to another user, number {found.st_uid}. Name another output.")
-    for entry in folder.iterdir():
-        mode, links = entry.lstat().st_mode, entry.lstat().st_nlink
-        if not stat.S_ISREG(mode) or links > 1:
-            raise FileError(f"{path}: {entry} is a link or no file, which no render leaves there. {hint}")
 
 
 def _copies(stored: StoredBytes, chunks: Iterable[StoredChunk]) -> Iterator[PackedChunk]:

@@ -53,6 +53,10 @@ class UnitInFlight:
         self._key = (unit.sensors, unit.lasers)
         self._budget: Mapping[str, Any] = asdict(budget) | {"time_limit_s": budget.time_limit_s is not None}
         kept = partial.kept_state(*self._state_of) or {}
+        if not kept and partial.has_state(self._key):
+            warn(
+                f"{partial.path}: what was kept of the unit in flight is damaged, or of another target; it begins anew."
+            )
         self.earlier_seconds = float(kept[OF_UNIT].numbers["seconds"]) if OF_UNIT in kept else 0.0
         self.passes = Passes(progress, self._look, kept)
         self._begun = self._kept_at = time.perf_counter()

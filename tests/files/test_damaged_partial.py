@@ -157,7 +157,7 @@ def test_a_damaged_journal_is_said(stopped: Callable) -> None:
         assert "the units it told of from there on are rendered again" in message
 
 
-@pytest.mark.parametrize("record", [{"unit": 3}, {"unit": [], "generation": 0}, {"switched_to": "x"}, [1], None])
+@pytest.mark.parametrize("record", [{"unit": 3}, {"unit": [], "generation": 0}, {"switched_to": "x"}, [1], "text"])
 def test_records_of_something_else_are_no_traceback(stopped: Callable, record: object) -> None:
     """A journal that passes its checksums and makes no sense is damage like any other."""
     path = stopped("gzip", closed=True)

@@ -16,16 +16,19 @@ from point_captures import cells, points_header, write_points
 
 from nlosrender.analysis.frames import FrameOptions, write_frames
 from nlosrender.analysis.plots import plot_capture
+from nlosrender.analysis.reconstruction.reconstruct import ReconstructionSettings, reconstruct_capture
+from nlosrender.analysis.reconstruction.volume_file import write_volume
 from nlosrender.bench.meshes import write_ply
 from nlosrender.bench.report import write_json
 from nlosrender.capture.part import Selection
-from nlosrender.errors import FileError
+from nlosrender.errors import EXIT_FAILURE, DiskError, FileError
 from nlosrender.files.dataset_index import write_index
 from nlosrender.files.exports import export_capture
+from nlosrender.files.kinds import PLY
 from nlosrender.files.merge import merge_captures
 from nlosrender.files.partial_capture import PartialCapture
 from nlosrender.files.reader import open_capture, read_header
-from nlosrender.files.replacement import partial_folder
+from nlosrender.files.replacement import partial_folder, replacing
 from nlosrender.files.writer import CaptureWriter
 
 THESIS = "\\documentclass{thesis} ten years of work"
@@ -263,3 +266,35 @@ def test_reading_needs_no_lock(capture: Path, monkeypatch: pytest.MonkeyPatch, n
     with open_capture(capture) as one, open_capture(capture) as other:
         np.testing.assert_array_equal(one.read_block(), other.read_block())
     assert asked == [False, False]
+
+
+def test_a_full_disk_is_a_failure_with_its_name(tmp_path: Path) -> None:
+    """Nothing is wrong with the input: exit code 1; the disk is named, and the earlier file stays."""
+    out = tmp_path / "a.ply"
+    write_ply(out, np.zeros((3, 3)), np.array([[0, 1, 2]]))
+    before = out.read_bytes()
+    message = r"a.ply: cannot be written: No space left on device\. Free some space on the disk /.* MB left\)"
+    with pytest.raises(DiskError, match=message) as caught, replacing(out, PLY):
+        raise OSError(errno.ENOSPC, "No space left on device")
+    assert caught.value.exit_code == EXIT_FAILURE
+    assert [(path.name, path.read_bytes()) for path in tmp_path.iterdir()] == [("a.ply", before)]
+
+
+def test_a_volume_on_a_full_disk(capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """HDF5 does not see the failure, which would end the process; what is left is the earlier volume."""
+    settings = ReconstructionSettings("backprojection", voxels=8)
+    found = reconstruct_capture(capture, settings)
+    out = write_volume(found, tmp_path / "volume.hdf5")
+    before, true_write, left = out.read_bytes(), os.pwrite, [3000]
+
+    def filling(descriptor: int, content: bytes, offset: int) -> int:
+        if left[0] < len(content):
+            raise OSError(errno.ENOSPC, "No space left on device")
+        left[0] -= len(content)
+        return true_write(descriptor, content, offset)
+
+    monkeypatch.setattr(os, "pwrite", filling)
+    with pytest.raises(DiskError, match=r"volume.hdf5: cannot be written: No space left"):
+        write_volume(found, out)
+    assert out.read_bytes() == before
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["in", "volume.hdf5"]
