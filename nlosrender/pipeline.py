@@ -30,7 +30,7 @@ from nlosrender.files.capture_file import CaptureHeader
 from nlosrender.files.chunks import sensor_tile
 from nlosrender.files.identity import capture_identity, files_read, identity_attributes
 from nlosrender.files.kinds import CAPTURE
-from nlosrender.files.part_attributes import MISSED, part_attributes, summed_attributes
+from nlosrender.files.part_attributes import MISSED, known_of, part_attributes, summed_attributes
 from nlosrender.files.partial_capture import PartialCapture
 from nlosrender.files.provenance import provenance_attributes
 from nlosrender.files.replacement import check_writable
@@ -148,7 +148,8 @@ def render_capture(
             bounces = engine.options.bounces
             missing = tuple(paths.summary for paths in unsampled)
             zero = () if tally.sums.squares else zero_capture(engine, unsampled, tally.sums, warnings)
-            results = summed_attributes(tally.sums, bounces, stopwatch.report(), missing, zero)
+            lowest = min((paths.first_bounce for paths in unsampled), default=None)
+            results = summed_attributes(tally.sums, bounces, stopwatch.report(), missing, zero, lowest)
             missed = missed_target(config, tally.sums.stated_error(missing))
             if missed and selection == WHOLE:
                 results[MISSED] = missed
@@ -174,6 +175,8 @@ def render_capture(
         warnings=tuple(warnings.said),
         unsampled_paths=missing,
         zero_because=zero,
+        error_estimate_per_bounce=known_of(tally.sums.errors_per_bounce(bounces), bounces, lowest),
+        energy_error_per_bounce=known_of(tally.sums.energy_errors(bounces), bounces, lowest),
     )
 
 
@@ -232,11 +235,13 @@ def set_up_engine(
     config: Config, backend: Backend, selection: Selection = WHOLE, sharing: Sharing = ALONE
 ) -> tuple[Plan, Engine, CaptureHeader]:
     """Stages 2 to 4 up to the first ray: scene, capture, plan, engine, and what the file will say of them."""
+    from nlosrender.engine.skipped import shared_samples
+
     built = load_view(config) if config.capture.is_line_of_sight else load_scene(config)
     capture, time_axis = describe_capture(config, built.wall, built)
     with sharing.named(config.render.memory_limit_bytes):
         plan, engine = prepare(config, backend, built, capture, time_axis, selection, sharing)
-    return plan, engine, describe_file(config, built, capture, time_axis)
+    return plan, engine, describe_file(config, built, capture, time_axis, shared_samples(engine))
 
 
 def settled_budget(config: Config, engine: Engine) -> Budget:
@@ -435,7 +440,7 @@ def prepare(
 
 
 def describe_file(
-    config: Config, built: BuiltScene | BuiltView, capture: Capture, time_axis: TimeAxis
+    config: Config, built: BuiltScene | BuiltView, capture: Capture, time_axis: TimeAxis, shared: str = ""
 ) -> CaptureHeader:
     """Stage 6: what the file says beside its samples."""
     bounces = bounce_axis(config)
@@ -461,4 +466,5 @@ def describe_file(
         pose=built.wall.pose,
         frame=config.output.frame,
         planar_wall=built.wall.is_planar,
+        shared_samples=shared,
     )

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from nlosrender.capture.bounces import LINE_OF_SIGHT
+from nlosrender.cli.stated_error import energies_by_bounce, errors_by_bounce
 
 SHOWN_LENGTH = 160  # characters of one value in the table; --json has all of it
 _LONGEST = {"mesh": 600}  # names of materials
@@ -41,6 +42,8 @@ def _rows(summary: dict[str, object]) -> list[tuple[str, str]]:
         ("samples per pixel" if is_view else "samples per pair", _text(summary["samples"])),
         ("seed", _text(summary["seed"])),
         ("error estimate", _error(summary)),
+        ("error per bounce", errors_by_bounce(_object(summary["error_estimate_per_bounce"]))),
+        ("energy", energies_by_bounce(_object(summary["energy"]), _object(summary["energy_error_per_bounce"]))),
         *(("NOT SAMPLED", _text(paths)) for paths in _sequence(summary["unsampled_paths"] or [])),
         *(("ZERO BECAUSE", _text(reason)) for reason in _sequence(summary["zero_because"] or [])),
         ("outside the window", _text(summary["out_of_window_energy"])),
@@ -132,6 +135,10 @@ def _named(values: object) -> str:
         if isinstance(values, dict)
         else _text(values)
     )
+
+
+def _object(value: object) -> dict[str, object]:
+    return value if isinstance(value, dict) else {}
 
 
 def _error(summary: dict[str, object]) -> str:

@@ -33,7 +33,7 @@ def merge(
 ) -> None:
     """Put the parts of a capture together; what is missing, there twice, damaged or not its own is named."""
     from nlosrender.cli.progress import progress_bar
-    from nlosrender.cli.stated_error import error_in_words
+    from nlosrender.cli.stated_error import energies_by_bounce, error_in_words
     from nlosrender.files.merge import merge_captures
 
     with progress_bar("merge", hidden=quiet) as (progress, _, _):
@@ -50,5 +50,5 @@ def merge(
             typer.echo(f"  not sampled     {missing}")
         for reason in report.zero_because:
             typer.echo(f"  zero because    {reason}")
-        energies = ", ".join(f"{name}: {energy:.4g}" for name, energy in report.energy.items())
+        energies = energies_by_bounce(report.energy, report.energy_error_per_bounce)
         typer.echo(f"  energy          bounce {energies}; outside the time window: {report.out_of_window:.4g}")

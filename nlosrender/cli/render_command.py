@@ -183,7 +183,7 @@ def _print_json(report: RenderReport) -> None:
 
 
 def _print_report(report: RenderReport) -> None:
-    from nlosrender.cli.stated_error import error_in_words
+    from nlosrender.cli.stated_error import energies_by_bounce, error_in_words, errors_by_bounce
 
     seconds = report.seconds
     typer.echo(f"wrote {report.output}" + (f", {report.part} of the capture" if report.part else ""))
@@ -198,7 +198,10 @@ def _print_report(report: RenderReport) -> None:
         typer.echo(f"  not sampled     {missing}")
     for reason in report.zero_because:
         typer.echo(f"  zero because    {reason}")
-    energies = ", ".join(f"{name}: {energy:.4g}" for name, energy in report.energy.items())
+    typer.echo(
+        f"  per bounce      {errors_by_bounce(report.error_estimate_per_bounce)} (relative L2; -: no light or unknown)"
+    )
+    energies = energies_by_bounce(report.energy, report.energy_error_per_bounce)
     counted = "interactions" if is_view else "bounce"
     typer.echo(f"  energy          {counted} {energies}; outside the time window: {report.out_of_window:.4g}")
     stages = ", ".join(f"{stage} {readable_duration(spent)}" for stage, spent in seconds.items() if stage != "total")

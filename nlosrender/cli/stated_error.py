@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 
 def error_in_words(error: float, unsampled: Sequence[str], zero_because: Sequence[str]) -> str:
@@ -21,3 +21,25 @@ def error_in_words(error: float, unsampled: Sequence[str], zero_because: Sequenc
     if zero_because:
         return "unknown: H is zero everywhere"
     return f"{error:.2%} (relative L2)" if math.isfinite(error) else "unknown: nothing but noise"
+
+
+def errors_by_bounce(errors: Mapping[str, object]) -> str:
+    """Return the relative errors of bounces that have one, or whose one is not known: "3: 1.2 %, 4: unknown"."""
+    return ", ".join(f"{name}: {_percent(error)}" for name, error in errors.items())
+
+
+def energies_by_bounce(energies: Mapping[str, object], errors: Mapping[str, object]) -> str:
+    """Return energies with their standard errors: "3: 0.364 +- 0.002, 4: 0.0058 (error unknown)"."""
+    return ", ".join(f"{name}: {_with_error(energy, errors.get(name))}" for name, energy in energies.items())
+
+
+def _percent(error: object) -> str:
+    return f"{error:.2%}" if isinstance(error, (int, float)) else "-"
+
+
+def _with_error(energy: object, error: object) -> str:
+    if not isinstance(energy, (int, float)):
+        return str(energy)
+    if not isinstance(error, (int, float)):
+        return f"{energy:.4g}"
+    return f"{energy:.4g} +- {error:.2g}" if error else f"{energy:.4g}"

@@ -111,6 +111,12 @@ class DeviceHistogram:
         variance = sum(squares[1:], squares[0]) / ((count - 1) * count)
         return mean * scale, variance * scale**2
 
+    def energies(self) -> NDArray[np.float64]:
+        """Return the sums over the time window (replica, sensor, laser, slot, channel)."""
+        shape = self.shape
+        rows = np.asarray(self.sums.numpy()).reshape(-1, shape.row)[:, :-1].sum(axis=-1)
+        return rows.reshape(shape.replicas, shape.sensors, shape.lasers, shape.slots, shape.channels)
+
     def total(self, scale: float = 1.0) -> mi.Float64:
         """Return the sum over replicas times ``scale``, in memory order, flattened."""
         replicas = self._replicas(scale, None)
@@ -163,3 +169,4 @@ class Histogram:
     variance: NDArray[np.float64]
     outside: NDArray[np.float64]  # (channel, bounce, laser, sensor): H outside the time window
     samples: int  # per sensor point; 0 for a deterministic engine
+    contrasts: NDArray[np.float64]  # (contrast, channel, bounce) of the energy, see ``energy_contrasts``

@@ -17,6 +17,7 @@ from nlosrender.capture.time_axis import TimeAxis
 from nlosrender.engine.deadline import Horizon, light_leaves_window
 from nlosrender.engine.device_arrays import laser_points, on_device, sensor_points
 from nlosrender.engine.direct_paths import are_direct
+from nlosrender.engine.energy_contrasts import no_contrasts
 from nlosrender.engine.further_paths import (
     DIRECT,
     LEAST_PATHS,
@@ -184,15 +185,18 @@ class PathEngine:
             if budget.target_error is not None:
                 known_squares += self.second_squares(batch)
             schedule = Schedule(budget, shape.replicas, known_squares, shape.lanes * shape.lasers)
-            mean, variance, per_lane = self._accumulate(batch, shape, transport, schedule, passes or Passes())
+            mean, variance, per_lane, contrasts = self._accumulate(
+                batch, shape, transport, schedule, passes or Passes()
+            )
         else:
             axes = (shape.channels, bounces.n_slots, shape.lasers, shape.sensors, shape.row)
             mean, variance, per_lane = np.zeros(axes), np.zeros(axes), 0
+            contrasts = no_contrasts(shape.channels, bounces.n_slots)
         if not self.built.wall.is_planar:
             mean[:, :1] += self.second_bounce(batch)
         if not (np.isfinite(mean).all() and np.isfinite(variance).all()):
             raise RenderError("the path engine produced a value that is not finite; please report the configuration")
-        return Histogram(mean[..., :-1], variance[..., :-1], mean[..., -1], per_lane * shape.replicas)
+        return Histogram(mean[..., :-1], variance[..., :-1], mean[..., -1], per_lane * shape.replicas, contrasts)
 
     def settle(self, budget: Budget, known_squares: float = 0.0) -> Budget:
         """Turn a target error into samples for the whole capture, found by a pilot on a few of its points.
@@ -234,8 +238,9 @@ class PathEngine:
 
     def _accumulate(
         self, batch: Batch | Pilot, shape: HistogramShape, transport: Transport, schedule: Schedule, passes: Passes
-    ) -> tuple[np.ndarray, np.ndarray, int]:
-        bounces, points = self.options.bounces, self.sensor_indices(batch)[self.lane_order(batch)]
+    ) -> tuple[np.ndarray, np.ndarray, int, np.ndarray]:
+        bounces, owners = self.options.bounces, self.sensor_indices(batch)
+        points = owners[self.lane_order(batch)]
         seed, kernel = self.options.seed, self.kernel
 
         def launch(histogram: DeviceHistogram, randomness: LaneRandomness, more: int) -> LaneRandomness:
@@ -250,9 +255,9 @@ class PathEngine:
 
         first = 1 if bounces.split else 0  # the second bounce has slot 0
         slots = range(-first, bounces.n_slots - first)
-        result = accumulate(shape, points, seed, launch, schedule, passes, self.scale, slots, kernel)
+        result = accumulate(shape, points, seed, launch, schedule, passes, self.scale, slots, kernel, owners)
         self.compile_seconds += result.compile_seconds
-        return result.mean, result.variance, result.per_lane
+        return result.mean, result.variance, result.per_lane, result.contrasts
 
     def shape(self, batch: Batch | Pilot, slots: int) -> HistogramShape:
         """Return the shape of a batch's histogram with ``slots`` bounce slots."""

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nlosrender.engine.device_arrays import on_device
+from nlosrender.engine.energy_contrasts import contrasts_of_points
 from nlosrender.engine.histogram import DeviceHistogram, HistogramShape
 from nlosrender.engine.passes import PASS_SECONDS, Passes, Snapshot
 from nlosrender.engine.temporal_kernel import TemporalKernel
@@ -58,6 +59,7 @@ class Sampled:
     mean: NDArray[np.float64]
     variance: NDArray[np.float64]  # of the mean
     per_lane: int  # samples
+    contrasts: NDArray[np.float64]  # of the energy, see ``energy_contrasts``
     compile_seconds: float
 
 
@@ -71,6 +73,7 @@ def accumulate(
     scale: float = 1.0,
     slots: range | None = None,
     kernel: TemporalKernel | None = None,
+    owners: NDArray[np.uint32] | None = None,
 ) -> Sampled:
     """Launch until the schedule has enough.
 
@@ -92,6 +95,8 @@ def accumulate(
         Bounce slots of the result, as for ``DeviceHistogram.statistics``.
     kernel
         As for ``DeviceHistogram``.
+    owners
+        (sensors,) flat indices of the sensor points in the histogram's order; None: ``points``.
     """
     histogram = DeviceHistogram(shape, kernel)
     if (earlier := passes.resumed("sums")) is None:
@@ -125,7 +130,13 @@ def accumulate(
         passes.between(schedule.fraction(done, seconds), take)
     mean, variance = histogram.statistics(done, scale, slots)
     dr.eval(mean, variance)
-    return Sampled(histogram.on_host(mean), histogram.on_host(variance), done, compile_seconds)
+    contrasts = contrasts_of_points(
+        histogram,
+        points if owners is None else owners,
+        scale / (done * shape.replicas),
+        range(shape.slots) if slots is None else slots,
+    )
+    return Sampled(histogram.on_host(mean), histogram.on_host(variance), done, contrasts, compile_seconds)
 
 
 def lane_randomness(shape: HistogramShape, points: NDArray[np.uint32], seed: int) -> LaneRandomness:

@@ -104,6 +104,17 @@ def _techniques(paths: PathEngine) -> Iterator[Skipped]:
         yield Skipped("hidden geometry sampling (MIS)", why)
 
 
+def shared_samples(engine: Engine) -> str:
+    """Return which samples of a capture have errors in common, in words for its file; empty where none have."""
+    if isinstance(engine, VirtualLightEngine):
+        what = "all sensor points share the same patches" + (" and walks" if makes_walks(engine) else "")
+    elif engine.capture.scan_type == "exhaustive":
+        what = "all laser points share the paths of a sensor point"
+    else:
+        return ""
+    return f"{what}: their errors are correlated. The error of sums is in the file's energy_error_per_bounce"
+
+
 def makes_walks(engine: Engine) -> bool:
     """Return whether walks give the further bounces."""
     return isinstance(engine, VirtualLightEngine) and engine.further is not None

@@ -52,6 +52,8 @@ class CaptureHeader:
         Frame of the positions in the file: ``znlos`` or ``scene``.
     planar_wall
         Whether the relay wall is a plane.
+    shared_samples
+        Which samples have errors in common, in words: their variances may not be summed. Empty where none have.
 
     Raises
     ------
@@ -80,6 +82,7 @@ class CaptureHeader:
     pose: Pose
     frame: str = "znlos"
     planar_wall: bool = True
+    shared_samples: str = ""
 
     def __post_init__(self) -> None:
         _require(self.scan_type in SCAN_TYPES, "scan_type", self.scan_type, f"one of {', '.join(SCAN_TYPES)}")

@@ -5,9 +5,9 @@ from __future__ import annotations
 import json
 import shutil
 import zlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -27,9 +27,11 @@ from nlosrender.files.part_attributes import (
     NOTE,
     PART,
     SUMS,
+    UNKNOWN_FROM,
     UNSAMPLED,
     ZERO,
     json_object,
+    known_of,
     summed_attributes,
     text_list,
 )
@@ -57,6 +59,8 @@ class MergeReport:
     samples: int  # paths per sensor point, the least of all parts
     unsampled_paths: tuple[str, ...] = ()  # classes of paths whose light is missing
     zero_because: tuple[str, ...] = ()  # why H is zero everywhere; empty where it is not
+    error_estimate_per_bounce: Mapping[str, float | None] = field(default_factory=dict)  # None: not known, or no light
+    energy_error_per_bounce: Mapping[str, float | None] = field(default_factory=dict)  # standard error; None: not known
 
 
 def merge_captures(
@@ -99,7 +103,7 @@ def merge_captures(
         for number, shard in enumerate(shards):
             _copy(shard, None if number == 0 else sink)
             progress((number + 1) / len(shards))
-        sums = sum((shard.stored.sums for shard in shards), Sums())
+        sums, bounces = sum((shard.stored.sums for shard in shards), Sums()), _bounces(shards[0])
         sink.remove_attributes((PART, SUMS, CHECKSUMS, NOTE, ZERO, SELECTION))
         sink.set_attributes(_attributes(shards, sums, output))
         sink.close()
@@ -115,11 +119,13 @@ def merge_captures(
         output=output,
         parts=len(shards),
         error_estimate=sums.stated_error(_told(shards, UNSAMPLED)),
-        energy=sums.energy_per_bounce(_bounces(shards[0])),
+        energy=sums.energy_per_bounce(bounces),
         out_of_window=float(sums.outside),
         samples=sums.samples or 0,
         unsampled_paths=_told(shards, UNSAMPLED),
         zero_because=() if sums.squares else _told(shards, ZERO),
+        error_estimate_per_bounce=known_of(sums.errors_per_bounce(bounces), bounces, _unknown_from(shards)),
+        energy_error_per_bounce=known_of(sums.energy_errors(bounces), bounces, _unknown_from(shards)),
     )
 
 
@@ -203,7 +209,14 @@ def _attributes(shards: Sequence[Shard], sums: Sums, output: Path) -> dict[str, 
         config["output"]["path"] = str(output)
         changed |= {"config": json.dumps(config, ensure_ascii=False), "config_hash": tree_hash(config)}
     zero = () if sums.squares else _told(shards, ZERO)
-    return changed | summed_attributes(sums, _bounces(shards[0]), seconds, _told(shards, UNSAMPLED), zero)
+    missing = _told(shards, UNSAMPLED)
+    return changed | summed_attributes(sums, _bounces(shards[0]), seconds, missing, zero, _unknown_from(shards))
+
+
+def _unknown_from(shards: Sequence[Shard]) -> int | None:
+    """Return the lowest bounce that light is missing of in any shard."""
+    told = [shard.header.attributes.get(UNKNOWN_FROM) for shard in shards]
+    return min((bounce for bounce in told if isinstance(bounce, int)), default=None)
 
 
 def _told(shards: Sequence[Shard], name: str) -> tuple[str, ...]:

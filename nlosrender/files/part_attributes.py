@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import astuple, dataclass
 from typing import Any
@@ -16,6 +17,7 @@ from nlosrender.files.unit_log import Tally
 
 PART, SUMS, CHECKSUMS, NOTE = "part", "part_sums", "part_checksums", "incomplete"
 UNSAMPLED, ZERO, MISSED = "unsampled_paths", "zero_because", "target_missed"
+UNKNOWN_FROM = "unsampled_first_bounce"
 
 
 @dataclass(frozen=True)
@@ -71,6 +73,7 @@ def summed_attributes(
     seconds: Mapping[str, float],
     unsampled: Sequence[str] = (),
     zero_because: Sequence[str] = (),
+    unknown_from: int | None = None,
 ) -> dict[str, object]:
     """Return the results of a render, or of several that were put together.
 
@@ -86,8 +89,12 @@ def summed_attributes(
         Classes of paths whose light is missing.
     zero_because
         Why H is zero everywhere; empty where it is not.
+    unknown_from
+        The lowest bounce that light is missing of; None: of none.
     """
     known: dict[str, object] = {UNSAMPLED: list(unsampled)}
+    if unknown_from is not None:
+        known[UNKNOWN_FROM] = unknown_from
     if zero_because:
         known[ZERO] = list(zero_because)
     return known | result_attributes(
@@ -96,7 +103,17 @@ def summed_attributes(
         seconds=seconds,
         out_of_window_energy=float(sums.outside),
         energy=sums.energy_per_bounce(bounces),
+        error_estimate_per_bounce=known_of(sums.errors_per_bounce(bounces), bounces, unknown_from),
+        energy_error_per_bounce=known_of(sums.energy_errors(bounces), bounces, unknown_from),
+        energy_error=math.nan if unsampled else sums.energy_error,
     )
+
+
+def known_of(errors: Mapping[str, float], bounces: BounceAxis, unknown_from: int | None) -> dict[str, float | None]:
+    """Return errors by bounce number as JSON holds them: None where there is no number, or light is missing."""
+    first_unknown = len(errors) if unknown_from is None else bounces.slot(max(unknown_from, bounces.first))
+    known = (slot < first_unknown and math.isfinite(error) for slot, error in enumerate(errors.values()))
+    return {name: errors[name] if is_known else None for name, is_known in zip(errors, known, strict=True)}
 
 
 def text_list(attributes: Mapping[str, object], name: str) -> tuple[str, ...]:

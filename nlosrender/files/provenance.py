@@ -87,6 +87,9 @@ def result_attributes(
     seconds: Mapping[str, float] | None = None,
     out_of_window_energy: float | Sequence[float] | None = None,
     energy: Mapping[str, float] | None = None,
+    error_estimate_per_bounce: Mapping[str, float | None] | None = None,
+    energy_error_per_bounce: Mapping[str, float | None] | None = None,
+    energy_error: float | None = None,
 ) -> dict[str, object]:
     """Return what is known when a render ends, for ``CaptureWriter.set_attributes``; None is left out.
 
@@ -103,6 +106,11 @@ def result_attributes(
         bounce [J m^-2 sr^-1].
     energy
         H summed over all samples, by bounce number [J m^-2 sr^-1].
+    error_estimate_per_bounce
+        Estimated relative L2 error of H, by bounce number; None: not known, or no light.
+    energy_error_per_bounce, energy_error
+        Estimated standard error of ``energy``, by bounce number and of all of it [J m^-2 sr^-1]; None and NaN: not
+        known.
     """
     known = {
         "samples": samples,
@@ -110,8 +118,15 @@ def result_attributes(
         "seconds": None if seconds is None else json.dumps({stage: float(spent) for stage, spent in seconds.items()}),
         "out_of_window_energy": out_of_window_energy,
         "energy": None if energy is None else json.dumps(dict(energy)),
+        "error_estimate_per_bounce": _json(error_estimate_per_bounce),
+        "energy_error_per_bounce": _json(energy_error_per_bounce),
+        "energy_error": energy_error,
     }
     return {name: value for name, value in known.items() if value is not None}
+
+
+def _json(errors: Mapping[str, float | None] | None) -> str | None:
+    return None if errors is None else json.dumps(dict(errors), allow_nan=False)
 
 
 def package_versions() -> dict[str, str]:

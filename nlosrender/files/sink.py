@@ -227,4 +227,6 @@ def _create_samples(file: h5py.File, name: str, header: CaptureHeader, compressi
     attributes = sample_attributes(header) | {"meaning": meaning}
     if name == layout.VARIANCE:
         attributes["unit"] = f"({layout.DATA_UNIT})^2"
+        if header.shared_samples:
+            attributes["not_to_be_summed"] = header.shared_samples
     set_attributes(dataset, attributes)

@@ -16,6 +16,8 @@ from nlosrender.capture.bounces import BounceAxis
 from nlosrender.capture.relative_error import relative_l2_error
 
 MANTISSA_BITS = 53  # of float64
+CONTRAST_BITS = 32  # that a unit's contrasts are rounded to
+STATED_DIGITS = 4  # of errors that rest on them: more would depend on how the work is cut
 HALF = 26  # bits of the lower half of a mantissa: sums of 2^36 halves stay within 64-bit integers
 
 
@@ -23,23 +25,35 @@ HALF = 26  # bits of the lower half of a mantissa: sums of 2^36 halves stay with
 class Sums:
     """Sums over part of a capture; parts are added with ``+``."""
 
-    noise: Fraction = Fraction(0)  # sum of variances
-    squares: Fraction = Fraction(0)  # sum of squared estimates
+    slot_noise: tuple[Fraction, ...] = ()  # sum of variances per bounce slot
+    slot_squares: tuple[Fraction, ...] = ()  # sum of squared estimates per bounce slot
     outside: Fraction = Fraction(0)  # H outside the time window [J m^-2 sr^-1]
     energy: tuple[Fraction, ...] = ()  # H per bounce slot [J m^-2 sr^-1]
     samples: int | None = None  # paths per sensor point, the least of all units
     seconds: float = 0.0  # spent rendering
+    contrasts: tuple[tuple[Fraction, ...], ...] = ()  # of the energy per bounce slot [J m^-2 sr^-1]
 
     def __add__(self, other: Sums) -> Sums:
         known = [samples for samples in (self.samples, other.samples) if samples is not None]
         return Sums(
-            noise=self.noise + other.noise,
-            squares=self.squares + other.squares,
+            slot_noise=_added(self.slot_noise, other.slot_noise),
+            slot_squares=_added(self.slot_squares, other.slot_squares),
             outside=self.outside + other.outside,
-            energy=tuple(a + b for a, b in zip_longest(self.energy, other.energy, fillvalue=Fraction(0))),
+            energy=_added(self.energy, other.energy),
             samples=min(known) if known else None,
             seconds=self.seconds + other.seconds,
+            contrasts=tuple(_added(a, b) for a, b in zip_longest(self.contrasts, other.contrasts, fillvalue=())),
         )
+
+    @property
+    def noise(self) -> Fraction:
+        """Sum of variances."""
+        return sum(self.slot_noise, Fraction(0))
+
+    @property
+    def squares(self) -> Fraction:
+        """Sum of squared estimates."""
+        return sum(self.slot_squares, Fraction(0))
 
     @property
     def error_estimate(self) -> float:
@@ -50,6 +64,22 @@ class Sums:
         """Return ``error_estimate``, or NaN where light is missing: ``unsampled`` lists the paths not sampled."""
         return math.nan if unsampled else self.error_estimate
 
+    def errors_per_bounce(self, bounces: BounceAxis) -> dict[str, float]:
+        """Return the relative L2 error of H by bounce number; NaN where a bounce has no light."""
+        pairs = zip(self.slot_noise, self.slot_squares, strict=True)
+        errors = [relative_l2_error(float(noise), float(squares)) if squares else math.nan for noise, squares in pairs]
+        return {bounces.name(slot): error for slot, error in enumerate(errors)}
+
+    def energy_errors(self, bounces: BounceAxis) -> dict[str, float]:
+        """Return the standard error of ``energy_per_bounce`` by bounce number, NaN where it is not known."""
+        columns = zip(*self.contrasts, strict=True) if self.contrasts else [()] * len(self.energy)
+        return {bounces.name(slot): _root_mean_square(column) for slot, column in enumerate(columns)}
+
+    @property
+    def energy_error(self) -> float:
+        """Standard error of the energy of all bounces together [J m^-2 sr^-1]; NaN: not known."""
+        return _root_mean_square([sum(contrast, Fraction(0)) for contrast in self.contrasts])
+
     def energy_per_bounce(self, bounces: BounceAxis) -> dict[str, float]:
         """Return the energy by bounce number, or under ``all`` when bounces are not split."""
         return {bounces.name(slot): float(energy) for slot, energy in enumerate(self.energy)}
@@ -57,12 +87,13 @@ class Sums:
     def as_json(self) -> dict[str, Any]:
         """Return plain values; sums as text ``numerator/denominator``, exact."""
         return {
-            "noise": str(self.noise),
-            "squares": str(self.squares),
+            "noise": _texts(self.slot_noise),
+            "squares": _texts(self.slot_squares),
             "outside": str(self.outside),
-            "energy": [str(energy) for energy in self.energy],
+            "energy": _texts(self.energy),
             "samples": self.samples,
             "seconds": self.seconds,
+            "contrasts": [_texts(contrast) for contrast in self.contrasts],
         }
 
     @classmethod
@@ -76,12 +107,13 @@ class Sums:
         """
         try:
             return cls(
-                noise=Fraction(stored["noise"]),
-                squares=Fraction(stored["squares"]),
+                slot_noise=_fractions(stored["noise"]),
+                slot_squares=_fractions(stored["squares"]),
                 outside=Fraction(stored["outside"]),
-                energy=tuple(Fraction(energy) for energy in stored["energy"]),
+                energy=_fractions(stored["energy"]),
                 samples=None if stored["samples"] is None else int(stored["samples"]),
                 seconds=float(stored["seconds"]),
+                contrasts=tuple(_fractions(contrast) for contrast in stored["contrasts"]),
             )
         except (KeyError, TypeError, ZeroDivisionError) as error:
             raise ValueError(f"no sums of a capture: {error!r}") from error
@@ -93,6 +125,7 @@ def sums_of(
     outside: NDArray[np.float64],
     samples: int,
     seconds: float,
+    contrasts: NDArray[np.float64] | None = None,
 ) -> Sums:
     """Return the sums over a block.
 
@@ -104,18 +137,46 @@ def sums_of(
         (channel, bounce, laser, sensor) H outside the time window.
     samples, seconds
         Paths per sensor point; time spent rendering.
+    contrasts
+        (contrast, bounce) of the energy, see ``engine.energy_contrasts``; None: not known.
     """
-    noise, squares = Fraction(0), Fraction(0)
-    energy = [Fraction(0)] * mean.shape[1]
+    noise, squares, energy = ([Fraction(0)] * mean.shape[1] for _ in range(3))
     # Over the bins of one histogram numpy's order depends on their number alone; the sums over histograms are exact.
     for laser in range(mean.shape[2]):  # one at a time: squaring makes a copy
         part = mean[:, :, laser]
-        squares += exact_sum(np.square(part).sum(axis=-1))
-        noise += exact_sum(variance[:, :, laser].sum(axis=-1))
-        totals = part.sum(axis=-1)
-        for slot in range(mean.shape[1]):
-            energy[slot] += exact_sum(totals[:, slot])
-    return Sums(noise, squares, exact_sum(outside), tuple(energy), samples, seconds)
+        of_rows = np.square(part).sum(axis=-1), variance[:, :, laser].sum(axis=-1), part.sum(axis=-1)
+        for sums, values in zip((squares, noise, energy), of_rows, strict=True):
+            for slot in range(mean.shape[1]):
+                sums[slot] += exact_sum(values[:, slot])
+    kept = () if contrasts is None else tuple(tuple(map(_short, row)) for row in contrasts.tolist())
+    return Sums(tuple(noise), tuple(squares), exact_sum(outside), tuple(energy), samples, seconds, kept)
+
+
+def _root_mean_square(values: Sequence[Fraction]) -> float:
+    if not values:
+        return math.nan
+    root = math.hypot(*map(float, values)) / math.sqrt(len(values))
+    return float(f"{root:.{STATED_DIGITS}g}")
+
+
+def _added(one: Sequence[Fraction], other: Sequence[Fraction]) -> tuple[Fraction, ...]:
+    return tuple(a + b for a, b in zip_longest(one, other, fillvalue=Fraction(0)))
+
+
+def _short(value: float) -> Fraction:
+    """Return a number rounded to as many bits as an error estimate has use for: journals keep its digits as text."""
+    mantissa, exponent = math.frexp(value)
+    return Fraction(round(mantissa * 2**CONTRAST_BITS)) * Fraction(2) ** (exponent - CONTRAST_BITS)
+
+
+def _texts(sums: Sequence[Fraction]) -> list[str]:
+    return [str(value) for value in sums]
+
+
+def _fractions(stored: Sequence[str]) -> tuple[Fraction, ...]:
+    if isinstance(stored, str):
+        raise TypeError(f"got {stored!r}, need one number per bounce slot")
+    return tuple(Fraction(value) for value in stored)
 
 
 def exact_sum(values: NDArray[np.float64] | Sequence[float]) -> Fraction:

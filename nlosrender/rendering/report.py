@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -69,6 +69,8 @@ class RenderReport:
     warnings: tuple[str, ...]
     unsampled_paths: tuple[str, ...] = ()  # classes of paths whose light is missing
     zero_because: tuple[str, ...] = ()  # why H is zero everywhere; empty where it is not
+    error_estimate_per_bounce: Mapping[str, float | None] = field(default_factory=dict)  # None: not known, or no light
+    energy_error_per_bounce: Mapping[str, float | None] = field(default_factory=dict)  # standard error; None: not known
 
 
 @dataclass(frozen=True)

@@ -65,14 +65,16 @@ def render_unit(engine: Engine, unit: Unit, budget: Budget, passes: Passes) -> H
 
 
 def _snapshot(histogram: Histogram) -> Snapshot:
-    arrays = {name: getattr(histogram, name) for name in ("mean", "variance", "outside")}
+    arrays = {name: getattr(histogram, name) for name in ("mean", "variance", "outside", "contrasts")}
     return Snapshot(arrays, {"samples": histogram.samples})
 
 
 def _histogram(kept: Snapshot) -> Histogram:
     from nlosrender.engine.histogram import Histogram
 
-    return Histogram(kept.arrays["mean"], kept.arrays["variance"], kept.arrays["outside"], kept.numbers["samples"])
+    arrays = kept.arrays
+    samples = kept.numbers["samples"]
+    return Histogram(arrays["mean"], arrays["variance"], arrays["outside"], samples, arrays["contrasts"])
 
 
 def joined_histogram(unit: Unit, pieces: list[Histogram]) -> Histogram:
@@ -93,7 +95,13 @@ def joined_histogram(unit: Unit, pieces: list[Histogram]) -> Histogram:
             values = getattr(piece, name)
             whole[(slice(None),) * 3 + inside] = values.reshape(*first.shape[:3], *tile.shape, *first.shape[4:])
         arrays[name] = whole.reshape(*first.shape[:3], rows * columns, *first.shape[4:])
-    return Histogram(arrays["mean"], arrays["variance"], arrays["outside"], min(piece.samples for piece in pieces))
+    return Histogram(
+        arrays["mean"],
+        arrays["variance"],
+        arrays["outside"],
+        min(piece.samples for piece in pieces),
+        sum((piece.contrasts for piece in pieces[1:]), pieces[0].contrasts),
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,7 +141,7 @@ def finished_unit(
     # of Stokes components the intensity: the others have signs, and are no energy
     light = slice(0, 1) if layout.CHANNELS.get(channels) == layout.STOKES else slice(None)
     mean, variance, outside = histogram.mean[light], histogram.variance[light], histogram.outside[light]
-    sums = sums_of(mean, variance, outside, histogram.samples, seconds)
+    sums = sums_of(mean, variance, outside, histogram.samples, seconds, histogram.contrasts[:, light].sum(axis=1))
     stored = {layout.DATA: histogram.mean} | ({layout.VARIANCE: histogram.variance} if store_variance else {})
     with np.errstate(over="ignore"):  # what overflows float32 is refused where it is cut into chunks
         samples = {name: values.astype(np.float32).reshape(axes) for name, values in stored.items()}

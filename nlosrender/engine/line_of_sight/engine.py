@@ -112,7 +112,9 @@ class LineOfSightEngine:
         mean, variance = sampled.mean, sampled.variance
         if not (np.isfinite(mean).all() and np.isfinite(variance).all()):
             raise RenderError("the line-of-sight engine produced a value that is not finite; please report the scene")
-        return Histogram(mean[..., :-1], variance[..., :-1], mean[..., -1], sampled.per_lane * shape.replicas)
+        return Histogram(
+            mean[..., :-1], variance[..., :-1], mean[..., -1], sampled.per_lane * shape.replicas, sampled.contrasts
+        )
 
     def settle(self, budget: Budget, known_squares: float = 0.0) -> Budget:
         """Turn a target error into samples for the whole capture, found by a pilot on a few of its pixels.

@@ -15,6 +15,7 @@ from nlosrender.capture.grids import Capture
 from nlosrender.capture.plan import Batch
 from nlosrender.capture.time_axis import TimeAxis
 from nlosrender.engine.device_arrays import on_device
+from nlosrender.engine.energy_contrasts import RoundContrasts, contrasts_of_deviation
 from nlosrender.engine.histogram import Histogram
 from nlosrender.engine.passes import Passes, Snapshot
 from nlosrender.engine.path_engine import PathEngine, PathOptions
@@ -192,12 +193,16 @@ class VirtualLightEngine:
         result = self._further_bounces(batch, replace(budget, time_limit_s=left), fine, rest)
         if self.misses_light:
             np.add(result.variance, np.square(MISSED * result.mean), out=result.variance)
+            result.contrasts[:] += MISSED * result.mean.sum(axis=(2, 3, 4))
         slot, scale = self.options.bounces.slot(THIRD_BOUNCE), self.paths.scale
         third, deviation = fine.values, coarse.values  # large: worked on in place
         np.subtract(third, deviation, out=deviation)
         deviation *= scale / difference_divisor(coarse, fine)
         third *= scale
         result.mean[:, slot] += third[:, 0, ..., :-1]
+        grid, sensors = self.capture.sensor_grid, self.paths.sensor_indices(batch)
+        in_window = deviation[:, 0, ..., :-1]
+        result.contrasts[:, :, slot] += contrasts_of_deviation(in_window, sensors, (grid.nx, grid.ny))
         result.variance[:, slot] += np.square(deviation, out=deviation)[:, 0, ..., :-1]
         result.outside[:, slot] += third[:, 0, ..., -1]
         if not np.isfinite(result.mean).all():
@@ -210,15 +215,19 @@ class VirtualLightEngine:
             return self.paths.render(batch, budget, passes, known_squares=known_squares)
         known_squares = third.squares + self.paths.second_squares(batch)
         histogram = self.further.histogram(batch, self.options.replicas)
+        contrasts = RoundContrasts(histogram)
         done, skipped, before = 0, 0, 0.0
         if (earlier := passes.resumed("sums")) is not None:
             histogram.sums = on_device(mi.Float64, earlier.arrays["sums"])
+            contrasts.restore(earlier.arrays["contrasts"], earlier.arrays["grouped"], earlier.numbers["groups"])
             done, skipped, before = (earlier.numbers[name] for name in ("done", "skipped", "seconds"))
         begun, share = time.perf_counter() - before, 0.0
 
         def told(skipped: int) -> None:
             numbers = {"done": done, "skipped": skipped, "seconds": time.perf_counter() - begun}
-            passes.between(share, lambda: Snapshot({"sums": histogram.sums.numpy()}, numbers))
+            numbers["groups"] = contrasts.groups
+            kept = {"contrasts": contrasts.sums, "grouped": contrasts.grouped}
+            passes.between(share, lambda: Snapshot({"sums": histogram.sums.numpy()} | kept, numbers))
 
         while True:
             self.further.accumulate(batch, histogram, done, told, skipped)
@@ -230,17 +239,20 @@ class VirtualLightEngine:
                 if budget.target_error is not None:
                     error = histogram.relative_error(done, known_squares) / (REST_OF_MANY * budget.target_error)
                     share = max(share, 1 / max(error, 1e-9) ** 2)
+            contrasts.add(done, share >= 1)
             if share >= 1:
                 break
             told(0)
         bounces = self.options.bounces
         first = bounces.slot(THIRD_BOUNCE + 1)
-        statistics = histogram.statistics(done, self.paths.scale, range(-first, bounces.n_slots - first))
+        slots = range(-first, bounces.n_slots - first)
+        statistics = histogram.statistics(done, self.paths.scale, slots)
+        errors = contrasts.result(self.paths.scale / (done * self.options.replicas), slots)
         mean, variance = (histogram.on_host(values) for values in statistics)
         impulses = done * self.further.impulses_per_round
         if not self.built.wall.is_planar:
             mean[:, :1] += self.paths.second_bounce(batch)
-        return Histogram(mean[..., :-1], variance[..., :-1], mean[..., -1], impulses)
+        return Histogram(mean[..., :-1], variance[..., :-1], mean[..., -1], impulses, errors)
 
     def _fineness_in_time(self, budget: Budget, target: float) -> float:
         """Return the fineness for ``target``, or the one that half of the time is predicted to suffice for."""
