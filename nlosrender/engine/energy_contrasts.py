@@ -19,9 +19,7 @@ from numpy.typing import NDArray
 from nlosrender.engine.histogram import DeviceHistogram
 
 CONTRASTS = 32  # a standard error of the energy's error of 1 / sqrt(2 * 32) = 13 %
-# Times which the error is stated that so many independent pairs tell: 0.5 / sqrt(q / n) with q the 5 % quantile of chi
-# squared with n degrees of freedom, so that in one case of 20 it is less than half of the true one.
-FEW_PAIRS = {1: 8.0, 2: 2.2, 3: 1.5, 4: 1.2}
+FEW_PAIRS = 8  # of replicas: with fewer, places of the wall have weights in the contrasts
 Contrasts = NDArray[np.float64]  # (contrast, channel, slot) [J m^-2 sr^-1]
 
 
@@ -62,14 +60,17 @@ class RoundContrasts:
     ----------
     histogram
         That the rounds are added to, empty.
+    sensors, grid
+        (sensors,) flat indices of its sensor points; columns and rows of their grid.
     """
 
-    def __init__(self, histogram: DeviceHistogram):
+    def __init__(self, histogram: DeviceHistogram, sensors: NDArray[np.integer], grid: tuple[int, int]):
         shape = histogram.shape
         self._histogram, self.groups = histogram, 0
+        self._weights = np.stack([np.ones((CONTRASTS, shape.sensors)), _slow_weights(sensors, grid)])
         self._wanted = math.ceil(CONTRASTS / max(shape.replicas // 2, 1))
-        self.grouped = np.zeros((shape.replicas, shape.slots, shape.channels))
-        self.sums = np.zeros((CONTRASTS, shape.channels, shape.slots))
+        self.grouped = np.zeros((2, CONTRASTS, shape.replicas, shape.slots, shape.channels))
+        self.sums = np.zeros((2, CONTRASTS, shape.channels, shape.slots))
 
     def restore(self, sums: NDArray[np.float64], grouped: NDArray[np.float64], groups: int) -> None:
         """Go on from the values that these attributes had."""
@@ -80,20 +81,20 @@ class RoundContrasts:
         every = 2 ** max(0, math.floor(math.log2(done / self._wanted)))
         if not (is_last or done % every == 0):
             return
-        energies = self._histogram.energies().sum(axis=(1, 2))
+        energies = np.einsum("wks,rsbc->wkrbc", self._weights, self._histogram.energies().sum(axis=2), optimize=True)
         added = energies - self.grouped
         self.grouped = energies
-        pairs = len(added) // 2
-        differences = added[0 : 2 * pairs : 2] - added[1 : 2 * pairs : 2]
-        keys = np.arange(pairs) * 2**32 + self.groups
-        self.sums += np.einsum("kp,pbc->kcb", random_signs(keys), differences)
+        pairs = added.shape[2] // 2
+        differences = added[:, :, 0 : 2 * pairs : 2] - added[:, :, 1 : 2 * pairs : 2]
+        signs = random_signs(np.arange(pairs) * 2**32 + self.groups)
+        self.sums += np.einsum("kp,wkpbc->wkcb", signs, differences)
         self.groups += 1
 
     def result(self, factor: float, slots: range) -> Contrasts:
         """Return the contrasts; parameters as for ``contrasts_of_points``."""
         replicas = self._histogram.shape.replicas
-        raised = FEW_PAIRS.get(replicas // 2 * self.groups, 1.0)
-        return _in_slots(self.sums * (factor * raised * _unpaired(replicas)), slots)
+        is_few = replicas // 2 * self.groups < FEW_PAIRS
+        return _in_slots(self.sums[int(is_few)] * (factor * _unpaired(replicas)), slots)
 
 
 def contrasts_of_deviation(
@@ -101,22 +102,28 @@ def contrasts_of_deviation(
 ) -> NDArray[np.float64]:
     """Return the contrasts (contrast, channel) of a known deviation, estimated minus true, of one bounce.
 
-    There is one sample of it, whose sum may be small by chance while sensor points here and there have much. So
-    the sum is added to others in which places of the wall have weights that change slowly from place to place.
-
     Parameters
     ----------
     deviation
-        (channel, laser, sensor, bin) [J m^-2 sr^-1].
+        (channel, laser, sensor, bin) [J m^-2 sr^-1]: one sample of it.
     sensors, grid
-        (sensors,) flat indices of the sensor points; columns and rows of their grid.
+        As for ``RoundContrasts``.
     """
     per_sensor = deviation.sum(axis=(1, 3))
-    place = np.stack([sensors % grid[0] / grid[0], sensors // grid[0] / grid[1]])
+    return np.asarray(_slow_weights(sensors, grid) @ per_sensor.T, dtype=np.float64)
+
+
+def _slow_weights(sensors: NDArray[np.integer], grid: tuple[int, int]) -> NDArray[np.float64]:
+    """Return weights (contrast, sensor) about 1 that change slowly from place to place.
+
+    Of one sample of a difference the sum may be small by chance while sensor points here and there have much. Added
+    to it with such weights they show; what is the same everywhere counts once, and no error more than sqrt(3) times.
+    """
+    index = np.asarray(sensors, dtype=np.int64)
+    place = np.stack([index % grid[0] / grid[0], index // grid[0] / grid[1]])
     waves = np.random.default_rng(0).random((3, CONTRASTS))
     phase = (waves[:2].T * 2 - 1) @ place + waves[2][:, None]  # at most a period over the grid
-    weights = 1 + math.sqrt(2) * np.cos(2 * math.pi * phase)
-    return np.asarray(weights @ per_sensor.T, dtype=np.float64)
+    return np.asarray(1 + math.sqrt(2) * np.cos(2 * math.pi * phase), dtype=np.float64)
 
 
 def random_signs(keys: NDArray[np.int64]) -> NDArray[np.float64]:

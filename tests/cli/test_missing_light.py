@@ -50,6 +50,41 @@ def test_the_error_of_a_capture_without_its_mirror_is_unknown(tmp_path: Path) ->
     assert run(tmp_path, "compare", "a.hdf5", "b.hdf5", "--z-test").returncode == 0
 
 
+def test_bounces_below_the_first_that_misses_light_have_their_errors(tmp_path: Path) -> None:
+    """A mirror lights another plate alone: bounce 3 is all there and has its errors, from bounce 4 on they are null."""
+    mirror = {**MIRROR, "center": [0.8, 0, 0.8], "width": 0.4, "normal": [1, 0, -1]}  # away from the wall
+    lit = {**GREY, "center": [2.0, 0, 1.4], "width": 2.0, "height": 2.0, "normal": [-1, 0, 0]}
+    config = write(tmp_path, GREY | {"center": [-0.5, 0, 0.8]}, mirror, lit, max_bounces=4)
+    report = json.loads(run(tmp_path, "render", config, "-o", "a.hdf5", "--json", "--quiet").stdout)
+    told = json.loads(run(tmp_path, "info", "a.hdf5", "--json").stdout)
+    for name in ("error_estimate_per_bounce", "energy_error_per_bounce"):
+        assert told[name] == report[name]
+        assert report[name]["3"] > 0
+        assert report[name]["4"] is None
+    assert told["energy"]["4"] > 0
+    shown = run(tmp_path, "info", "a.hdf5").stdout
+    assert "error per bounce" in shown
+    assert "+-" in shown
+
+
+def test_a_file_says_which_variances_are_not_to_be_summed(tmp_path: Path) -> None:
+    """Virtual lights share patches between sensor points, exhaustive captures paths between lasers."""
+    for number, (settings, shares) in enumerate(SHARING):
+        path = f"{number}.hdf5"
+        run(tmp_path, "render", write(tmp_path, GREY, **settings), "-o", path, "--quiet")
+        with h5py.File(tmp_path / path) as file:
+            assert (shares is None) == ("not_to_be_summed" not in file["variance"].attrs)
+            assert shares is None or shares in file["variance"].attrs["not_to_be_summed"]
+            assert "not_to_be_summed" not in file["data"].attrs
+
+
+SHARING: list[tuple[dict[str, object], str | None]] = [
+    ({}, None),
+    ({"scan": "exhaustive", "sensors": (3, 2)}, "laser points"),
+    ({"engine": "virtual_lights", "spp": None, "target_error": 0.1}, "sensor points"),
+]
+
+
 def test_plan_tells_before_the_render(tmp_path: Path) -> None:
     """The plan has the class of paths, and a warning of what to do."""
     planned = run(tmp_path, "plan", write(tmp_path, BLEND))

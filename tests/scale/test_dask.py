@@ -52,7 +52,16 @@ output: {path: a.hdf5, variance: true}
 """
 TRIANGLE = "v -0.2 0.1 1.1\nv 0.2 0.1 1.1\nv 0.0 0.4 1.2\nf 1 3 2\n"
 SPP = 20_000
-SUMS = ("samples", "error_estimate", "energy", "out_of_window_energy", "capture_hash")
+SUMS = (
+    "samples",
+    "error_estimate",
+    "energy",
+    "out_of_window_energy",
+    "capture_hash",
+    "energy_error",
+    "energy_error_per_bounce",
+    "error_estimate_per_bounce",
+)
 N_UNITS = 14  # of two workers: one of each laser
 DASK = ("--executor", "dask", "--workers", "2")
 

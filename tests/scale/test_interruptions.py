@@ -98,7 +98,8 @@ def assert_whole(folder: Path) -> None:
         for name in whole:
             np.testing.assert_array_equal(whole[name][()], file[name][()])
         assert whole["data"][()].any()
-        for name in ("samples", "error_estimate", "energy", "out_of_window_energy", "capture_hash"):
+        more = ("energy_error", "energy_error_per_bounce", "error_estimate_per_bounce")
+        for name in ("samples", "error_estimate", "energy", "out_of_window_energy", "capture_hash", *more):
             assert whole.attrs[name] == file.attrs[name], name
 
 

@@ -38,7 +38,8 @@ def assert_same_samples(one: Path, other: Path) -> None:
         for name in ("data", "variance"):
             np.testing.assert_array_equal(first[name][()], second[name][()])
         assert first["data"][()].any()
-        for name in ("samples", "error_estimate", "out_of_window_energy", "energy", "capture_hash"):
+        more = ("energy_error", "energy_error_per_bounce", "error_estimate_per_bounce")
+        for name in ("samples", "error_estimate", "out_of_window_energy", "energy", "capture_hash", *more):
             assert first.attrs[name] == second.attrs[name], name
 
 

@@ -367,7 +367,7 @@ class _ClockworkPaths:
         self.clock.now += self.overhead + self.per_path * samples * batch.sensors.size
         mean = np.ones((1, 2, 1, batch.sensors.size, 4))
         # the estimate's square holds the variance too: truth^2 = 1 - v, relative error^2 = v / (1 - v)
-        return Histogram(mean, np.full_like(mean, 1 / (1 + samples)), mean[..., 0], samples)
+        return Histogram(mean, np.full_like(mean, 1 / (1 + samples)), mean[..., 0], samples, np.zeros((1, 1, 2)))
 
 
 @pytest.fixture

@@ -9,6 +9,8 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
+from nlosrender.capture.bounces import BounceAxis
+from nlosrender.files.part_attributes import known_of
 from nlosrender.files.sums import Sums, exact_sum, sums_of
 
 
@@ -47,8 +49,38 @@ def test_parts_add_up_to_the_whole() -> None:
 
 def test_sums_are_kept_as_text() -> None:
     """They come back from JSON to the last bit."""
-    sums = Sums(Fraction(1, 3 << 70), exact_sum([1e300, 1e-300]), Fraction(5), (Fraction(7), Fraction(0)), 12, 0.25)
+    noise, squares = (Fraction(1, 3 << 70), Fraction(0)), (exact_sum([1e300, 1e-300]), Fraction(1))
+    contrasts = ((Fraction(-1, 8), Fraction(3)), (Fraction(0), Fraction(2)))
+    sums = Sums(noise, squares, Fraction(5), (Fraction(7), Fraction(0)), 12, 0.25, contrasts)
     assert Sums.from_json(json.loads(json.dumps(sums.as_json()))) == sums
-    for damaged in ({}, {**sums.as_json(), "noise": "1/0"}, {**sums.as_json(), "energy": 3}):
+    for damaged in (
+        {},
+        {**sums.as_json(), "noise": ["1/0"]},
+        {**sums.as_json(), "noise": "1"},
+        {**sums.as_json(), "energy": 3},
+    ):
         with pytest.raises(ValueError, match="no sums"):
             Sums.from_json(damaged)
+
+
+def test_every_bounce_has_its_own_errors() -> None:
+    """Errors rest on the bounce's own samples; where it has no light, or light is missing from it on, there is none."""
+    mean = np.zeros((1, 4, 1, 2, 5))
+    mean[:, 1], mean[:, 2] = 2.0, 1.0
+    variance = np.zeros_like(mean)
+    variance[:, 1], variance[:, 2] = 0.04, 0.5
+    contrasts = np.array([[0.0, 3.0, 4.0, 0.0], [0.0, -3.0, 0.0, 0.0]])
+    sums = sums_of(mean, variance, mean[..., 0], 8, 1.0, contrasts)
+    bounces = BounceAxis(5, split=True)
+    # sqrt(noise / (squares - noise)), ten samples each
+    expected = {"2": None, "3": math.sqrt(0.4 / (40 - 0.4)), "4": math.sqrt(5 / (10 - 5)), "5": None}
+    assert known_of(sums.errors_per_bounce(bounces), bounces, None) == pytest.approx(expected, nan_ok=True)
+    assert known_of(sums.errors_per_bounce(bounces), bounces, 4) == pytest.approx(expected | {"4": None})
+    assert sums.energy_errors(bounces) == pytest.approx({"2": 0, "3": 3, "4": math.sqrt(8), "5": 0}, rel=1e-3)
+    assert sums.energy_error == pytest.approx(math.sqrt((7**2 + 3**2) / 2), rel=1e-3)  # contrasts are added first
+
+
+def test_sums_without_contrasts_know_no_error_of_the_energy() -> None:
+    """Nothing is taken for exact that nobody has looked at."""
+    sums = sums_of(np.ones((1, 2, 1, 1, 3)), np.zeros((1, 2, 1, 1, 3)), np.zeros((1, 2, 1, 1)), 8, 1.0)
+    assert all(math.isnan(error) for error in (sums.energy_error, *sums.energy_errors(BounceAxis(3, True)).values()))

@@ -215,7 +215,8 @@ class VirtualLightEngine:
             return self.paths.render(batch, budget, passes, known_squares=known_squares)
         known_squares = third.squares + self.paths.second_squares(batch)
         histogram = self.further.histogram(batch, self.options.replicas)
-        contrasts = RoundContrasts(histogram)
+        grid = self.capture.sensor_grid
+        contrasts = RoundContrasts(histogram, self.paths.sensor_indices(batch), (grid.nx, grid.ny))
         done, skipped, before = 0, 0, 0.0
         if (earlier := passes.resumed("sums")) is not None:
             histogram.sums = on_device(mi.Float64, earlier.arrays["sums"])
