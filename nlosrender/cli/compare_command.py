@@ -85,7 +85,8 @@ def compare(
     """Compare two captures; fail when they differ by more than the tolerances allow.
 
     Without any tolerance they have to be equal up to rounding (relative L2 at most 1e-6), as two renders with the
-    same seed, version and machine are. Relative numbers are relative to B.
+    same seed, version and machine are. Relative numbers are relative to B. Points in another order, and bins that begin
+    elsewhere by whole bins, are aligned first.
     """
     from nlosrender.analysis.comparison.captures import compare_captures
     from nlosrender.analysis.comparison.report import comparison_report
