@@ -37,11 +37,14 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def test_every_command_has_the_same_line(folder: Path) -> None:
+def test_every_command_has_the_same_line(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """From the file's text, worked out by hand; the warnings come with each of them."""
     from nlosrender.engine import backend
 
     backend.start_backend("llvm")
+    from nlosrender.engine import forecast
+
+    monkeypatch.setattr(forecast, "PILOT_SECONDS", 0.02)
     checked, planned = run(folder, "validate", "a.yaml"), run(folder, "plan", "a.yaml")
     rendered = run(folder, "render", "a.yaml", "--quiet")
     for done in (checked, planned, rendered):
