@@ -118,15 +118,15 @@ def _lengths(position: object) -> str:
 
 def _meshes(meshes: object) -> list[str]:
     """Return a line for each mesh; as it stands where it is not ours."""
-    from nlosrender.scene.mesh_report import MeshReport
+    from nlosrender.scene.mesh_report import MOST_LINES, MeshReport
 
-    lines = []
-    for mesh in _sequence(meshes):
+    lines, rest = [], len(_sequence(meshes)) - MOST_LINES
+    for mesh in _sequence(meshes)[:MOST_LINES]:
         try:
             lines.append(MeshReport(**mesh).line())  # type: ignore[arg-type]
         except (TypeError, ValueError, AttributeError):
             lines.append(_text(mesh))
-    return lines
+    return [*lines, f"and {rest} more, which --json has"] if rest > 0 else lines
 
 
 def _named(values: object) -> str:

@@ -88,7 +88,7 @@ def validate(
             problems += error.problems
             continue
         try:
-            own_meshes, doubts = _meshes_of(config)
+            own_meshes, lines, doubts = _meshes_of(config)
         except ConfigError as error:
             problems += with_places(error, path, overrides or ()).problems
             continue
@@ -98,8 +98,8 @@ def validate(
         if not as_json:
             captures = "" if sweep is None else f"a sweep of {len(sweep)} captures in {sweep.output_folder}, such as "
             typer.echo(f"{path}: ok ({captures}{_summary(config)})")
-            for mesh in own_meshes:
-                typer.echo(f"  mesh {mesh.line()}")
+            for line in lines:
+                typer.echo(f"  mesh {line}")
             for warning in found:
                 typer.echo(f"warning: {warning}", err=True)
     if as_json:
@@ -120,8 +120,8 @@ def schema() -> None:
     typer.echo(json.dumps(document, indent=2))
 
 
-def _meshes_of(config: Config) -> tuple[Sequence[MeshReport], Sequence[str]]:
-    """Return what there is to say of the meshes of a scene, and warnings; numpy is loaded only where there are some.
+def _meshes_of(config: Config) -> tuple[Sequence[MeshReport], Sequence[str], Sequence[str]]:
+    """Return what there is to say of a scene's meshes, in lines, too, and warnings; numpy is loaded only for meshes.
 
     Raises
     ------
@@ -129,11 +129,12 @@ def _meshes_of(config: Config) -> tuple[Sequence[MeshReport], Sequence[str]]:
         One cannot be used.
     """
     if not config.scene.has_mesh_files:
-        return (), ()
+        return (), (), ()
+    from nlosrender.scene.mesh_report import mesh_lines
     from nlosrender.scene.mesh_surfaces import describe_meshes
 
     read = describe_meshes(config.scene)
-    return read.meshes, read.warnings
+    return read.meshes, list(mesh_lines(read.meshes)), read.warnings
 
 
 def _print_verdict(problems: list[Problem], warnings: list[str], meshes: list[MeshReport]) -> None:

@@ -64,6 +64,8 @@ def plan(
 
 
 def _lines(forecast: Forecast) -> Iterator[str]:
+    from nlosrender.scene.mesh_report import mesh_lines
+
     yield f"engine   {forecast.engine}: {forecast.reason} ({forecast.variant})"
     for item in forecast.skipped:
         yield f"skipped  {item.what}: {item.why}"
@@ -71,7 +73,7 @@ def _lines(forecast: Forecast) -> Iterator[str]:
         yield f"missing  {paths}: sampled by no technique, the stated error will be unknown"
     hidden = "" if forecast.scan_type == LINE_OF_SIGHT else "hidden "
     yield f"scan     {_scan(forecast)}, {forecast.n_triangles} {hidden}triangles"
-    yield from (f"mesh     {mesh.line()}" for mesh in forecast.meshes)
+    yield from (f"mesh     {line}" for line in mesh_lines(forecast.meshes))
     start, end = forecast.window_opl
     yield f"time     {forecast.n_bins} bins of {forecast.bin_width_opl:g} m, from {start:.6g} to {end:.6g} m"
     plural = "" if forecast.batches == 1 else "es"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,6 +14,7 @@ from nlosrender.scene.pose import Float64
 from nlosrender.scene.triangle_mesh import TriangleMesh
 
 _NORMALS = {"flat": "flat", "file": "normals of the file", "smoothed": "smoothed normals"}
+MOST_LINES = 20  # of a scene: some have thousands of meshes
 CONTRADICTED = 0.01  # share of the area whose normals contradict its faces from which on it is told
 
 
@@ -101,6 +102,13 @@ class MeshReport:
                 "area. Light goes by the normals. Use normals: flat to go by the order of the faces' corners, or write "
                 "the file anew with both alike."
             )
+
+
+def mesh_lines(meshes: Sequence[MeshReport]) -> Iterator[str]:
+    """Yield the lines of the first meshes, and how many more there are."""
+    yield from (mesh.line() for mesh in meshes[:MOST_LINES])
+    if len(meshes) > MOST_LINES:
+        yield f"and {len(meshes) - MOST_LINES} more, which --json has"
 
 
 def mesh_report(

@@ -75,7 +75,9 @@ def build_view(scene_config: SceneConfig, capture_config: CaptureConfig) -> Buil
     ValueError
         A pose is degenerate; the message begins with the item's key.
     """
-    whole, left_out = (None, ()) if scene_config.mitsuba is None else load_xml_scene(scene_config.mitsuba)
+    whole, of_whole, left_out = None, (), ()  # type: tuple[mi.Scene | None, tuple[MeshReport, ...], tuple[str, ...]]
+    if scene_config.mitsuba is not None:
+        whole, of_whole, left_out = load_xml_scene(scene_config.mitsuba)
     plane = _image_plane(capture_config, whole)
     frame = _engine_frame(scene_config, plane)
     surfaces = tuple(_surfaces(scene_config, frame))
@@ -107,7 +109,7 @@ def build_view(scene_config: SceneConfig, capture_config: CaptureConfig) -> Buil
         unit=unit,
         n_triangles=sum(int(shape.face_count()) for shape in shapes if shape.is_mesh()),
         warnings=left_out + read.warnings + medium_warnings(zip(keys, shapes, strict=True)),
-        meshes=read.meshes,
+        meshes=read.meshes + of_whole,
     )
 
 

@@ -16,15 +16,18 @@ from nlosrender.config.mitsuba_xml import image_files, read_mitsuba_xml
 from nlosrender.config.xml_shapes import named, placement, shape_parameters
 from nlosrender.config.xml_tree import numbered_text, place_of
 from nlosrender.scene.build import load_flat_serialized, shape_bounds
+from nlosrender.scene.file_mesh import FileMesh
 from nlosrender.scene.hidden_geometry import MESH_PLUGINS, ShapeDescription, box_corners
 from nlosrender.scene.images import check_image
 from nlosrender.scene.materials import first_line, rejected
-from nlosrender.scene.mesh_file import read_mesh
+from nlosrender.scene.mesh_file import read_mesh_file
+from nlosrender.scene.mesh_normals import with_normals
+from nlosrender.scene.mesh_report import MeshReport, mesh_report
 from nlosrender.scene.pose import Float64
 from nlosrender.scene.primitives import box_mesh, rectangle_mesh
 from nlosrender.scene.transforms import transform_matrix
 from nlosrender.scene.triangle_mesh import TriangleMesh
-from nlosrender.scene.xml_textures import check_attributes, picture_warnings
+from nlosrender.scene.xml_textures import check_attributes, has_two_sides, picture_warnings
 
 WHERE = "scene.mitsuba"
 SAME_AREA = 0.01  # float32, and bent quadrangles cut along the other diagonal
@@ -35,13 +38,13 @@ _PARAMETER = re.compile(r'^\s*- \w+ "([^"]+)"', re.MULTILINE)
 _LINE = re.compile(r"(?:[Ee]rror while loading |[Ww]hile loading |[Aa]t |at )?string \(line (\d+), col \d+\)")
 
 
-def load_xml_scene(path: Path) -> tuple[mi.Scene, tuple[str, ...]]:
+def load_xml_scene(path: Path) -> tuple[mi.Scene, tuple[MeshReport, ...], tuple[str, ...]]:
     """Load a Mitsuba scene; the backend has to be started before.
 
     Returns
     -------
     tuple
-        The scene, and what was left out of it or is hardly meant, a sentence each.
+        The scene; what is in its mesh files; and what was left out of it or is hardly meant, a sentence each.
 
     Raises
     ------
@@ -50,13 +53,17 @@ def load_xml_scene(path: Path) -> tuple[mi.Scene, tuple[str, ...]]:
         rejects it; the line is named where there is one.
     """
     told: list[str] = []
+    meshes: list[MeshReport] = []
     try:
         root, _ = read_mitsuba_xml(path)
         with_id = {part.get("id", ""): part for part in root.iter() if part.tag in ("bsdf", "texture")}
         for shape in root.iter("shape"):
-            mesh = _check_shape(shape)
+            read = _check_shape(shape)
             check_attributes(shape, with_id)
-            told += picture_warnings(shape, with_id, mesh)
+            if read is not None:
+                meshes.append(_report(shape, read))
+                told += meshes[-1].warnings(read, has_two_sides=has_two_sides(shape, with_id))
+                told += picture_warnings(shape, with_id, read.mesh)
         for image in image_files(root):
             check_image(image)
     except ValueError as error:
@@ -64,7 +71,7 @@ def load_xml_scene(path: Path) -> tuple[mi.Scene, tuple[str, ...]]:
     scene, warnings = _loaded(root, path)
     for shape in scene.shapes():
         _check_bounds(shape, path)
-    return scene, (*told, *warnings)
+    return scene, tuple(meshes), (*told, *warnings)
 
 
 def _loaded(root: Element, path: Path) -> tuple[mi.Scene, tuple[str, ...]]:
@@ -92,15 +99,15 @@ def _without_parameters(plugin: Element, names: Sequence[str]) -> str:
     return f"{WHERE}: {place_of(plugin)}: {named(plugin)} has no parameter {listed}, which is left out."
 
 
-def _check_shape(shape: Element) -> TriangleMesh | None:
-    """Refuse a shape that float32 rounds to nothing; return its mesh, if it is one, which is read before Mitsuba does.
+def _check_shape(shape: Element) -> FileMesh | None:
+    """Refuse a shape that float32 rounds to nothing; return what its file holds, if it has one.
 
-    Mitsuba's own readers end the process on a wrong index.
+    That is read before Mitsuba does: its own readers end the process on a wrong index.
     """
-    parameters = shape_parameters(shape)
-    to_world = reduce(lambda matrix, step: transform_matrix(step) @ matrix, placement(shape), np.eye(4))
+    parameters, to_world = shape_parameters(shape), _to_world(shape)
     try:
-        mesh = _mesh_of(parameters)
+        read = _file_of(parameters)
+        mesh = _mesh_of(parameters) if read is None else read.mesh
         box = ShapeDescription(parameters).bounds() if mesh is None else mesh.bounds()
         if box is None:
             return None  # only Mitsuba knows its extent
@@ -112,27 +119,49 @@ def _check_shape(shape: Element) -> TriangleMesh | None:
             raise ValueError(f"it reaches {reach:.4g} m from the origin, need at most {LONGEST:g} m. {_ADVICE}")
         if _rounded_to_nothing(mesh, corners, to_world):
             raise ValueError(f"float32 rounds it to nothing where it is. {_ADVICE}")
-        return mesh
+        return read
     except ValueError as error:
         raise ValueError(f"{place_of(shape)}: {named(shape)}: {error}".removesuffix(".")) from error
 
 
+def _to_world(shape: Element) -> Float64:
+    return reduce(lambda matrix, step: transform_matrix(step) @ matrix, placement(shape), np.eye(4))
+
+
+def _report(shape: Element, read: FileMesh) -> MeshReport:
+    """Return what there is to say of a mesh, with the normals that Mitsuba gives it."""
+    parameters = shape_parameters(shape)
+    mesh, normals = with_normals(read.mesh, "flat" if parameters.get("face_normals") is True else "mitsuba")
+    mesh = mesh.transformed(_to_world(shape))
+    mesh = mesh.turned_round() if parameters.get("flip_normals") is True else mesh
+    name = shape.get("id") or f"shape at {place_of(shape)}"
+    return mesh_report(WHERE, name, Path(str(parameters["filename"])).name, read, mesh, normals, None)
+
+
+def _file_of(parameters: Mapping[str, object]) -> FileMesh | None:
+    """Return what the .obj or .ply file of a shape holds; None for a shape without."""
+    kind, filename = str(parameters["type"]), str(parameters.get("filename"))
+    if kind not in MESH_PLUGINS:
+        return None
+    try:
+        read = read_mesh_file(filename, kind)
+        _check_reading(filename, kind, read.mesh)
+    except ValueError as error:
+        raise ValueError(f"{filename} cannot be used as a mesh: {error}") from error
+    return read
+
+
 def _mesh_of(parameters: Mapping[str, object]) -> TriangleMesh | None:
-    """Return the triangles of a shape that has some, in its own coordinates; None for another."""
+    """Return the triangles of another shape that has some, in its own coordinates; None for one without."""
     kind = str(parameters["type"])
     if kind in ("cube", "disk", "rectangle"):
         return _unit_mesh(is_flat=kind != "cube")
-    if kind not in (*MESH_PLUGINS, "serialized"):
+    if kind != "serialized":
         return None
-    filename = str(parameters["filename"])
     try:
-        if kind == "serialized":
-            return _serialized(parameters)
-        mesh = read_mesh(filename, kind, "flat")
-        _check_reading(filename, kind, mesh)
-        return mesh
+        return _serialized(parameters)
     except ValueError as error:
-        raise ValueError(f"{filename} cannot be used as a mesh: {error}") from error
+        raise ValueError(f"{parameters['filename']} cannot be used as a mesh: {error}") from error
 
 
 def _serialized(parameters: Mapping[str, object]) -> TriangleMesh:

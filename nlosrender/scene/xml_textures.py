@@ -8,6 +8,7 @@ from xml.etree.ElementTree import Element
 import mitsuba as mi
 import numpy as np
 
+from nlosrender.config.bsdf_table import TRANSMITTING
 from nlosrender.config.xml_shapes import named, shape_parameters
 from nlosrender.config.xml_tree import place_of
 from nlosrender.scene.hidden_geometry import MESH_PLUGINS
@@ -64,6 +65,12 @@ def picture_warnings(shape: Element, with_id: Mapping[str, Element], mesh: Trian
         f"scene.mitsuba: {place_of(shape)}: {named(shape)} has a picture, but its file no texture coordinates at every "
         "corner: Mitsuba puts the picture on each triangle. Give the file some, or take a plain reflectance."
     ]
+
+
+def has_two_sides(shape: Element, with_id: Mapping[str, Element]) -> bool:
+    """Return whether a ``<shape>`` has a BSDF that does something at its back, too."""
+    named_ones = [with_id[ref.get("id", "")] for ref in shape.findall("ref") if ref.get("id", "") in with_id]
+    return any(bsdf.get("type") in TRANSMITTING for bsdf in (*shape.findall("bsdf"), *named_ones))
 
 
 def _textures(

@@ -222,7 +222,13 @@ def test_a_mesh_that_mitsuba_reads_otherwise_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=message):
         seen(tmp_path, shape)
     (tmp_path / "ell.obj").write_text("\n".join([*lines, "f 1 6 2", "f 2 6 3", "f 3 6 4", "f 4 6 5"]))
-    assert seen(tmp_path, shape).mean.any()
+    view = seen(tmp_path, shape)
+    assert view.mean.any()
+    (mesh,) = view.engine.built.meshes
+    assert mesh.line() == (
+        "shape at line 2 (ell.obj): 4 triangles, 0.3264 m^2, 0.8 x 0.8 x 0 m, smoothed normals (up to 0 degrees "
+        "from the faces'), no texture coordinates"
+    )
 
 
 def test_a_flat_shape_is_told_without_a_renderer(tmp_path: Path) -> None:
