@@ -42,7 +42,6 @@ def trace_any_hit(loaded: LoadedScene, lit: LitPatches, *, only_asked: bool = Fa
     from nlosrender.engine.connections import WALL_OFFSET
     from nlosrender.engine.device_arrays import on_device
     from nlosrender.engine.space_filling import z_order
-    from nlosrender.engine.virtual_lights.lights import SHORT
 
     built, n_sensors = loaded.built, loaded.capture.n_sensors
     points = loaded.capture.sensor_grid.positions.reshape(-1, 3) / built.unit
@@ -62,7 +61,7 @@ def trace_any_hit(loaded: LoadedScene, lit: LitPatches, *, only_asked: bool = Fa
         turned = (dr.dot(mi.Vector3f(dr.gather(mi.Point3f, normals, patch)), towards) < 0) & (towards.z > 0)
         known = dr.gather(mi.UInt64, clearance, patch)
         turned &= (known & dr.gather(mi.UInt64, tiles, index % n_sensors)) == 0
-        ray = mi.Ray3f(origin, towards, mi.Float(1 - SHORT), mi.Float(0), [])
+        ray = mi.Ray3f(origin, towards, mi.Float(1), mi.Float(0), [])
         hit = built.scene.ray_test(ray, coherent=False, active=turned)
         # sums inside the kernel: nothing of the size of the rays is written
         counts = dr.zeros(mi.UInt32, 2 * SPREAD)

@@ -10,11 +10,11 @@ import numpy as np
 
 from nlosrender.capture.arrivals import sampled_indices
 from nlosrender.capture.grids import Capture, PointGrid
-from nlosrender.engine.connections import RAY_OFFSET, WALL_OFFSET
+from nlosrender.engine.connections import WALL_OFFSET, ray_offset
 from nlosrender.engine.engines import Engine
 from nlosrender.engine.path_engine import PathEngine
 from nlosrender.engine.virtual_lights.engine import RARE, VirtualLightEngine
-from nlosrender.scene.build import BuiltScene
+from nlosrender.scene.build import BuiltScene, curvature, wall_box
 from nlosrender.scene.mesh_wall import MeshWall
 from nlosrender.scene.pose import Float64
 
@@ -41,7 +41,15 @@ def points_above_wall(built: BuiltScene, grid: PointGrid) -> Float64:
     """Return a sample of a grid's points, just above the wall (n, 3) [engine units]."""
     index = sampled_indices(grid)
     positions, normals = grid.positions.reshape(-1, 3)[index], grid.normals.reshape(-1, 3)[index]
-    return positions / built.unit + (WALL_OFFSET if built.wall.is_planar else RAY_OFFSET) * normals
+    return positions / built.unit + wall_offset(built) * normals
+
+
+def wall_offset(built: BuiltScene) -> float:
+    """Return the largest ray offset from the wall [engine units], see ``ray_offset_at``."""
+    if built.wall.is_planar:
+        return WALL_OFFSET
+    farthest = float(np.abs(wall_box(built.wall)).max()) / built.unit
+    return ray_offset(built) * (1 + farthest) * max(1.0, curvature(built.wall_shape))
 
 
 def _near_warnings(built: BuiltScene, capture: Capture) -> Iterator[str]:
@@ -49,11 +57,11 @@ def _near_warnings(built: BuiltScene, capture: Capture) -> Iterator[str]:
     grids = {id(grid): grid for grid in (capture.laser_grid, capture.sensor_grid)}.values()
     height, (x, y, z) = min((_nearest_above(built, grid) for grid in grids), key=lambda found: found[0])
     if not built.wall.is_planar:
-        if height < NEAREST_TOLD * RAY_OFFSET:
+        if height < NEAREST_TOLD * wall_offset(built):
             yield (
                 f"a hidden surface lies {height * built.unit:.1g} m before the relay wall at ({x:.4g}, {y:.4g}, "
                 f"{z:.4g}) m of its frame: on a curved wall, light within "
-                f"{NEAREST_TOLD * RAY_OFFSET * built.unit:.0g} m of it is not found."
+                f"{NEAREST_TOLD * wall_offset(built) * built.unit:.0g} m of it is not found."
             )
     elif height < NEAREST_KNOWN:
         yield (
@@ -96,8 +104,9 @@ def _nearest_above(built: BuiltScene, grid: PointGrid) -> tuple[float, Float64]:
     starts, normals = points_above_wall(built, grid), grid.normals.reshape(-1, 3)[sampled_indices(grid)]
     heights = _first_hits(built, starts, normals, math.inf)
     if not built.wall.is_planar:  # what lies below the ray offset is met by a ray that comes back to the wall
-        top = NEAREST_TOLD * RAY_OFFSET
-        down = _first_hits(built, starts + (top - RAY_OFFSET) * normals, -normals, 0.99 * top)
+        offset = wall_offset(built)
+        top = NEAREST_TOLD * offset
+        down = _first_hits(built, starts + (top - offset) * normals, -normals, top - offset / 2)
         heights = np.where(np.isfinite(down), top - down, heights)
     nearest = int(np.argmin(heights))
     return float(heights[nearest]), np.round(starts[nearest] * built.unit, 9)

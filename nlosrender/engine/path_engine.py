@@ -130,7 +130,7 @@ class PathEngine:
             laser_sampling=self.options.laser_sampling,
             russian_roulette=self.options.russian_roulette,
             spot_radius=self.capture.laser_spot_radius / self.built.unit,
-            needs_visibility=not self._sees_everything(),
+            needs_visibility=not nothing_occludes(self.built),
             has_transmission=any(bool(flag & mi.BSDFFlags.Transmission) for flag in flags),
             only_normals_matter=only_normals_matter(self.built),
         )
@@ -373,13 +373,3 @@ class PathEngine:
     def laser_indices(self, batch: Batch | Pilot) -> np.ndarray:
         """Return the flat indices of a batch's laser points."""
         return np.array(batch.lasers.flat_indices(self.capture.laser_grid.nx), dtype=np.uint32)
-
-    def _sees_everything(self) -> bool:
-        """Return whether a surface that faces a point of the wall is never hidden from it."""
-        shapes = self.built.hidden_shapes
-        # what lights a back side passes through the object; shading normals may light a little of it
-        through = mi.BSDFFlags.Transmission | mi.BSDFFlags.BackSide
-        if any(bool(shape.bsdf().flags() & through) for shape in shapes):
-            return False
-        smooth = any(shape.is_mesh() and shape.has_vertex_normals() for shape in shapes)
-        return not smooth and nothing_occludes(self.built)

@@ -7,17 +7,18 @@ scene, of millimetres or kilometres, to the same size without rounding anything;
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from nlosrender.scene.double_faces import doubles_of_earlier, without_double_faces
+from nlosrender.scene.coincident import PASSES, Overlap, moved_apart, overlaps
+from nlosrender.scene.double_faces import without_double_faces
 from nlosrender.scene.hidden_geometry import (
     Bounds,
-    Radiance,
     ShapeDescription,
     Surface,
     box_corners,
@@ -34,6 +35,9 @@ from nlosrender.scene.triangle_mesh import TriangleMesh
 
 WALL_ID = "relay_wall"
 MOST_REACH = 1e5  # hidden geometry over the wall's size: float32 then tells points 1 % of the wall apart
+ROUND_PLUGINS = ("Sphere", "Cylinder")
+EXACT_PLUGINS = ("Rectangle", "Disk", *ROUND_PLUGINS)  # intersections in closed form, as those of meshes
+OVERLAP_TOLD = 1e-3  # of an item's area that coincides with other surfaces
 LEAST_EXTENT = 1e-12  # hidden geometry over the wall's size: the squares of areas stay numbers in float32
 
 
@@ -56,6 +60,27 @@ class BuiltScene:
     def all_flat(self) -> bool:
         """Whether the wall is a plane and every hidden surface made of triangles."""
         return self.wall.is_planar and all(shape.is_mesh() for shape in self.hidden_shapes)
+
+    @property
+    def has_exact_hits(self) -> bool:
+        """Whether rays meet every hidden surface where float32 has it; curves and distance grids are searched for."""
+        return all(shape.is_mesh() or shape.class_name() in EXACT_PLUGINS for shape in self.hidden_shapes)
+
+    @cached_property
+    def curvatures(self) -> mi.Float:
+        """1 / radius [1 / engine unit] of spheres and cylinders, 0 for other shapes; index = registry of shapes."""
+        shapes = self.scene.shapes()
+        registry = np.array(dr.reinterpret_array(mi.UInt32, self.scene.shapes_dr()))
+        values = np.zeros(int(registry.max(initial=0)) + 1, np.float32)
+        values[registry] = [curvature(shape) for shape in shapes]
+        table = mi.Float(values)
+        dr.eval(table)
+        return table
+
+    @cached_property
+    def is_curved(self) -> bool:
+        """Whether any shape is a sphere or a cylinder."""
+        return any(shape.class_name() in ROUND_PLUGINS for shape in self.scene.shapes())
 
     @property
     def wall_bsdf(self) -> mi.BSDF:
@@ -90,57 +115,64 @@ def build_scene(wall: RelayWall, wall_bsdf: Mapping[str, object], surfaces: Sequ
     wall_item = description if isinstance(description, TriangleMesh) else ShapeDescription(description)
     wall_surface = Surface(WALL_ID, "scene.relay_wall", wall_item, upright_bsdf(description, wall_bsdf))
     wall_shape = load_surface(wall_surface, wall_item, unit)
-    loaded, warnings = without_shared_faces(surfaces, loaded)
-    hidden_shapes = [load_surface(surface, shape, unit) for surface, shape in zip(surfaces, loaded, strict=True)]
-    contents: dict[str, object] = {"type": "scene", WALL_ID: wall_shape}
-    contents |= {f"hidden_{index}": shape for index, shape in enumerate(hidden_shapes)}
+    scene, hidden_shapes, warnings = _load_apart(surfaces, loaded, wall_shape, unit)
     hidden_boxes = [shape_bounds(shape, unit) for shape in hidden_shapes]
     for surface, box in zip(surfaces, hidden_boxes, strict=True):
         _check_reach(surface, box, wall)
-    scene = mi.load_dict(contents)
     hidden_bounds = joined_bounds(hidden_boxes)
     n_triangles = sum(int(shape.face_count()) for shape in hidden_shapes if shape.is_mesh())
     shapes = tuple(hidden_shapes)
     warnings += medium_warnings((f"{surface.key}.bsdf", shape) for surface, shape in zip(surfaces, shapes, strict=True))
     warnings = read.warnings + warnings
-    return BuiltScene(
+    built = BuiltScene(
         scene, wall, wall_shape, tuple(surfaces), shapes, hidden_bounds, unit, n_triangles, warnings, read.meshes
     )
+    _ = built.curvatures  # now, not while a kernel is recorded
+    return built
 
 
-def without_shared_faces(
-    surfaces: Sequence[Surface], loaded: Sequence[TriangleMesh | ShapeDescription]
-) -> tuple[list[TriangleMesh | ShapeDescription], tuple[str, ...]]:
-    """Leave out what lies exactly on an earlier item: which of the two a ray meets would be chance.
+def _load_apart(
+    surfaces: Sequence[Surface], loaded: Sequence[TriangleMesh | ShapeDescription], wall_shape: mi.Shape, unit: float
+) -> tuple[mi.Scene, list[mi.Shape], tuple[str, ...]]:
+    """Load the surfaces and the scene of them and the wall; coincident triangles are moved apart.
 
     Returns
     -------
     tuple
-        The shapes; and a sentence for each item that lost triangles.
-
-    Raises
-    ------
-    ConfigError
-        Nothing is left of an item, or a BSDF is rejected.
+        Scene; shapes of the surfaces; a sentence for each item of which more than a little was moved.
     """
-    kept = list(loaded)
-    meshes = {number: shape for number, shape in enumerate(loaded) if isinstance(shape, TriangleMesh)}
-    corners = [mesh.vertices[mesh.faces].astype(np.float32) for mesh in meshes.values()]
-    if len(meshes) < 2 or not any(doubles.any() for doubles in doubles_of_earlier(corners, both_sides=True)):
-        return kept, ()
-    bsdfs = [load_bsdf(surfaces[number].bsdf, f"{surfaces[number].key}.bsdf") for number in meshes]
-    both_sides = any(bool(bsdf.flags() & mi.BSDFFlags.BackSide) for bsdf in bsdfs)
-    warnings = []
-    for (number, mesh), doubles in zip(meshes.items(), doubles_of_earlier(corners, both_sides), strict=True):
-        if doubles.all():
-            raise rejected(surfaces[number].key, "it lies exactly where earlier items are. Remove or move one of them.")
-        if doubles.any():
-            kept[number] = mesh.subset(~doubles)
-            warnings.append(
-                f"{surfaces[number].key}: {int(doubles.sum())} of its triangles lie exactly on earlier items and are "
-                "left out. Move it a little if they should be seen."
+    bsdfs = [_load_bsdf_of(surface, shape) for surface, shape in zip(surfaces, loaded, strict=True)]
+    meshes: dict[int, TriangleMesh] = {}
+    shapes: list[mi.Shape] = []
+    for index, (surface, shape, bsdf) in enumerate(zip(surfaces, loaded, bsdfs, strict=True)):
+        if isinstance(shape, TriangleMesh):
+            meshes[index] = _in_engine_units(shape, surface, bsdf, unit)
+            shapes.append(_load_mesh(meshes[index], surface, bsdf))
+        else:
+            shapes.append(_load_shape(shape.description, surface, bsdf, unit))
+    told: dict[int, Overlap] = {}
+    for seed in range(PASSES):
+        contents: dict[str, object] = {"type": "scene", WALL_ID: wall_shape}
+        scene = mi.load_dict(contents | {f"hidden_{index}": shape for index, shape in enumerate(shapes)})
+        found = overlaps(scene, shapes, meshes, seed)
+        for overlap in found:
+            index = overlap.mesh
+            told.setdefault(index, overlap)
+            meshes[index] = moved_apart(meshes[index], overlap.faces, both_sides=_has_two_sides(bsdfs[index]))
+            shapes[index] = _load_mesh(meshes[index], surfaces[index], bsdfs[index])
+        if not found:
+            break
+    return scene, shapes, tuple(_overlap_warnings(surfaces, told))
+
+
+def _overlap_warnings(surfaces: Sequence[Surface], found: Mapping[int, Overlap]) -> Iterator[str]:
+    for index, overlap in found.items():
+        if overlap.share > OVERLAP_TOLD:
+            other = "itself" if overlap.other == index else surfaces[overlap.other].key
+            yield (
+                f"{surfaces[index].key}: {100 * overlap.share:.3g} % of its area lies where {other} is, or closer than "
+                "rays tell apart. It is taken to lie in front there. Move one of them if it should not."
             )
-    return kept, tuple(warnings)
 
 
 def load_surface(surface: Surface, shape: TriangleMesh | ShapeDescription, unit: float) -> mi.Shape:
@@ -151,18 +183,16 @@ def load_surface(surface: Surface, shape: TriangleMesh | ShapeDescription, unit:
     ConfigError
         Mitsuba rejects the shape or its BSDF, or float32 rounds it to nothing.
     """
-    colors = shape.colors if isinstance(shape, TriangleMesh) else None
-    _check_attributes(surface, {} if colors is None else {VERTEX_COLOR: colors})
+    bsdf = _load_bsdf_of(surface, shape)
     if isinstance(shape, TriangleMesh):
-        loaded = _load_mesh(shape, surface, unit)
-    else:
-        loaded = _load_shape(shape.description, surface.bsdf, surface.key, surface.name, unit, surface.radiance)
-    check_surface(loaded, f"{surface.key}.bsdf")
-    return loaded
+        return _load_mesh(_in_engine_units(shape, surface, bsdf, unit), surface, bsdf)
+    return _load_shape(shape.description, surface, bsdf, unit)
 
 
-def _check_attributes(surface: Surface, attributes: Mapping[str, Float64]) -> None:
-    """Refuse textures that read what the surface does not have: Mitsuba takes it for black."""
+def _load_bsdf_of(surface: Surface, shape: TriangleMesh | ShapeDescription) -> mi.BSDF:
+    """Load a BSDF; refuse textures that read what the surface does not have: Mitsuba takes it for black."""
+    colors = shape.colors if isinstance(shape, TriangleMesh) else None
+    attributes = {} if colors is None else {VERTEX_COLOR: colors}
     for use in attribute_uses(surface.bsdf):
         try:
             if surface.name == WALL_ID:
@@ -170,15 +200,26 @@ def _check_attributes(surface: Surface, attributes: Mapping[str, Float64]) -> No
             use.check(attributes)
         except ValueError as error:
             raise rejected(f"{surface.key}.bsdf", f"{error}.") from error
+    return load_bsdf(surface.bsdf, f"{surface.key}.bsdf")
 
 
-def _load_mesh(mesh: TriangleMesh, surface: Surface, unit: float) -> mi.Mesh:
-    # A triangle that float32 rounds to nothing has no normal, and NaN would come of it.
-    mesh = replace(mesh, vertices=(mesh.vertices / unit).astype(np.float32)).with_area_only()
+def _in_engine_units(mesh: TriangleMesh, surface: Surface, bsdf: mi.BSDF, unit: float) -> TriangleMesh:
+    """Return a mesh as float32 has it, without triangles that float32 rounds to nothing and double ones.
+
+    The former have no normal, and NaN would come of it.
+    """
+    mesh = mesh.with_vertices((mesh.vertices / unit).astype(np.float32)).with_area_only()
     if not len(mesh.faces):
         raise rejected(surface.key, f"too small in a scene of {unit:g} m: float32 rounds its triangles to nothing.")
-    bsdf = load_bsdf(surface.bsdf, f"{surface.key}.bsdf")
-    mesh = without_double_faces(mesh, both_sides=bool(bsdf.flags() & mi.BSDFFlags.BackSide))
+    return without_double_faces(mesh, both_sides=_has_two_sides(bsdf))
+
+
+def _has_two_sides(bsdf: mi.BSDF) -> bool:
+    return bool(bsdf.flags() & mi.BSDFFlags.BackSide)
+
+
+def _load_mesh(mesh: TriangleMesh, surface: Surface, bsdf: mi.BSDF) -> mi.Mesh:
+    """Load a mesh in engine units."""
     properties = mi.Properties()
     properties["mesh_bsdf"] = bsdf
     if surface.radiance is not None:
@@ -202,29 +243,35 @@ def _load_mesh(mesh: TriangleMesh, surface: Surface, unit: float) -> mi.Mesh:
     parameters.update()
     if mesh.colors is not None and any(attribute_uses(surface.bsdf)):
         shape.add_attribute(VERTEX_COLOR, 3, np.ravel(mesh.colors).astype(np.float32))
+    check_surface(shape, f"{surface.key}.bsdf")
     return shape
 
 
-def _load_shape(
-    description: Mapping[str, object],
-    bsdf: Mapping[str, object],
-    key: str,
-    name: str,
-    unit: float,
-    radiance: Radiance | None = None,
-) -> mi.Shape:
+def _load_shape(description: Mapping[str, object], surface: Surface, bsdf: mi.BSDF, unit: float) -> mi.Shape:
     """Load an analytic shape or any Mitsuba plugin, scaled to engine units."""
     plugin = _scaled(description, unit)
-    plugin["bsdf"] = load_bsdf(bsdf, f"{key}.bsdf")
-    plugin["id"] = name
-    if radiance is not None:
-        plugin["emitter"] = area_emitter(radiance)
+    plugin["bsdf"], plugin["id"] = bsdf, surface.name
+    if surface.radiance is not None:
+        plugin["emitter"] = area_emitter(surface.radiance)
     try:
         if plugin["type"] == "serialized":
             load_flat_serialized(plugin)
-        return mi.load_dict(plugin)
+        shape = mi.load_dict(plugin)
     except (RuntimeError, TypeError, ValueError) as error:
-        raise rejected(key, f"Mitsuba rejects this shape: {first_line(error)}") from error
+        raise rejected(surface.key, f"Mitsuba rejects this shape: {first_line(error)}") from error
+    check_surface(shape, f"{surface.key}.bsdf")
+    return shape
+
+
+def curvature(shape: mi.Shape) -> float:
+    """Return 1 / radius [1 / engine unit] of a sphere or cylinder, 0 for other shapes."""
+    if shape.class_name() == "Sphere":
+        box = shape.bbox()
+        return 2 / float(np.ravel(box.max - box.min).max())
+    if shape.class_name() == "Cylinder":
+        to_world = np.array(mi.traverse(shape)["to_world"].matrix, dtype=np.float64).reshape(4, 4)
+        return 1 / float(np.linalg.norm(to_world[:3, 0]))
+    return 0.0
 
 
 def load_flat_serialized(plugin: Mapping[str, object]) -> mi.Mesh:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -144,6 +144,10 @@ class TriangleMesh:
             None if self.normals is None else self.normals[used],
             None if self.colors is None else self.colors[used],
         )
+
+    def with_vertices(self, vertices: Float64) -> TriangleMesh:
+        """Return the same faces with other vertices (n, 3)."""
+        return replace(self, vertices=vertices)
 
     def with_area_only(self) -> TriangleMesh:
         """Return the mesh without faces of no area and without vertices that no face uses; itself if it has neither."""

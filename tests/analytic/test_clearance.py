@@ -1,7 +1,7 @@
 """Clearances: where nothing is said to hide a point, nothing does, whatever lies around it.
 
 Brute force in float64: every triangle against every segment from the wall to the point. What is said holds up to what
-rays know: they end SHORT of the way before the point, and what lies in a plane with it within RISE does not count.
+rays know: what lies in a plane with the point within RISE does not count.
 """
 
 from __future__ import annotations
@@ -156,18 +156,14 @@ def assert_sound(
         How many of these ways are not free, and how many are said to be.
     """
     from nlosrender.engine.virtual_lights.clearance import MOST_RISE, RISE
-    from nlosrender.engine.virtual_lights.lights import LEAST_SHORT, SHORT
 
     planes, n_hidden, n_open = unit_normals(triangles), 0, 0
     for k, point in enumerate(points):
         is_before = (ends[k] - point) @ normals[k] > 0
         start, is_open = ends[k][is_before], (clearance[k] & bits[k][is_before]) > 0
         met = 1 - hits(start, np.broadcast_to(point, start.shape), triangles)
-        lengths = np.linalg.norm(start - point, axis=1)[:, None]
         rise = min(RISE * point[2], MOST_RISE)
-        is_near = (met * lengths <= SHORT * lengths + LEAST_SHORT) | (
-            met * ((start - point) @ normals[k])[:, None] <= rise
-        )
+        is_near = met * ((start - point) @ normals[k])[:, None] <= rise
         in_plane = np.abs(np.einsum("tx,tx->t", point - triangles[:, 0], planes)) <= rise
         hides = ~np.isnan(met) & ~is_near & ~in_plane
         assert not hides[is_open].any(), f"point {k} at {point}: hidden from an open tile"
@@ -303,7 +299,7 @@ def test_a_sphere_counts_by_its_box() -> None:
     for z, expected in ((1.2, True), (0.75, False)):
         stage = stage_of(FRONT | {"width": 0.3}, {"type": "sphere", "center": [0.0, 0, z], "radius": 0.2})
         lit = lit_patches(stage)
-        in_plane = np.abs(lit.positions[:, 2] * stage.engine.built.unit - 0.8) < 1e-6
+        in_plane = np.abs(lit.positions[:, 2] * stage.engine.built.unit - 0.8) < 5e-6  # rays end at an offset
         plate = in_plane & (lit.normals[:, 2] < -0.999)
         assert plate.any()
         assert is_open(lit)[plate].all() == expected

@@ -86,7 +86,6 @@ class Merger:
             self.cells.shapes[stands],
             self.cells.primitives[stands],
             middles(self.cells.weights[stands])[:, 1:],
-            np.zeros(len(merged)),
             middles(self.cells.corners[stands]),
             self.normals[stands],
             np.ones(len(merged), bool),

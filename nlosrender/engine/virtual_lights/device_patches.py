@@ -10,12 +10,14 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from nlosrender.engine.connections import off_the_surface
 from nlosrender.engine.device_arrays import columns, on_device
 from nlosrender.engine.low_discrepancy import recurrence_steps
 from nlosrender.engine.space_filling import z_order
 from nlosrender.engine.virtual_lights.clearance import Surface
 from nlosrender.engine.virtual_lights.patches import Patches
-from nlosrender.scene.build import BuiltScene
+from nlosrender.engine.virtual_lights.round_shapes import RoundShape
+from nlosrender.scene.build import ROUND_PLUGINS, BuiltScene
 from nlosrender.scene.pose import Float64
 
 
@@ -46,6 +48,43 @@ class Places:
 
 
 @dataclass(frozen=True, eq=False)
+class Curvature:
+    """The sphere or cylinder that each patch lies on."""
+
+    centre: mi.Vector3f  # from the patch's centre to that of a sphere, or to a point of a cylinder's axis
+    radius: mi.Float  # 0 for flat patches
+    axis: mi.Vector3f  # unit axis of a cylinder, 0 for a sphere
+
+    @classmethod
+    def of(cls, built: BuiltScene, patches: Patches) -> Curvature | None:
+        """Return what patches lie on; None where all are flat."""
+        rows = np.zeros((len(built.scene.shapes()), 7))
+        for index, shape in enumerate(built.scene.shapes()):
+            if shape.class_name() in ROUND_PLUGINS:
+                rows[index] = RoundShape.of(index, shape).row
+        if not rows.any():
+            return None
+        rows = rows[patches.shapes]
+        centre, axis = mi.Vector3f(to_points(rows[:, :3] - patches.centres)), mi.Vector3f(to_points(rows[:, 4:]))
+        return cls(centre, on_device(mi.Float, np.abs(rows[:, 3])), axis)
+
+    def onto_surface(self, points: mi.Vector3f) -> mi.Vector3f:
+        """Return points, relative to the patches' centres, brought onto the surface along its normal."""
+        outward = self._outward(points)
+        distance = dr.norm(outward)
+        return dr.select(self.radius > 0, points + outward * ((self.radius - distance) / distance), points)
+
+    def turned(self, along: mi.Vector3f, points: mi.Vector3f) -> mi.Vector3f:
+        """Return vectors along the normals of patches turned along the normals at points of them."""
+        normal = dr.normalize(self._outward(points))
+        return dr.select(self.radius > 0, normal * dr.mulsign(dr.norm(along), dr.dot(normal, along)), along)
+
+    def _outward(self, points: mi.Vector3f) -> mi.Vector3f:
+        outward = points - self.centre
+        return outward - dr.dot(outward, self.axis) * self.axis
+
+
+@dataclass(frozen=True, eq=False)
 class DevicePatches:
     """Patches on the device, engine units; one lane per patch."""
 
@@ -55,13 +94,14 @@ class DevicePatches:
     remainder: mi.Vector3f  # of the centre, what float32 rounds off: close to the wall it is more than the distance
     is_near: bool  # some patch is so near to a laser or sensor point that the remainder counts
     corners: list[mi.Vector3f]  # three, from the centre
-    lift: mi.Vector3f  # from the plane of the corners to the surface
+    curvature: Curvature | None  # None: all are flat
     members: mi.Vector4f  # from the centre to where shadow rays of clusters end, and 1 for a cluster, else 0
     has_clusters: bool
     areas: mi.Vector3f  # geometric normal times area
     interaction: mi.SurfaceInteraction3f  # at the centres
     reflectance: mi.Spectrum  # of Lambertian patches
     member_normals: mi.Vector3f  # geometric, where shadow rays end
+    offset: mi.Vector3f  # ray offset there, see ``off_the_surface``; on curved patches in the middle
 
     def points(self, index: mi.UInt32) -> mi.Vector3f:
         """Return points of the surface, one per patch, from the centres' float32 positions: where rays end.
@@ -69,8 +109,17 @@ class DevicePatches:
         ``index`` chooses a low-discrepancy point of a patch. That of a cluster is its member's, whichever.
         """
         u, v = spread_numbers(self.start, index)
-        inside = point_inside(self.corners, u, v) + self.lift
+        inside = point_inside(self.corners, u, v)
+        if self.curvature is not None:
+            inside = self.curvature.onto_surface(inside)
         return self.remainder + dr.select(self.members.w > 0, self.members.xyz, inside)
+
+    def offset_at(self, points: mi.Vector3f) -> mi.Vector3f:
+        """Return the ray offset along the normal at ``points``, as ``points`` returns them.
+
+        On a curved patch a ray that grazes it may come from behind its middle's normal.
+        """
+        return self.offset if self.curvature is None else self.curvature.turned(self.offset, points)
 
     def surface(self, points: mi.Vector3f) -> Surface:
         """Return the surface at ``points``, as ``points`` returns them: what may hide it from the wall."""
@@ -104,7 +153,8 @@ def upload_patches(built: BuiltScene, patches: Patches, places: Places, seed: in
     remainder = mi.Vector3f(to_points(from_rounded))
     corners = [mi.Vector3f(to_points(patches.corners[:, k] - patches.centres)) for k in range(3)]
     areas = mi.Vector3f(to_points(patches.normals * patches.areas[:, None]))
-    lift = mi.Vector3f(to_points(patches.normals * patches.lifts[:, None]))
+    curvature = Curvature.of(built, patches)
+    offset = off_the_surface(built, patches.members, patches.member_normals, patches.shapes) - patches.members
     is_cluster = on_device(mi.Float, patches.is_cluster)
     members = mi.Vector4f(*to_points(patches.members - patches.centres), is_cluster)
     # a cluster's members have normals of their own: it is lit and seen by their mean
@@ -113,7 +163,8 @@ def upload_patches(built: BuiltScene, patches: Patches, places: Places, seed: in
     number, start = on_device(mi.UInt32, places.numbers), mi.Vector2u(*mi.sample_tea_32(mi.UInt32(seed), mi.UInt32(0)))
     dr.make_opaque(start)
     member_normals = mi.Vector3f(to_points(patches.member_normals))
-    dr.eval(interaction, reflectance, remainder, corners, areas, lift, members, member_normals)
+    offset = mi.Vector3f(to_points(offset))
+    dr.eval(interaction, reflectance, remainder, corners, areas, curvature, members, member_normals, offset)
     has_clusters = bool(patches.is_cluster.any())
     return DevicePatches(
         places,
@@ -122,13 +173,14 @@ def upload_patches(built: BuiltScene, patches: Patches, places: Places, seed: in
         remainder,
         is_near,
         corners,
-        lift,
+        curvature,
         members,
         has_clusters,
         areas,
         interaction,
         reflectance,
         member_normals,
+        offset,
     )
 
 

@@ -13,6 +13,7 @@ import numpy as np
 
 from nlosrender.capture.bounces import THIRD_BOUNCE
 from nlosrender.capture.plan import Batch
+from nlosrender.engine.connections import off_the_surface
 from nlosrender.engine.device_arrays import laser_points, on_device
 from nlosrender.engine.histogram import DeviceHistogram, HistogramShape
 from nlosrender.engine.passes import PassSize
@@ -43,6 +44,7 @@ class SiteTable:
     """What the gather reads of the sites that anything leaves, one lane per site."""
 
     packed: mi.Float  # eight a site: position, first impulse; normal times area, end of the impulses
+    offset: mi.Vector3f  # ray offset along the normal
     shading: mi.Normal3f
     clearance: mi.UInt64  # see ``Clearances.of``
     first: mi.UInt32  # per replica: its sites are first[r] to first[r + 1]
@@ -182,12 +184,15 @@ class FurtherBounces:
         rows[:, 0:3], rows[:, 3] = sites.positions[used], as_float[0]
         rows[:, 4:7], rows[:, 7] = sites.normals[used] * sites.areas[used, None], as_float[1]
         shading = mi.Normal3f(to_points(sites.normals[used]))
+        positions = sites.positions[used]
+        offset = off_the_surface(self.built, positions, sites.normals[used], sites.shapes[used]) - positions
         clearance = mi.UInt64(0)
         if self.clearances is not None:
             surface = Surface(to_points(sites.positions[used]), mi.Vector3f(shading), mi.Vector3f(shading))
             where, active = dr.zeros(mi.UInt32, len(used)), dr.full(mi.Bool, True, len(used))
             clearance = self.clearances.of(surface, outlook, where, active)
-        return SiteTable(on_device(mi.Float, rows.ravel()), shading, clearance, on_device(mi.UInt32, first))
+        packed, first_site = on_device(mi.Float, rows.ravel()), on_device(mi.UInt32, first)
+        return SiteTable(packed, mi.Vector3f(to_points(offset)), shading, clearance, first_site)
 
 
 @dr.syntax
@@ -236,7 +241,8 @@ def _gather_impulses(
         active = dr.any(weight > 0)
         if dr.hint(needs_visibility, mode="scalar"):
             clearance = dr.gather(mi.UInt64, table.clearance, site)
-            active = is_visible(built, sensor, to_site, active, clearance, tile)
+            offset = dr.gather(mi.Vector3f, table.offset, site)
+            active = is_visible(built, sensor, to_site, offset, active, clearance, tile)
 
         # ---- Deposit its impulses ------------------------------------------------------------------------------------
         delay = distance * scale + sensors.delay_fraction
@@ -254,7 +260,8 @@ def _gather_impulses(
                 value *= arriving(built, own_laser, end_point, facing)
                 lit = dr.any(value > 0)
                 if dr.hint(needs_visibility, mode="scalar"):
-                    lit = is_visible(built, own_laser.interaction, end_point - own_laser.interaction.p, lit)
+                    end_offset = dr.gather(mi.Vector3f, impulses.offset, impulse)
+                    lit = is_visible(built, own_laser.interaction, end_point - own_laser.interaction.p, end_offset, lit)
                 arrival = delay + dr.gather(mi.Float, impulses.delays, impulse) + own_laser.delay_fraction
                 arrival += dr.norm(end_point - own_laser.interaction.p) * scale
                 bins = mi.Int32(dr.floor(dr.minimum(arrival, 1e9))) + own_laser.delay_bins + sensors.delay_bins

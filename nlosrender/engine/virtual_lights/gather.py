@@ -77,7 +77,7 @@ def gather_third_bounce(
     ):
         # ---- The patch as the sensor point sees it -----------------------------------------------------------------
         rows = [dr.gather(mi.Vector4f, lights.packed, patch * ROWS + k) for k in range(ROWS)]
-        a, b, c, centre, shown = (mi.Point3f(row.x, row.y, row.z) for row in rows)
+        a, b, c, centre, shown, offset = (mi.Point3f(row.x, row.y, row.z) for row in rows)
         from_sensor = centre - sensor.p
         areas = mi.Vector3f(rows[0].w, rows[1].w, rows[2].w)
         to_patch = from_sensor
@@ -102,7 +102,7 @@ def gather_third_bounce(
             # in front of the plane through the point that is looked at, not through the centre
             way = from_sensor + shown
             clearance = dr.select(dr.dot(areas, way) < 0, dr.gather(mi.UInt64, lights.clearance, patch), 0)
-            active = is_visible(built, sensor, way, active, clearance, tile)
+            active = is_visible(built, sensor, way, mi.Vector3f(offset), active, clearance, tile)
 
         # ---- Reflect towards the lasers and deposit ----------------------------------------------------------------
         scale = transport.bins_per_unit

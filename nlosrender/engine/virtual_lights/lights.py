@@ -15,10 +15,8 @@ from nlosrender.engine.virtual_lights.clearance import Clearances, Outlook
 from nlosrender.engine.virtual_lights.device_patches import DevicePatches
 from nlosrender.scene.build import BuiltScene
 
-ROWS = 5  # of four numbers each: what the gather reads of a patch
+ROWS = 6  # of four numbers each: what the gather reads of a patch
 LASER_RAYS = 4  # shadow rays from the only laser to points spread over a patch
-SHORT = 1e-4  # of the way: rays stop so short of a patch; a thin sheet 4 mm in front still hides it
-LEAST_SHORT = 2e-7  # engine units: float32 knows a surface's place no better, and a ray must not meet its own end
 
 
 @dataclass(frozen=True)
@@ -40,8 +38,8 @@ class GatherSettings:
 class Lights:
     """What the gather's loop reads: patches that are lit, packed so that one load brings four numbers."""
 
-    # 20 a patch: three corners, each with one component of normal times area; the centre, and 1 for a cluster; from it
-    # to where rays from sensor points end, and 0
+    # 24 a patch: three corners, each with one component of normal times area; the centre, and 1 for a cluster; from it
+    # to the point of the surface that shadow rays ask for, and 0; the ray offset along the normal there, and 0
     packed: mi.Float
     clearance: mi.UInt64  # there, see ``Clearances.of``
     remainder: mi.Float | None  # four a patch: what float32 rounds off the centre; None where that does not count
@@ -147,7 +145,8 @@ def lights_of(
     is_cluster = dr.gather(mi.Vector4f, patches.members, lit).w
     shown = dr.gather(mi.Vector3f, illuminated.seen_at, lit)
     clearance = dr.gather(mi.UInt64, illuminated.clearance, lit)
-    rows = [(a, areas.x), (b, areas.y), (c, areas.z), (interaction.p, is_cluster), (shown, mi.Float(0))]
+    offset = dr.gather(mi.Vector3f, patches.offset_at(illuminated.seen_at), lit)
+    rows = [(a, areas.x), (b, areas.y), (c, areas.z), (interaction.p, is_cluster), (shown, 0), (offset, 0)]
     packed = dr.zeros(mi.Float, 4 * ROWS * dr.width(lit))
     lane = dr.arange(mi.UInt32, dr.width(lit))
     for k, (point, fourth) in enumerate(rows):
@@ -207,10 +206,11 @@ def _illuminate(
     elif settings.needs_visibility:
         # the very point that sensor points look at: what hides a part of a patch from both hides the same part
         way = to_rounded + dr.gather(mi.Vector3f, seen_at, patch)
+        offset = dr.gather(mi.Vector3f, patches.offset_at(seen_at), patch)
         tile = clearing.outlook.tile_bit(mi.UInt32(0), lit.p)
         is_before = dr.dot(dr.gather(mi.Vector3f, patches.areas, patch), way) < 0  # the plane through that point
         clear = dr.select(is_before, dr.gather(mi.UInt64, clearance, patch), 0)
-        seen = dr.select(is_visible(built, lit, way, active, clear, tile), mi.Float(1), 0)
+        seen = dr.select(is_visible(built, lit, way, offset, active, clear, tile), mi.Float(1), 0)
     arriving = dr.select(active, arriving * seen, 0)
     brightest = dr.zeros(mi.Float, n_patches)
     dr.scatter_reduce(dr.ReduceOp.Max, brightest, dr.max(arriving), patch)
@@ -235,7 +235,7 @@ def _share_in_light(
     for k in range(LASER_RAYS):
         index = patches.number * LASER_RAYS + k
         point = patches.points(index)
-        is_lit = is_visible(built, laser, to_rounded + point, active)
+        is_lit = is_visible(built, laser, to_rounded + point, patches.offset_at(point), active)
         n_seen += dr.select(is_lit, mi.UInt32(1), 0)
         # the n-th point in light takes the place of the one before with a chance of 1 / n
         takes = is_lit & (mi.sample_tea_float32(index, patches.start.x) * mi.Float(n_seen) < 1)
@@ -247,19 +247,22 @@ def is_visible(
     built: BuiltScene,
     wall_point: mi.SurfaceInteraction3f,
     way: mi.Vector3f,
+    offset: mi.Vector3f,
     active: mi.Bool,
     clearance: mi.UInt64 | None = None,
     tile: mi.UInt64 | None = None,
 ) -> mi.Bool:
     """Return whether nothing lies on the way from a point of the wall to a point of a hidden surface.
 
-    ``clearance`` is that of the latter, and ``tile`` the bit of the tile the former lies in.
+    The shadow ray ends at the latter moved by ``offset``, the ray offset along the surface's normal, to the side that
+    faces the wall point. ``clearance`` is that of the surface point, and ``tile`` the bit of the tile the wall point
+    lies in.
     """
     origin = off_the_wall(built, wall_point)
     direction = way - (origin - wall_point.p)
-    end = dr.maximum(1 - SHORT - LEAST_SHORT * dr.rsqrt(dr.squared_norm(direction)), 0)
+    direction -= offset * dr.sign(dr.dot(offset, direction))
     asked = active if clearance is None else active & ((clearance & tile) == 0)
-    ray = mi.Ray3f(origin, direction, end, mi.Float(0), [])
+    ray = mi.Ray3f(origin, direction, mi.Float(1), mi.Float(0), [])
     return active & ~(asked & built.scene.ray_test(ray, coherent=False, active=asked))
 
 

@@ -17,15 +17,18 @@ def nothing_occludes(built: BuiltScene) -> bool:
 
     That holds for one object alone in front of a planar wall: a sphere seen from outside; a mesh whose vertices all
     lie behind (or in) the plane of each of its faces: a flat sheet, a box, any convex solid; and a mesh whose vertices
-    and whose wall all lie in front of each face: a convex room around the wall.
+    and whose wall all lie in front of each face: a convex room around the wall. Surfaces that light can reach from
+    behind, by their BSDF or by vertex normals that turn away from their faces', may be hidden by the object itself.
     """
     if not built.wall.is_planar or len(built.hidden_shapes) != 1:
         return False
     shape = built.hidden_shapes[0]
+    if bool(shape.bsdf().flags() & (mi.BSDFFlags.BackSide | mi.BSDFFlags.Transmission)):
+        return False
     if not shape.is_mesh():
         return shape.class_name() == "Sphere" and not shape.has_flipped_normals()
-    if shape.face_count() > MOST_FACES or bool(shape.bsdf().flags() & mi.BSDFFlags.BackSide):
-        return False  # a two-sided sheet may be seen from behind, past its own other faces
+    if shape.face_count() > MOST_FACES or shape.has_vertex_normals():
+        return False
     parameters = mi.traverse(shape)
     vertices = np.asarray(parameters["vertex_positions"], dtype=np.float64).reshape(-1, 3)
     corners = vertices[np.asarray(parameters["faces"]).reshape(-1, 3)]

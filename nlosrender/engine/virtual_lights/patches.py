@@ -15,7 +15,8 @@ from nlosrender.scene.pose import Float64
 class Patches:
     """Triangular patches of the hidden geometry [engine units].
 
-    ``areas``, ``centres`` and ``normals`` are those of the true surface where it is curved; ``corners`` lie on it.
+    ``areas``, ``centres`` and ``normals`` are those of the true surface where it is curved; ``corners`` are raised to
+    its mean height over them.
     """
 
     corners: Float64  # (n, 3, 3); of clusters three in a row of a parallelogram's four
@@ -25,7 +26,6 @@ class Patches:
     shapes: NDArray[np.uint32]  # (n,) index into the scene's shapes
     primitives: NDArray[np.uint32]  # (n,) triangle of a mesh, 0 on analytic shapes
     barycentric: Float64  # (n, 2) the centre within that triangle
-    lifts: Float64  # (n,) height of the surface over the plane of the corners: where shadow rays may end
     members: Float64  # (n, 3) where shadow rays of a cluster end; elsewhere the centre
     member_normals: Float64  # (n, 3) geometric, there
     is_cluster: NDArray[np.bool_]  # (n,)
@@ -43,7 +43,7 @@ class Patches:
         if not parts:
             none, index = np.zeros((0, 3)), np.zeros(0, np.uint32)
             corners, numbers, pairs = np.zeros((0, 3, 3)), np.zeros(0), np.zeros((0, 2))
-            return cls(corners, numbers, none, none, index, index, pairs, numbers, none, none, index.astype(bool))
+            return cls(corners, numbers, none, none, index, index, pairs, none, none, index.astype(bool))
         names = [field.name for field in fields(cls)]
         return cls(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
 
@@ -69,7 +69,6 @@ def split_cells(cells: Cells, splits: NDArray[np.int64]) -> Patches:
                 cells.shapes[repeated],
                 cells.primitives[repeated],
                 centres[:, 1:],
-                np.zeros(len(repeated)),
                 corners.mean(axis=1),
                 units,
                 np.zeros(len(repeated), bool),

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import mitsuba as mi
 import numpy as np
 
 from nlosrender.engine.virtual_lights.cells import WallDistance
 from nlosrender.engine.virtual_lights.patches import Patches, split_weights
+from nlosrender.scene.build import curvature
 from nlosrender.scene.pose import Float64
 
-ROUND_PLUGINS = ("Sphere", "Cylinder")
 FEWEST_AROUND = 6  # parts of a cylinder's circumference
 EDGE = 1.052  # of the icosahedron in its unit sphere
 
@@ -28,13 +28,13 @@ class RoundShape:
     @classmethod
     def of(cls, index: int, shape: mi.Shape) -> RoundShape:
         """Return what a Mitsuba sphere or cylinder is."""
-        sign = -1.0 if shape.has_flipped_normals() else 1.0
+        radius = (-1.0 if shape.has_flipped_normals() else 1.0) / curvature(shape)
         if shape.class_name() == "Cylinder":
             to_world = np.array(mi.traverse(shape)["to_world"].matrix, dtype=np.float64).reshape(4, 4)
-            return cls(index, to_world[:3, 3], sign * float(np.linalg.norm(to_world[:3, 0])), to_world[:3, 2])
+            return cls(index, to_world[:3, 3], radius, to_world[:3, 2])
         box = shape.bbox()
         low, high = (np.ravel(np.asarray(corner, dtype=np.float64)) for corner in (box.min, box.max))
-        return cls(index, (low + high) / 2, sign * float((high - low).max()) / 2, np.zeros(3))
+        return cls(index, (low + high) / 2, radius, np.zeros(3))
 
     @property
     def row(self) -> Float64:
@@ -47,24 +47,34 @@ class RoundShape:
         along = np.linspace(0, 1, 33)[:, None] * self.axis if self.axis.any() else np.zeros((1, 3))
         return abs(float(distance(self.centre + along).min()) - abs(self.radius))
 
-    def count(self, allowed: float) -> int:
-        """Return how many patches no larger than ``allowed`` it takes."""
+    def count(self, across: float, along: float) -> int:
+        """Return how many patches it takes of sizes up to ``across``, and ``along`` the axis of a cylinder."""
         if not self.axis.any():
-            return 20 * self._splits(allowed) ** 2
-        around, along = self._rings(allowed)
-        return 2 * around * along
+            return 20 * self._splits(across) ** 2
+        n_around, n_along = self._rings(across, along)
+        return 2 * n_around * n_along
 
-    def patches(self, allowed: float) -> Patches:
-        """Return patches no larger than ``allowed``."""
-        return _cylinder(self, *self._rings(allowed)) if self.axis.any() else _sphere(self, self._splits(allowed))
+    def patches(self, across: float, along: float, *, raised: bool = True) -> Patches:
+        """Return patches of sizes up to ``across``, and ``along`` the axis of a cylinder.
+
+        ``raised`` to the mean height of the surface over them; otherwise their corners lie on it.
+        """
+        if self.axis.any():
+            patches, height = _cylinder(self, *self._rings(across, along))
+        else:
+            patches, height = _sphere(self, self._splits(across))
+        if not raised:
+            return patches
+        outward = patches.normals * (np.sign(self.radius) * height)[:, None]
+        return replace(patches, corners=patches.corners + outward[:, None])
 
     def _splits(self, allowed: float) -> int:
         return int(np.ceil(EDGE * abs(self.radius) / allowed))
 
-    def _rings(self, allowed: float) -> tuple[int, int]:
-        side = allowed / np.sqrt(2)  # of a square whose diagonal is ``allowed``
-        around = max(int(np.ceil(2 * np.pi * abs(self.radius) / side)), FEWEST_AROUND)
-        return around, max(int(np.ceil(np.linalg.norm(self.axis) / side)), 1)
+    def _rings(self, across: float, along: float) -> tuple[int, int]:
+        # a square's diagonal is the size of its triangles
+        n_around = max(int(np.ceil(np.sqrt(2) * 2 * np.pi * abs(self.radius) / across)), FEWEST_AROUND)
+        return n_around, max(int(np.ceil(np.sqrt(2) * np.linalg.norm(self.axis) / along)), 1)
 
 
 def onto_round_shapes(positions: Float64, normals: Float64, rows: Float64) -> tuple[Float64, Float64, Float64]:
@@ -99,8 +109,16 @@ def onto_round_shapes(positions: Float64, normals: Float64, rows: Float64) -> tu
     return positions, normals, stretch
 
 
-def _sphere(shape: RoundShape, n: int) -> Patches:
-    """Cut a sphere into 20 n^2 spherical triangles: an icosahedron's faces, cut and projected."""
+def _sphere(shape: RoundShape, n: int) -> tuple[Patches, Float64]:
+    """Cut a sphere into 20 n^2 spherical triangles: an icosahedron's faces, cut and projected.
+
+    Returns
+    -------
+    tuple
+        Patches; and the mean height (20 n^2,) of the sphere over the plane through their corners: (a^2 + b^2 + c^2) /
+        (24 R) over a triangle with edges a, b, c, the mean power of its points over 2 R. With it their mean delay is
+        right.
+    """
     flat = np.einsum("pkb,tbx->tpkx", split_weights(n), _icosahedron()).reshape(-1, 3, 3)
     unit = flat / np.linalg.norm(flat, axis=-1, keepdims=True)
     a, b, c = unit[:, 0], unit[:, 1], unit[:, 2]
@@ -112,7 +130,8 @@ def _sphere(shape: RoundShape, n: int) -> Patches:
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
     centre, radius, outside = shape.centre, abs(shape.radius), np.sign(shape.radius)
     count = len(unit)
-    return Patches(
+    squares = np.square(unit - np.roll(unit, 1, axis=1)).sum(axis=(1, 2))
+    patches = Patches(
         centre + radius * unit,
         radius**2 * solid_angle,
         centre + radius * direction,
@@ -120,16 +139,21 @@ def _sphere(shape: RoundShape, n: int) -> Patches:
         np.full(count, shape.index, np.uint32),
         np.zeros(count, np.uint32),
         np.zeros((count, 2)),
-        # seen from within, a plane through points of the sphere lies in front of it already
-        np.maximum(outside, 0) * radius * (1 - np.linalg.norm(unit.mean(axis=1), axis=1)),
         centre + radius * direction,
         outside * direction,
         np.zeros(count, bool),
     )
+    return patches, radius * squares / 24
 
 
-def _cylinder(shape: RoundShape, around: int, along: int) -> Patches:
-    """Cut a cylinder into ``around`` times ``along`` rectangles of two patches each."""
+def _cylinder(shape: RoundShape, around: int, along: int) -> tuple[Patches, Float64]:
+    """Cut a cylinder into ``around`` times ``along`` rectangles of two patches each.
+
+    Returns
+    -------
+    tuple
+        As of ``_sphere``: a chord s lies s^2 / (12 R) below its arc on average.
+    """
     length = float(np.linalg.norm(shape.axis))
     axis, radius, outside = shape.axis / length, abs(shape.radius), np.sign(shape.radius)
     first = np.cross(axis, np.eye(3)[np.abs(axis).argmin()])
@@ -150,9 +174,7 @@ def _cylinder(shape: RoundShape, around: int, along: int) -> Patches:
     radial = centres - shape.centre
     radial -= (radial @ axis)[:, None] * axis
     count = len(corners)
-    # seen from within, the plane of the corners lies in front of the surface already
-    lift = max(outside, 0) * radius * (1 - np.cos(np.pi / around))
-    return Patches(
+    patches = Patches(
         corners,
         np.full(count, 2 * np.pi * radius * length / count),
         centres,
@@ -160,11 +182,11 @@ def _cylinder(shape: RoundShape, around: int, along: int) -> Patches:
         np.full(count, shape.index, np.uint32),
         np.zeros(count, np.uint32),
         np.zeros((count, 2)),
-        np.full(count, lift),
         centres,
         outside * radial / radius,
         np.zeros(count, bool),
     )
+    return patches, np.full(count, radius * (2 * np.sin(np.pi / around)) ** 2 / 12)
 
 
 def _icosahedron() -> Float64:

@@ -19,8 +19,8 @@ from nlosrender.engine.virtual_lights.cells import Cells, WallDistance, quartere
 from nlosrender.engine.virtual_lights.graded_cells import GradedCells, Grading
 from nlosrender.engine.virtual_lights.patches import Patches
 from nlosrender.engine.virtual_lights.regions import regions_of
-from nlosrender.engine.virtual_lights.round_shapes import ROUND_PLUGINS, RoundShape
-from nlosrender.scene.build import WALL_ID, BuiltScene
+from nlosrender.engine.virtual_lights.round_shapes import RoundShape
+from nlosrender.scene.build import ROUND_PLUGINS, WALL_ID, BuiltScene
 
 MAX_PATCHES = 2_000_000  # of one gather; beyond it the path engine is the better choice
 MOST_KEPT = 200_000  # patches of one resolution that are kept for the next call
@@ -102,20 +102,17 @@ class Tessellator:
             yield labels, parts
 
     def _make(self, coarseness: float) -> Patches:
-        on_round = [shape.patches(self._allowed_on(shape, coarseness)) for shape in self.round_shapes]
+        on_round = [shape.patches(*self._allowed_on(shape, coarseness)) for shape in self.round_shapes]
         return Patches.joined([*self.shared.patches(coarseness), *on_round])
 
     def count(self, coarseness: float) -> int:
         """Return about how many patches a sensor point would gather, on average; exactly where none merge."""
         return sum(self.counts(coarseness))
 
-    def counts(self, coarseness: float) -> tuple[int, int]:
-        """Return ``count`` of the hidden surfaces, and of a wall that sees itself."""
-        hidden, wall = (self.regions or self.shared).counts(coarseness)
-        for shape in self.round_shapes:
-            more = shape.count(self._allowed_on(shape, coarseness))
-            hidden, wall = (hidden, wall + more) if shape.index == self.wall_index else (hidden + more, wall)
-        return hidden, wall
+    def counts(self, coarseness: float) -> tuple[int, ...]:
+        """Return ``count`` of the hidden meshes, of a mesh wall that sees itself, and of each sphere and cylinder."""
+        on_round = (shape.count(*self._allowed_on(shape, coarseness)) for shape in self.round_shapes)
+        return (*(self.regions or self.shared).counts(coarseness), *on_round)
 
     @property
     def nearest(self) -> float:
@@ -139,19 +136,21 @@ class Tessellator:
     @property
     def n_round_cells(self) -> int:
         """Cells of all round shapes: a needle has as many as it is longer than it is wide."""
-        return sum(shape.count(self._allowed_on(shape, 1.0)) for shape in self.round_shapes)
+        return sum(shape.count(*self._allowed_on(shape, 1.0)) for shape in self.round_shapes)
 
     def round_cells(self) -> list[tuple[RoundShape, Patches]]:
         """Return every round shape, and its cells, whose corners lie on it."""
-        return [(shape, shape.patches(self._allowed_on(shape, 1.0))) for shape in self.round_shapes]
+        return [(shape, shape.patches(*self._allowed_on(shape, 1.0), raised=False)) for shape in self.round_shapes]
 
-    def _allowed_on(self, shape: RoundShape, coarseness: float) -> float:
+    def _allowed_on(self, shape: RoundShape, coarseness: float) -> tuple[float, float]:
+        """Return the size of patches across a round shape, and along the axis of a cylinder, which is straight."""
         if shape.index == self.wall_index:
             # cos cos / r^2 varies over the radius only, however near: 1 / (4 radius^2) between points of a sphere
             nearest = abs(shape.radius)
         else:
             nearest = max(shape.nearest(self.distance), abs(shape.radius) / 8)
-        return coarseness * min(float(self.grading.allowed_size(np.array([nearest]))[0]), abs(shape.radius))
+        straight = float(self.grading.allowed_size(np.array([nearest]))[0])
+        return coarseness * min(straight, abs(shape.radius)), coarseness * straight
 
 
 def can_tessellate(built: BuiltScene) -> bool:

@@ -194,7 +194,7 @@ class ThirdBounce:
         lanes, patches, outlook = self._lanes(batch, shape), self.tessellator.patches(coarseness), self._outlook(batch)
         lights = self._shared_lights(lanes.transport, shape, coarseness, patches, outlook)
         rows = np.array(lights.packed, np.float32).reshape(-1, ROWS, 4)
-        ends, normals = (rows[:, ROWS - 2] + rows[:, ROWS - 1])[:, :3], np.array(lights.interaction.n, np.float64).T
+        ends, normals = (rows[:, 3] + rows[:, 4] + rows[:, 5])[:, :3], np.array(lights.interaction.n, np.float64).T
         tiles = np.empty(shape.sensors, np.uint64)
         bits = np.array(outlook.tile_bit(mi.UInt32(0), lanes.transport.sensors.interaction.p))
         tiles[lanes.order] = bits[: shape.sensors]

@@ -47,6 +47,7 @@ class WalkEnds:
     position: mi.Point3f
     normal: mi.Normal3f  # geometric
     shading: mi.Normal3f
+    shape: mi.ShapePtr
     carried: mi.Spectrum  # of the walk up to the vertex, its reflectance / pi included
     opl: mi.Float  # from the site [engine units]
     bounce: mi.UInt32  # of a connection to the laser
@@ -69,6 +70,7 @@ class Impulses:
     delays: mi.Float  # from the laser point to the site [bins]
     ends: mi.Point3f  # (count,) where the laser's light meets the walk
     shading: mi.Normal3f  # (count,) shading normals there
+    offset: mi.Vector3f  # (count,) ray offset there, along the geometric normal
 
 
 @dr.syntax
@@ -110,7 +112,7 @@ def trace_walks(
     origin = mi.Point3f(sites.p)
     opl = mi.Float(0)  # optical path length from the site [engine units]
     bounce = mi.UInt32(FIRST_BOUNCE + 1)  # of a connection from the last vertex
-    position, normal, shading = mi.Point3f(0), mi.Normal3f(0), mi.Normal3f(0)
+    position, normal, shading, shape = mi.Point3f(0), mi.Normal3f(0), mi.Normal3f(0), mi.ShapePtr(wall)
     carried, chosen_opl, chosen_bounce = mi.Spectrum(0), mi.Float(0), mi.UInt32(0)
     expected, total = mi.Float(0), mi.Float(0)
     is_thinned = mi.Bool(False)  # the walk can only find light that comes too late, and has survived that roulette
@@ -148,7 +150,7 @@ def trace_walks(
         total += lit
         pick = (lit > 0) & (generator.next_float32(alive) * total < lit)
         position, normal = dr.select(pick, si.p, position), dr.select(pick, si.n, normal)
-        shading = dr.select(pick, si.sh_frame.n, shading)
+        shading, shape = dr.select(pick, si.sh_frame.n, shading), dr.select(pick, si.shape, shape)
         carried = dr.select(pick, leaving, carried)
         chosen_opl, chosen_bounce = dr.select(pick, opl, chosen_opl), dr.select(pick, bounce, chosen_bounce)
         expected = dr.select(pick, lit, expected)
@@ -166,7 +168,7 @@ def trace_walks(
         origin = mi.Point3f(si.p)
         ray = mi.Ray3f(offset_origin(built, si, direction), direction)
 
-    return WalkEnds(position, normal, shading, carried, chosen_opl, chosen_bounce, expected, total)
+    return WalkEnds(position, normal, shading, shape, carried, chosen_opl, chosen_bounce, expected, total)
 
 
 def arriving(built: BuiltScene, laser: WallPoints, point: mi.Point3f, shading: mi.Normal3f) -> mi.Spectrum:
@@ -252,14 +254,24 @@ def walk_back(plan: WalkPlan, transport: Transport, sites: Sites, tried: TriedLa
         dr.gather(mi.Float, delays, entry),
         dr.gather(mi.Point3f, ends.position, end),
         dr.gather(mi.Normal3f, ends.shading, end),
+        _ray_offset(built, ends, end),
     )
-    dr.eval(impulses.bounces, impulses.values, impulses.delays, impulses.ends, impulses.shading)
+    dr.eval(impulses.bounces, impulses.values, impulses.delays, impulses.ends, impulses.shading, impulses.offset)
     return impulses
 
 
 def no_impulses() -> Impulses:
     """Return what comes back when no walk finds light."""
-    return Impulses(0, np.zeros(0, np.int64), mi.UInt32(), mi.Spectrum(0), mi.Float(), mi.Point3f(), mi.Normal3f())
+    nothing = mi.UInt32(), mi.Spectrum(0), mi.Float(), mi.Point3f(), mi.Normal3f(), mi.Vector3f()
+    return Impulses(0, np.zeros(0, np.int64), *nothing)
+
+
+def _ray_offset(built: BuiltScene, ends: WalkEnds, index: mi.UInt32) -> mi.Vector3f:
+    """Return the ray offset of the ends of walks, on the side of their shading normals."""
+    si = dr.zeros(mi.SurfaceInteraction3f, dr.width(index))
+    si.p, si.n = dr.gather(mi.Point3f, ends.position, index), dr.gather(mi.Normal3f, ends.normal, index)
+    si.shape = dr.gather(mi.ShapePtr, ends.shape, index)
+    return mi.Vector3f(offset_origin(built, si, dr.gather(mi.Normal3f, ends.shading, index)) - si.p)
 
 
 def _resample(
@@ -315,7 +327,7 @@ def _connect(
     lasers = transport.lasers.gather(index // per_laser)
     position = dr.gather(mi.Point3f, ends.position, end)
     si = dr.zeros(mi.SurfaceInteraction3f, dr.width(index))
-    si.p, si.n = position, dr.gather(mi.Normal3f, ends.normal, end)
+    si.p, si.n, si.shape = position, dr.gather(mi.Normal3f, ends.normal, end), dr.gather(mi.ShapePtr, ends.shape, end)
     to_laser = lasers.interaction.p - position
     distance = dr.norm(to_laser)
     value = dr.gather(mi.Spectrum, ends.carried, end) / dr.gather(mi.Float, ends.expected, end)

@@ -1,0 +1,134 @@
+"""Coincident surfaces: triangles in one place, or closer than rays tell apart, are moved apart by a ray offset or two.
+
+Shadow rays end a ray offset (about 5e-7 of the scene's size) before a surface, and float32 intersections are good to
+about 1e-7: of two surfaces closer than that, both would be lit, or either one met by chance. The later of the two, in
+the order of the items and of the triangles of a mesh, is moved along its normal until the gap is wide enough to tell
+them apart. Visibility then decides as everywhere: what lies behind is dark, and their union counts once.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+
+from nlosrender.scene.triangle_mesh import TriangleMesh
+
+GAP = 2e-6  # over 1 + the largest coordinate [engine units]: four times the ray offset
+LEAST_POINTS = 2**16  # tried on all meshes of a scene
+STEP = 1.25  # gaps by which triangles are moved: what has been moved is not found again
+FLATNESS = 4.0  # gaps that the corners of a triangle may be off the plane of the other
+EDGE = 1e-3  # barycentric distance from an edge within which a neighbour in the same plane may be met
+PASSES = 8  # so many layers in one place are told apart
+
+
+@dataclass(frozen=True, eq=False)
+class Overlap:
+    """Triangles of one mesh that lie in the same place as others."""
+
+    mesh: int
+    other: int  # the mesh that most of them lie on
+    faces: NDArray[np.bool_]  # (m,) to be moved
+    share: float  # of the mesh's area that these have
+
+
+def overlaps(
+    scene: mi.Scene, shapes: Sequence[mi.Shape], meshes: Mapping[int, TriangleMesh], seed: int = 0
+) -> list[Overlap]:
+    """Find triangles that lie within ``GAP`` of earlier ones.
+
+    Points of all triangles are tried, in proportion to area but two of each at least, by a ray that comes from just
+    outside and goes to just inside: about every second one meets the other of two surfaces in one place first.
+
+    Parameters
+    ----------
+    scene, shapes
+        Scene, and its hidden shapes.
+    meshes
+        Those of the shapes that are meshes, by their number, in engine units; of others nothing is found.
+    seed
+        Of the points.
+    """
+    if not meshes:
+        return []
+    joined = TriangleMesh.merged([TriangleMesh(mesh.vertices, mesh.faces) for mesh in meshes.values()])
+    owners = np.repeat(list(meshes), [len(mesh.faces) for mesh in meshes.values()])  # mesh of each triangle
+    in_scene = list(scene.shapes())
+    first = np.zeros(len(in_scene), np.uint32)  # triangle in ``joined`` of each of the scene's shapes, plus 1
+    for number in meshes:
+        first[in_scene.index(shapes[number])] = np.searchsorted(owners, number) + 1
+    pairs = _pairs(scene, joined, mi.UInt32(first), seed)
+    # in a mesh what faces away from the wall counts as later: both sides of a sheet are then one layer each
+    turned_away = np.einsum("ij,ij->i", joined.face_normals(), joined.vertices[joined.faces[:, 0]]) > 0
+    rank = (2 * owners + turned_away) * len(owners) + np.arange(len(owners))
+    earlier, later = np.take_along_axis(pairs, np.argsort(rank[pairs], axis=0), axis=0)
+    areas, result = joined.areas(), []
+    for number in np.unique(owners[later]).tolist():
+        of_this = owners[later] == number
+        faces = np.zeros(len(owners), bool)
+        faces[later[of_this]] = True
+        other = int(np.bincount(owners[earlier[of_this]]).argmax())
+        share = areas[faces].sum() / areas[owners == number].sum()
+        result.append(Overlap(number, other, faces[owners == number], float(share)))
+    return result
+
+
+def moved_apart(mesh: TriangleMesh, faces: NDArray[np.bool_], *, both_sides: bool) -> TriangleMesh:
+    """Return the mesh with some of its faces (m,) moved along their normals, as the last of its faces.
+
+    A surface that reflects from ``both_sides`` is moved towards the origin, where the relay wall is.
+    """
+    moved = mesh.subset(faces)
+    normals = moved.face_normals()
+    if both_sides:
+        normals = normals * -np.sign(np.einsum("ij,ij->i", normals, moved.vertices[moved.faces].mean(axis=1)))[:, None]
+    at_vertices = np.zeros_like(moved.vertices)
+    for corner in range(3):
+        np.add.at(at_vertices, moved.faces[:, corner], normals)
+    length = np.linalg.norm(at_vertices, axis=1, keepdims=True)
+    along = np.divide(at_vertices, length, out=np.zeros_like(at_vertices), where=length > 0)
+    step = STEP * GAP * (1 + np.abs(moved.vertices).max(axis=1, keepdims=True))
+    moved = moved.with_vertices(moved.vertices + along * step)
+    return TriangleMesh.merged([mesh.subset(~faces), moved]) if not faces.all() else moved
+
+
+def _pairs(scene: mi.Scene, mesh: TriangleMesh, first: mi.UInt32, seed: int) -> NDArray[np.uint32]:
+    """Return pairs (2, n) of triangles of ``mesh`` in one plane, one within ``GAP`` before a point of the other.
+
+    ``first`` tells for each shape of the scene with which triangle of ``mesh`` it begins, plus 1; 0 for other shapes.
+    """
+    areas = mesh.areas()
+    count = max(LEAST_POINTS, len(areas))
+    copies = 1 + np.ceil(areas / areas.sum() * count).astype(np.intp)
+    own = mi.UInt32(np.repeat(np.arange(len(areas), dtype=np.uint32), copies))
+    faces, vertices = mi.UInt32(np.ravel(mesh.faces)), mi.Float(np.ravel(mesh.vertices).astype(np.float32))
+
+    def corners(face: mi.UInt32) -> list[mi.Point3f]:
+        return [dr.gather(mi.Point3f, vertices, dr.gather(mi.UInt32, faces, 3 * face + k)) for k in range(3)]
+
+    lane, number = dr.arange(mi.UInt32, dr.width(own)), dr.opaque(mi.UInt32, 2 * seed)
+    root, other = dr.sqrt(mi.sample_tea_float32(lane, number)), mi.sample_tea_float32(lane, number + 1)
+    v = EDGE + (1 - 2 * EDGE) * other
+    a, b, c = corners(own)
+    point = a + (b - a) * (root * (1 - v)) + (c - a) * (root * v)
+    normal = dr.normalize(dr.cross(b - a, c - a))
+    reach = normal * (GAP * (1 + dr.max(dr.abs(point))))
+    hit = scene.ray_intersect_preliminary(mi.Ray3f(point + reach, -2 * reach, mi.Float(1), mi.Float(0), []))
+    start = dr.gather(mi.UInt32, first, hit.shape_index, hit.is_valid())
+    met = start - 1 + hit.prim_index
+    u, v = hit.prim_uv
+    chosen = (start > 0) & (met != own) & (dr.minimum(dr.minimum(u, v), 1 - u - v) > EDGE)
+    # in one plane, not across each other: surfaces that cross are in one place in a thin strip alone
+    here, there = [a, b, c], corners(dr.select(chosen, met, 0))
+    normals = [dr.cross(q - p, r - p) for p, q, r in (here, there)]
+    is_larger = dr.squared_norm(normals[0]) > dr.squared_norm(normals[1])
+    plane, corner = dr.normalize(dr.select(is_larger, *normals)), dr.select(is_larger, here[0], there[0])
+    for k in range(3):
+        off = dr.dot(plane, dr.select(is_larger, there[k], here[k]) - corner)
+        chosen &= dr.abs(off) < FLATNESS * GAP * (1 + dr.max(dr.abs(corner)))
+    index = dr.compress(chosen)
+    return np.stack([dr.gather(mi.UInt32, values, index).numpy() for values in (own, met)])
