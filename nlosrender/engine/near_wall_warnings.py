@@ -106,7 +106,7 @@ def _nearest_above(built: BuiltScene, grid: PointGrid) -> tuple[float, Float64]:
     if not built.wall.is_planar:  # what lies below the ray offset is met by a ray that comes back to the wall
         offset = wall_offset(built)
         top = NEAREST_TOLD * offset
-        down = _first_hits(built, starts + (top - offset) * normals, -normals, top - offset / 2)
+        down = _first_hits(built, starts + (top - offset) * normals, -normals, top - offset / 16)
         heights = np.where(np.isfinite(down), top - down, heights)
     nearest = int(np.argmin(heights))
     return float(heights[nearest]), np.round(starts[nearest] * built.unit, 9)

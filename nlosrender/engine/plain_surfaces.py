@@ -14,8 +14,10 @@ def only_normals_matter(built: BuiltScene) -> bool:
 
 
 def _is_plain(shape: mi.Shape) -> bool:
-    bsdf = shape.bsdf()
     has_smooth_normals = shape.class_name() == "Mesh" and shape.has_vertex_normals()
-    if has_smooth_normals or bsdf.class_name() != "SmoothDiffuse":
-        return False
-    return [key for key, _ in mi.traverse(bsdf)] == ["reflectance.value"]
+    return not has_smooth_normals and is_uniform_diffuse(shape.bsdf())
+
+
+def is_uniform_diffuse(bsdf: mi.BSDF) -> bool:
+    """Return whether a BSDF is Mitsuba's ``diffuse`` of one reflectance, without a texture."""
+    return bsdf.class_name() == "SmoothDiffuse" and [key for key, _ in mi.traverse(bsdf)] == ["reflectance.value"]

@@ -78,6 +78,7 @@ class Merger:
         merged = members.merged(coarseness, np.random.default_rng(seed))
         footprint, stands = _Footprint.of(merged), merged.stands
         areas, normals = _as_one(merged, self.light - footprint.mean)
+        barycentric = middles(self.cells.weights[stands])[:, 1:]
         return Patches(
             footprint.corners(),
             areas,
@@ -85,7 +86,8 @@ class Merger:
             normals,
             self.cells.shapes[stands],
             self.cells.primitives[stands],
-            middles(self.cells.weights[stands])[:, 1:],
+            barycentric,
+            np.repeat(barycentric[:, None], 3, axis=1),
             middles(self.cells.corners[stands]),
             self.normals[stands],
             np.ones(len(merged), bool),

@@ -13,12 +13,16 @@ from numpy.typing import NDArray
 from nlosrender.engine.connections import off_the_surface
 from nlosrender.engine.device_arrays import columns, on_device
 from nlosrender.engine.low_discrepancy import recurrence_steps
+from nlosrender.engine.plain_surfaces import is_uniform_diffuse
 from nlosrender.engine.space_filling import z_order
 from nlosrender.engine.virtual_lights.clearance import Surface
-from nlosrender.engine.virtual_lights.patches import Patches
+from nlosrender.engine.virtual_lights.patches import Patches, split_weights
 from nlosrender.engine.virtual_lights.round_shapes import RoundShape
 from nlosrender.scene.build import ROUND_PLUGINS, BuiltScene
 from nlosrender.scene.pose import Float64
+
+# A textured patch is cut into this many squared parts, a random point of each is looked up: 16 of many, 144 of few.
+TEXTURE_SPLITS, FEW_PATCHES = (4, 12), 2**14
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,7 +151,7 @@ def upload_patches(built: BuiltScene, patches: Patches, places: Places, seed: in
     interaction = surface_at(
         built, patches.centres, patches.normals, patches.shapes, patches.primitives, patches.barycentric
     )
-    reflectance = normal_reflectance(interaction)
+    reflectance = _mean_reflectance(built, patches, normal_reflectance(interaction))
     centre = np.array(interaction.p, np.float64).T
     from_rounded = patches.centres - centre
     remainder = mi.Vector3f(to_points(from_rounded))
@@ -218,6 +222,37 @@ def surface_at(
     interaction.n = mi.Normal3f(normal)
     interaction.wi = mi.Vector3f(0, 0, 1)
     return interaction
+
+
+def _mean_reflectance(built: BuiltScene, patches: Patches, reflectance: mi.Spectrum) -> mi.Spectrum:
+    """Return the reflectance of patches, averaged over random points of each where some surface has a texture.
+
+    That of the centre alone, ``reflectance``, takes a texture finer than the patches for one of other colours at every
+    resolution, and the difference of two resolutions, the stated error, for noise.
+    """
+    shapes = built.scene.shapes()
+    textured = np.array([_has_texture(shape.bsdf()) for shape in shapes])[patches.shapes]
+    chosen = np.flatnonzero(textured & ~patches.is_cluster)
+    if not len(chosen):
+        return reflectance
+    some, random = patches.at(chosen), np.random.default_rng(len(patches))
+    parts = split_weights(TEXTURE_SPLITS[0 if len(chosen) > FEW_PATCHES else 1])
+    total = mi.Spectrum(0)
+    for part in parts:
+        root, v = np.sqrt(random.random(len(chosen))), random.random(len(chosen))
+        weights = np.stack([1 - root, root * (1 - v), root * v], axis=1) @ part
+        positions = np.einsum("nk,nkx->nx", weights, some.corners)
+        barycentric = np.einsum("nk,nkx->nx", weights, some.corner_barycentric)
+        total += normal_reflectance(
+            surface_at(built, positions, some.normals, some.shapes, some.primitives, barycentric)
+        )
+        dr.eval(total)
+    dr.scatter(reflectance, total / len(parts), on_device(mi.UInt32, chosen))
+    return reflectance
+
+
+def _has_texture(bsdf: mi.BSDF) -> bool:
+    return bsdf.class_name() == "SmoothDiffuse" and not is_uniform_diffuse(bsdf)
 
 
 def normal_reflectance(interaction: mi.SurfaceInteraction3f) -> mi.Spectrum:

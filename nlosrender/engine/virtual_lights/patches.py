@@ -26,6 +26,7 @@ class Patches:
     shapes: NDArray[np.uint32]  # (n,) index into the scene's shapes
     primitives: NDArray[np.uint32]  # (n,) triangle of a mesh, 0 on analytic shapes
     barycentric: Float64  # (n, 2) the centre within that triangle
+    corner_barycentric: Float64  # (n, 3, 2) the corners within that triangle; of clusters, and off meshes, the centre
     members: Float64  # (n, 3) where shadow rays of a cluster end; elsewhere the centre
     member_normals: Float64  # (n, 3) geometric, there
     is_cluster: NDArray[np.bool_]  # (n,)
@@ -43,7 +44,8 @@ class Patches:
         if not parts:
             none, index = np.zeros((0, 3)), np.zeros(0, np.uint32)
             corners, numbers, pairs = np.zeros((0, 3, 3)), np.zeros(0), np.zeros((0, 2))
-            return cls(corners, numbers, none, none, index, index, pairs, none, none, index.astype(bool))
+            places = np.zeros((0, 3, 2))
+            return cls(corners, numbers, none, none, index, index, pairs, places, none, none, index.astype(bool))
         names = [field.name for field in fields(cls)]
         return cls(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
 
@@ -57,7 +59,7 @@ def split_cells(cells: Cells, splits: NDArray[np.int64]) -> Patches:
         owners = np.flatnonzero(splits == n)
         weights = split_weights(int(n))  # (n^2, 3 corners, 3 barycentric)
         corners = np.einsum("pkb,tbx->tpkx", weights, cells.corners[owners]).reshape(-1, 3, 3)
-        centres = np.einsum("pb,tbx->tpx", weights.mean(axis=1), cells.weights[owners]).reshape(-1, 3)
+        barycentric = np.einsum("pkb,tbx->tpkx", weights, cells.weights[owners])[..., 1:].reshape(-1, 3, 2)
         repeated = np.repeat(owners, n * n)
         units = normals[repeated] / lengths[repeated, None]
         parts.append(
@@ -68,7 +70,8 @@ def split_cells(cells: Cells, splits: NDArray[np.int64]) -> Patches:
                 units,
                 cells.shapes[repeated],
                 cells.primitives[repeated],
-                centres[:, 1:],
+                barycentric.mean(axis=1),
+                barycentric,
                 corners.mean(axis=1),
                 units,
                 np.zeros(len(repeated), bool),
