@@ -276,6 +276,21 @@ def test_a_picture_lies_the_right_way_up_on_the_relay_wall(name: str, picture: d
     np.testing.assert_allclose(np.array(met.uv).T, built.wall.uv(xy), atol=1e-5)  # float32 over 1 m
 
 
+@pytest.mark.parametrize("name", ["rectangle", "cylinder", "relay wall"])
+def test_the_pictures_own_transform_comes_last(name: str, picture: dict[str, Any]) -> None:
+    """Moved by one column and one row in (u, v), every texel shows its neighbour to the right and below, all shapes."""
+    picture["reflectance"]["to_uv"] = [{"translate": [1 / COLUMNS, 1 / ROWS, 0]}]
+    config = flat_wall(wall={"bsdf": picture})
+    place = flat([0, 0, 0], Z, Y, 2.0, 1.6)
+    if name != "relay wall":
+        item, place = ITEMS[name]
+        config = flat_wall({**item, "center": CENTER.tolist(), "bsdf": picture})
+    built = pipeline.load_scene(configured(config))
+    shape = built.wall_shape if name == "relay wall" else built.hidden_shapes[0]
+    expected = np.roll(TEXELS, (-1, -1), axis=(0, 1))
+    np.testing.assert_allclose(seen(built, shape, place, built.wall.pose.to_local), expected, rtol=1e-6)
+
+
 LASER, SENSORS = np.array([[[0.3, -0.2, 0.0]]]), grid_points(5, 3, 2.0, 1.6)
 EDGES = np.linspace(0.0, 6.0, 61)
 
