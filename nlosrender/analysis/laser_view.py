@@ -43,7 +43,7 @@ def laser_view(capture: StoredCapture, laser: tuple[int, int]) -> LaserView:
     Raises
     ------
     FileError
-        The laser point does not exist, or the file is damaged or too large to be read for a picture.
+        The laser point does not exist, a sample is not finite, or the file is damaged or too large for a picture.
     """
     _check_size(capture)
     sizes = capture.header.sizes
@@ -130,6 +130,8 @@ def _bands(capture: StoredCapture, laser: tuple[int, int]) -> Iterator[tuple[sli
     for start in range(0, n_rows, step):
         rows = slice(start, min(start + step, n_rows))
         block = capture.read_block(lasers=laser, sensors=(rows, None))
+        if not np.isfinite(block).all():
+            raise FileError(f"{capture.path}: data holds numbers that are not finite; see `nlosrender info --check`")
         yield rows, intensity(capture.header, block[:, :, 0, 0].astype(np.float64))
 
 

@@ -163,7 +163,9 @@ def _draw_frames(figure: SubFigure, capture: StoredCapture, view: LaserView, pix
     for axes, frame, index in zip(all_axes, frames, bins, strict=True):
         opl = header.start_opl + (index + 0.5) * header.bin_width_opl
         style(axes, f"{opl:.3f} m   {opl_to_seconds(opl) * 1e9:.2f} ns", xlabel, ylabel if axes is all_axes[0] else "")
-        axes.imshow(frame, origin="lower", extent=extent, cmap=COLORMAP, vmin=0, vmax=frame.max() or 1, aspect="equal")
+        axes.imshow(
+            frame, origin="lower", extent=extent, cmap=COLORMAP, vmin=0, vmax=max(frame.max(), 0) or 1, aspect="equal"
+        )
         x, y = _wall_position(header, pixel, extent)
         axes.plot(x, y, marker="+", markersize=9, markeredgewidth=1.2, color=MARK, clip_on=False)
 
@@ -229,7 +231,7 @@ def _draw_row(axes: Axes, capture: StoredCapture, view: LaserView) -> None:
     early, late = (header.start_opl + index * header.bin_width_opl for index in (first, last + 1))
     style(axes, f"brightest row ({row}) over time", xlabel, "optical path length [m]")
     # square root: one bright front would leave everything behind it black
-    scale = PowerNorm(0.5, vmin=0, vmax=float(light.max()) / factor or 1.0, clip=True)
+    scale = PowerNorm(0.5, vmin=0, vmax=max(float(light.max()), 0.0) / factor or 1.0, clip=True)
     extent = (left, right, early, late)
     image = axes.imshow(
         light / factor, origin="lower", extent=extent, aspect="auto", cmap=COLORMAP, norm=scale, interpolation="nearest"

@@ -11,9 +11,11 @@ import h5py
 import matplotlib.image
 import numpy as np
 import pytest
+from point_captures import cells, points_header, write_points
 
 from nlosrender.analysis import laser_view as views
 from nlosrender.analysis.plots import plot_capture
+from nlosrender.analysis.reconstruction.reconstruct import ReconstructionSettings, reconstruct_capture
 from nlosrender.analysis.summary import summarise
 from nlosrender.errors import FileError, OptionError
 from nlosrender.files.provenance import provenance_attributes
@@ -186,3 +188,36 @@ def test_pictures_that_cannot_be(
         plot_capture(path, Path(picture), **points)
     assert path.read_bytes() == before
     assert list(tmp_path.iterdir()) == [path]
+
+
+def spoilt(path: Path, value: float, everywhere: bool) -> Path:
+    """Write a confocal capture whose samples, or one of them, are ``value``."""
+    write_points(path, points_header("confocal", cells(5, 3, 1.0, 0.8)), [(0, 0, 0.8)])
+    with h5py.File(path, "r+") as file:
+        samples = file["data"][...]
+        samples[(...,) if everywhere else (0, 100, 1, 2, 3)] = value
+        file["data"][...] = samples
+    return path
+
+
+@pytest.mark.parametrize("everywhere", [False, True])
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_a_picture_of_numbers_that_are_none_is_refused(tmp_path: Path, value: float, everywhere: bool) -> None:
+    """One such sample makes every sum one; the message says what is wrong and which command tells where."""
+    path = spoilt(tmp_path / "a.hdf5", value, everywhere)
+    with pytest.raises(FileError, match=r"a\.hdf5: data holds numbers that are not finite; see `nlosrender info"):
+        plot_capture(path, tmp_path / "a.png")
+    assert not (tmp_path / "a.png").exists()
+
+
+def test_a_picture_of_negative_numbers_is_drawn(tmp_path: Path) -> None:
+    """Measured captures dip below zero, dark ones with their background taken off everywhere."""
+    assert plot_capture(spoilt(tmp_path / "a.hdf5", -1.0, everywhere=True), tmp_path / "a.png").exists()
+
+
+@pytest.mark.filterwarnings("ignore:overflow", "ignore:invalid value")
+def test_a_volume_that_overflows_is_refused(tmp_path: Path) -> None:
+    """Sums of samples at the end of float32 are infinite: no volume, and no picture of one."""
+    path = spoilt(tmp_path / "a.hdf5", 3e38, everywhere=True)
+    with pytest.raises(FileError, match="so large that the volume is not finite"):
+        reconstruct_capture(path, ReconstructionSettings(voxels=8))

@@ -15,7 +15,7 @@ from nlosrender.analysis.reconstruction.pulse import DEFAULT_CYCLES, Pulse, defa
 from nlosrender.analysis.reconstruction.threads import Progress
 from nlosrender.analysis.reconstruction.voxel_grid import VoxelGrid, expected_box, voxel_grid
 from nlosrender.config.fields import LONGEST
-from nlosrender.errors import OptionError
+from nlosrender.errors import FileError, OptionError
 from nlosrender.files.layout import Float64
 from nlosrender.files.reader import open_capture
 from nlosrender.files.scan import Float32, chosen_bounces, read_scan
@@ -156,6 +156,8 @@ def reconstruct_capture(
             width = max(wavelength * FILTER_WAVELENGTHS, grid.voxel_size * FILTER_VOXELS)
             volume = laplacian_filtered(backproject(capture, scan, grid, indices, progress), grid.voxel_size, width)
         header = capture.header
+    if not np.isfinite(volume).all():
+        raise FileError(f"{path}: data holds numbers so large that the volume is not finite; scale them down")
     if not volume.any():
         say("no light of this capture comes from the volume: look elsewhere (--volume-center, --volume-size)")
     return Reconstruction(
