@@ -12,8 +12,6 @@ from reference.convert import load_task
 from nlosrender.config.load import load_config
 from nlosrender.pipeline import render_capture
 
-SURE = 4.0  # standard deviations of the reference's own noise
-
 
 @dataclass(frozen=True, eq=False)
 class Verdict:
@@ -27,6 +25,7 @@ class Verdict:
     noise: float  # relative L2 error of the reference, taken out of ``true``
     energy: tuple[float, ...]  # of the product over the reference's, per bounce from 2; NaN without light
     energy_noise: tuple[float, ...]
+    energy_sigmas: tuple[float, ...]  # difference of the energies in standard errors of both; NaN: not known
     seconds: float
     warnings: tuple[str, ...]
 
@@ -41,6 +40,11 @@ class Verdict:
         slack = self.noise / 2  # of the difference of squares that ``true`` is
         return self.stated <= 2 * (self.true + slack) and self.true - slack <= 2 * self.stated
 
+    @property
+    def worst_energy(self) -> float:
+        """Largest difference of a bounce's energy in standard errors; 0 where none is known."""
+        return max((z for z in self.energy_sigmas if not np.isnan(z)), default=0.0)
+
     def __str__(self) -> str:
         ratios = " ".join(
             "-" if np.isnan(r) else f"{r:.3f}+-{s:.3f}" for r, s in zip(self.energy, self.energy_noise, strict=True)
@@ -48,7 +52,8 @@ class Verdict:
         verdict = "unknown" if self.is_unknown else "ok" if self.is_within_two else "OFF"
         return (
             f"{verdict:8}{self.name:44} {self.engine:15} asked {self.asked:.3f} stated {self.stated:.4f} "
-            f"true {self.true:.4f} (ref {self.noise:.4f}) energy {ratios} {self.seconds:.0f}s"
+            f"true {self.true:.4f} (ref {self.noise:.4f}) energy {ratios} ({self.worst_energy:.1f} sigma)"
+            f" {self.seconds:.0f}s"
         )
 
 
@@ -73,6 +78,11 @@ def judge(path: Path, samples: int, output: Path, overrides: tuple[str, ...] = (
     with np.errstate(divide="ignore", invalid="ignore"):
         ratio = np.where(energy > 0, data[:slots].sum((1, 2)) / energy, np.nan)
         spread = np.where(energy > 0, sigma / energy, np.nan)
+    known = [report.energy_error_per_bounce.get(str(2 + slot)) for slot in range(slots)]
+    own = np.array([np.nan if e is None else e for e in known])
+    with np.errstate(divide="ignore", invalid="ignore"):
+        # float32 samples: 1e-6 of the sum
+        sigmas = np.abs(data[:slots].sum((1, 2)) - energy) / np.sqrt(own**2 + sigma**2 + (1e-6 * energy) ** 2)
     stated = report.error_estimate
     return Verdict(
         name=path.parent.name + "/" + path.stem,
@@ -83,6 +93,7 @@ def judge(path: Path, samples: int, output: Path, overrides: tuple[str, ...] = (
         noise=float(np.sqrt(variance.sum() / square)),
         energy=tuple(ratio.tolist()),
         energy_noise=tuple(spread.tolist()),
+        energy_sigmas=tuple(sigmas.tolist()),
         seconds=sum(report.seconds.values()) if hasattr(report.seconds, "values") else float("nan"),
         warnings=report.warnings,
     )

@@ -42,6 +42,7 @@ def test_no_render_is_wrong_without_a_warning(seed):
     else:
         # errors are estimated from few replicas and points; a target that was missed is a warning
         assert found.true <= 3 * found.stated + found.noise / 2, found
+        assert found.worst_energy <= 6, found  # standard errors of few replicas; one in 1e5 of normal ones is above 4.4
 
 
 def test_stated_errors_are_within_two_of_the_truth():
