@@ -31,7 +31,7 @@ def plate(center=(0.1, 0.05, 0.8), normal=(0.1, 0.2, -1.0), size=(0.8, 0.6), bsd
     return posed | {"bsdf": bsdf or {"type": "diffuse", "reflectance": 1.0}}
 
 
-def third_bounce(task, center, x, y, normal, keep=lambda u, v: np.ones_like(u), n=300):
+def third_bounce(task, center, x, y, normal, keep=lambda u, v: np.ones_like(u), n=200):
     """Midpoint rule for the third bounce of a white parallelogram centre +- x +- y: (pair, bin) [J m^-2 sr^-1]."""
     u, v = np.meshgrid(*[(2 * np.arange(n) + 1) / n - 1] * 2)
     points = center + u[..., None] * x + v[..., None] * y
@@ -63,8 +63,8 @@ def test_a_white_plate_is_the_integral_over_its_area():
     x, y = p[3:6] / 2, (p[6:9] - p[3:6]) / 2
     normal = np.cross(x, y) / np.linalg.norm(np.cross(x, y))
     expected = third_bounce(task, p[:3] + x + y, x, y, normal)
-    # bins cut the midpoint rule's cells: 90,000 of them err by about 1e-3 of the largest bin
-    assert_same(task.render(20_000, replicas=16), expected, floor=2e-3)
+    # bins cut the midpoint rule's cells: 40,000 of them err by about 1e-3 of the largest bin
+    assert_same(task.render(20_000, replicas=16), expected, floor=3e-3)
 
 
 @pytest.mark.parametrize("gap", [1e-3, 1e-5, 1e-7])
@@ -81,7 +81,7 @@ def test_what_a_black_sheet_covers_is_dark_however_small_the_gap(gap):
         task, np.array([0, 0, 1.0]), np.array([0.3, 0, 0]), np.array([0, 0.3, 0]), np.array([0, 0, -1.0]), uncovered
     )
     # a gap of 1 mm shades a rim of at most 1.5 mm around the 1.2 m long edge, seen from up to 60 degrees: 1 %
-    assert_same(task.render(20_000, replicas=16), expected, floor=2e-3 + 10 * gap)
+    assert_same(task.render(20_000, replicas=16), expected, floor=3e-3 + 10 * gap)
 
 
 def test_surfaces_in_one_place_count_once():
@@ -185,7 +185,7 @@ def test_glass_makes_a_pool_look_shallow():
     transmitted = 1 - ((n - 1) / (n + 1)) ** 2
     # the patch is matt in glass: of its radiance 1 / n^2 gets into air
     expected = transmitted**2 / n**2 / (air + depth / n) ** 4 / np.pi**3 * edge**2
-    result = task.render(2_000_000, replicas=16)
+    result = task.render(1_000_000, replicas=16)
     arrival = int(2 * (air + n * depth) / 0.2)  # 2.1 m: the middle of a bin
     found, sigma = result.mean[3, 0, arrival], np.sqrt(result.variance[3, 0, arrival])
     assert abs(found - expected) <= SIGMAS * sigma + 1e-3 * expected  # cosines of up to (edge / depth)^2 = 4e-3 / 6 off
