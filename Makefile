@@ -29,7 +29,7 @@ $(VENV)/.dev: $(VENV)/.installed
 
 render: install ## Render configs/z-letter.yaml to out/: an HDF5 capture and a picture of it.
 	@mkdir -p out
-	$(BIN)/nlosrender render configs/z-letter.yaml -o out/z-letter.hdf5
+	$(BIN)/nlosrender render configs/z-letter.yaml -o out/z-letter.hdf5 --overwrite
 	@echo "picture: $$($(BIN)/nlosrender plot out/z-letter.hdf5)"
 
 test: $(VENV)/.dev ## Run the default test suite.

@@ -1,22 +1,22 @@
 """The bytes of an unfinished capture's samples: read back, and held against the checksums of the journal.
 
 Chunks have a checksum each. Everything else in the file, the header and HDF5's tables, has one checksum that is taken
-when the file is closed: together they cover every byte.
+when the file is closed: together they cover every byte. ISA-L computes the same CRC-32 as zlib, 8 times as fast.
 """
 
 from __future__ import annotations
 
 import os
-import zlib
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
+from isal import isal_zlib
 
 from nlosrender.files.unit_log import Closing, StoredChunk
 
-READ_BYTES = 2**20
+READ_BYTES = 2**20  # of what is no chunk, at a time
 
 
 class StoredBytes:
@@ -37,7 +37,7 @@ class StoredBytes:
         if chunk.offset < 0 or not 0 <= chunk.length <= self.size - chunk.offset:
             return None
         content = os.pread(self._descriptor, chunk.length, chunk.offset)
-        return content if zlib.crc32(content) == chunk.checksum else None
+        return content if isal_zlib.crc32(content) == chunk.checksum else None
 
     def has(self, chunks: Iterable[StoredChunk]) -> bool:
         """Return whether all of these chunks are as they were written.
@@ -61,7 +61,7 @@ class StoredBytes:
         for start, stop in self._gaps(chunks):
             for position in range(start, stop, READ_BYTES):
                 content = os.pread(self._descriptor, min(READ_BYTES, stop - position), position)
-                checksum = zlib.crc32(content, checksum)
+                checksum = isal_zlib.crc32(content, checksum)
         return Closing(self.size, checksum)
 
     def _gaps(self, chunks: Iterable[StoredChunk]) -> Iterator[tuple[int, int]]:
