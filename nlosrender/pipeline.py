@@ -53,7 +53,7 @@ if TYPE_CHECKING:
     from nlosrender.scene.build import BuiltScene
     from nlosrender.scene.view import BuiltView
 
-MISSED_BY = 1.1  # times the target: the estimate has an error of its own
+MISSED_BY = 1.25  # times the target: the estimate has an error of its own
 
 
 def render_capture(

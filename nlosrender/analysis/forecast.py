@@ -43,7 +43,10 @@ class Forecast:
     scene_bytes: int  # that the triangles take, about
     output: Path
     file: FileSize
-    seconds_estimate: float | None  # from scene to file, kernels compiled; None: the pilot saw nothing but noise
+    seconds_estimate: float | None  # of the command, scene to file, kernels compiled; None: only noise was seen
+    seconds_rendering: float | None  # of them, rendering and settling the target error
+    units: int  # that are written one by one
+    seconds_per_unit: float | None  # rendering
     estimate_basis: str
     warnings: tuple[str, ...]
     meshes: tuple[MeshReport, ...] = ()  # what was read of mesh files
@@ -111,6 +114,9 @@ def forecast_render(
         output=Path(config.output.path),
         file=size,
         seconds_estimate=seconds,
+        seconds_rendering=rendering.seconds,
+        units=len(plan.units),
+        seconds_per_unit=None if rendering.seconds is None else rendering.seconds / len(plan.units),
         estimate_basis=rendering.basis,
         warnings=(*warnings, *duration_warnings(config, seconds)),
         meshes=engine.built.meshes,

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from nlosrender.analysis.forecast import Forecast
 
 NOTABLE_BYTES = 50e6  # of a scene's triangles
+KEEP_SECONDS = 30.0  # units that take longer are kept on the way, see ``rendering.unit_in_flight``
 
 
 def register(app: typer.Typer) -> None:
@@ -89,7 +90,21 @@ def _lines(forecast: Forecast) -> Iterator[str]:
     if forecast.seconds_estimate is None:
         yield f"takes    a time that cannot be told ({forecast.estimate_basis})"
     else:
-        yield f"takes    about {readable_duration(forecast.seconds_estimate)} ({forecast.estimate_basis})"
+        yield (
+            f"takes    about {readable_duration(forecast.seconds_estimate)} for the whole command, of which rendering "
+            f"{readable_duration(forecast.seconds_rendering or 0.0)} ({forecast.estimate_basis})"
+        )
+        yield _units(forecast)
+
+
+def _units(forecast: Forecast) -> str:
+    seconds = forecast.seconds_per_unit or 0.0
+    count = "1 unit" if forecast.units == 1 else f"{forecast.units} units"
+    if seconds < KEEP_SECONDS:
+        kept = "SIGTERM ends the render with the one in flight, or seconds later; SIGKILL costs that one"
+    else:
+        kept = "SIGTERM ends the render within seconds and keeps the one in flight; SIGKILL costs about a minute"
+    return f"units    {count} of about {readable_duration(seconds)} each: {kept}"
 
 
 def _scan(forecast: Forecast) -> str:

@@ -1,7 +1,7 @@
-"""How long a render will take: a pilot of the engine on part of the capture, extrapolated.
+"""How long a render will take: what the engine settles for the target error, and the speed on part of the capture.
 
-The path engine's error falls as 1 / sqrt(paths), and cost is linear in them; what the virtual lights need for a target
-error they find out themselves.
+Engines find out themselves what a target error takes, by a pilot of the capture's points that ends here after some
+seconds: beyond it the error is taken to fall on as it has. Cost is linear in paths, patches and rounds of walks.
 """
 
 from __future__ import annotations
@@ -17,19 +17,20 @@ from nlosrender.capture.bounces import FIRST_BOUNCE, LINE_OF_SIGHT, THIRD_BOUNCE
 from nlosrender.capture.grids import Capture
 from nlosrender.capture.plan import Batch, Plan, Tile
 from nlosrender.engine.engines import Engine, SamplingEngine
-from nlosrender.engine.histogram import Histogram, relative_l2_error
+from nlosrender.engine.histogram import Histogram
 from nlosrender.engine.memory import n_pairs
-from nlosrender.engine.sampling import DEFAULT_TARGET, FIRST_SAMPLES, Budget
+from nlosrender.engine.passes import Kept, Passes
+from nlosrender.engine.sampling import Budget
 from nlosrender.engine.skipped import makes_walks, traces_paths
 from nlosrender.engine.virtual_lights.engine import VirtualLightEngine
 from nlosrender.engine.virtual_lights.third_bounce import FIRST_COARSENESS, REFINEMENT
 
-PILOT_SECONDS = 0.5
-PILOT_BYTES = 128e6  # of histograms: a forecast must not take the memory of the render
+PILOT_SECONDS = 1.0
+SETTLING_SECONDS = 5.0  # of the pilot that says how many paths a target error takes
+PILOT_BYTES = 512e6  # of histograms: a forecast must not take the memory of the render
 PILOT_DEPOSITS = 5e8  # of the gather, patches times bins they cover: a fraction of a second
 MOST_PILOTS = 20.0  # pilots' worth of deposits for one sensor point above which no pilot is run
 LAUNCH_OVERHEAD = 0.01  # s per batch at most that does not grow with the batch
-SECOND_LOOK = 1.1  # the engines look at the error now and then only, and overshoot by so much
 
 
 @dataclass(frozen=True)
@@ -58,7 +59,7 @@ def estimate_render_time(engine: Engine, plan: Plan, budget: Budget, lanes: int)
     Returns
     -------
     TimeEstimate
-        Rendering alone: no start, no compilation, no writing.
+        Rendering alone, and what it takes to settle the target error: no start, no compilation, no writing.
     """
     limit = budget.time_limit_s
     goes_on = traces_paths(engine) or makes_walks(engine)  # as long as there is time
@@ -67,18 +68,21 @@ def estimate_render_time(engine: Engine, plan: Plan, budget: Budget, lanes: int)
     pilot = pilot_batch(engine, plan)
     if isinstance(engine, VirtualLightEngine) and _deposits_per_sensor(engine, pilot) > MOST_PILOTS * PILOT_DEPOSITS:
         return TimeEstimate(limit, "no pilot: the bins are so fine that the gather of one sensor point takes too long")
-    seconds, known_squares, lit_shares = 0.0, 0.0, None
+    begun = time.perf_counter()
+    free = budget if isinstance(engine, VirtualLightEngine) else replace(budget, time_limit_s=None)
+    settled = engine.settle(free, seconds=SETTLING_SECONDS)
+    seconds, lit_shares = time.perf_counter() - begun, None
     parts = []
     paths = engine.paths if isinstance(engine, VirtualLightEngine) else engine
     if isinstance(engine, VirtualLightEngine):
-        gather, known_squares = _light_seconds(engine, plan, pilot, budget)
-        seconds += gather
+        seconds += _light_seconds(engine, plan, pilot, settled)
         parts.append("patches and walks settled")
     if traces_paths(engine):
-        traced, rays = _path_seconds(paths, plan, pilot, budget, lanes, known_squares)
+        traced, rays = _path_seconds(paths, plan, pilot, settled, lanes)
         lit_shares = _lit_shares(rays, engine.options.bounces)
-        parts.append("error ~ 1 / sqrt(paths)" if budget.spp is None else "time ~ paths")
-        seconds = math.inf if traced is None else seconds + traced
+        cut_short = budget.spp is None and seconds > SETTLING_SECONDS
+        parts.append("error extrapolated" if cut_short else "time ~ paths")
+        seconds += math.inf if traced is None else traced
     points = "pixels" if engine.capture.scan_type == LINE_OF_SIGHT else "sensor points"
     basis = f"pilot of {pilot.sensors.size} of {engine.capture.n_sensors} {points}, {' and '.join(parts)}"
     if limit is not None and seconds >= limit:
@@ -124,24 +128,22 @@ def _middle(tile: Tile, most: int) -> Tile:
 
 
 def _path_seconds(
-    paths: SamplingEngine, plan: Plan, pilot: Batch, budget: Budget, lanes: int, known_squares: float
+    paths: SamplingEngine, plan: Plan, pilot: Batch, settled: Budget, lanes: int
 ) -> tuple[float | None, Histogram]:
-    """Return the seconds of path tracing, None when the pilot is nothing but noise, and what the pilot saw."""
+    """Return the seconds of path tracing, None when the settled paths are not known, and what the pilot saw."""
     paths.render(pilot, Budget(spp=1))  # compiles
     begun = time.perf_counter()
     first = paths.render(pilot, Budget(spp=1))
     overhead = time.perf_counter() - begun
-    second = paths.render(pilot, Budget(time_limit_s=PILOT_SECONDS))
+    launches = _Launches()
+    second = paths.render(pilot, Budget(time_limit_s=PILOT_SECONDS), Passes(look=launches))
     seconds = time.perf_counter() - begun - overhead
     per_path = max(seconds - overhead, 1e-6) / max(second.samples - first.samples, 1) / pilot.sensors.size
-    if budget.spp is not None:
-        needed = float(math.ceil(budget.spp / plan.replicas) * plan.replicas)
-    else:
-        error = _error(second, known_squares * paths.scale**2)
-        if math.isinf(error):
-            return None, second
-        needed = second.samples * (error / (budget.target_error or DEFAULT_TARGET)) ** 2 * SECOND_LOOK
-        needed = max(needed, FIRST_SAMPLES * plan.replicas)
+    if launches.seconds_per_sample is not None:
+        per_path = launches.seconds_per_sample / plan.replicas / pilot.sensors.size
+    if settled.spp is None:
+        return None, second
+    needed = float(math.ceil(settled.spp / plan.replicas) * plan.replicas)
     largest = max(batch.sensors.size for batch in plan.batches)
     # A pilot of a few sensor points leaves processors idle that the render will use; a quarter of the lanes fills
     # their vector units, the rest only evens out the load.
@@ -150,6 +152,26 @@ def _path_seconds(
     growing = max(overhead - LAUNCH_OVERHEAD, 0.0) * _all_pairs(paths.capture, plan) / n_pairs(paths.capture, pilot)
     fixed = min(overhead, LAUNCH_OVERHEAD) * len(plan.batches)
     return needed * points * per_path * idle + growing + fixed, second
+
+
+class _Launches:
+    """Times the launches of a pilot; the first ones, of few paths, take longer for a path than those of a render."""
+
+    def __init__(self) -> None:
+        self._marks: list[tuple[float, int]] = []  # when, and samples per lane so far
+
+    def __call__(self, take: Callable[[], Kept]) -> None:
+        (snapshot,) = take().values()
+        self._marks.append((time.perf_counter(), snapshot.numbers["done"]))
+
+    @property
+    def seconds_per_sample(self) -> float | None:
+        """Of a lane, in the second half of the samples; None: there were too few launches."""
+        if len(self._marks) < 4:
+            return None
+        end, last = self._marks[-1]
+        begin, first = next(mark for mark in self._marks if mark[1] >= last / 3 or mark is self._marks[-2])
+        return (end - begin) / max(last - first, 1)
 
 
 def _sensor_visits(capture: Capture, plan: Plan, pilot: Batch) -> float:
@@ -172,15 +194,12 @@ def _lit_shares(pilot: Histogram, bounces: BounceAxis) -> tuple[float | None, ..
     return tuple(None if slot == third else share for slot, share in enumerate(shares))
 
 
-def _light_seconds(engine: VirtualLightEngine, plan: Plan, pilot: Batch, budget: Budget) -> tuple[float, float]:
-    """Return the seconds of settling, the gather and the walks, and the pilot's sum of squares of the third bounce."""
-    begun = time.perf_counter()
-    settled = engine.settle_lights(budget)
-    settling = time.perf_counter() - begun
+def _light_seconds(engine: VirtualLightEngine, plan: Plan, pilot: Batch, settled: Budget) -> float:
+    """Return the seconds of the gather and the walks."""
     part = _middle(pilot.sensors, max(1, pilot.sensors.size // 4))
     quarter = Batch(part, part if engine.capture.scan_type == "confocal" else pilot.lasers)
     fineness = settled.fineness or FIRST_COARSENESS
-    third = engine.third.gather(pilot, fineness)
+    engine.third.gather(pilot, fineness)  # compiles
     if traces_paths(engine):
         seconds = _extrapolated(engine, plan, pilot, quarter, lambda batch: engine.third.pair(batch, fineness))
     else:  # all that a render does, with one round of walks; the other rounds add up
@@ -195,7 +214,7 @@ def _light_seconds(engine: VirtualLightEngine, plan: Plan, pilot: Batch, budget:
             dr.sync_thread()
 
         seconds += (rounds - 1) * _extrapolated(engine, plan, pilot, quarter, walk)
-    return settling + seconds, third.squares
+    return seconds
 
 
 def _extrapolated(
@@ -213,10 +232,6 @@ def _timed(work: Callable[[Batch], object], batch: Batch) -> float:
     begun = time.perf_counter()
     work(batch)
     return time.perf_counter() - begun
-
-
-def _error(histogram: Histogram, known_squares: float = 0.0) -> float:
-    return relative_l2_error(float(histogram.variance.sum()), float((histogram.mean**2).sum()) + known_squares)
 
 
 def _all_pairs(capture: Capture, plan: Plan) -> int:

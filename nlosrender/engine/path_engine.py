@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -35,6 +36,7 @@ from nlosrender.engine.path_integrator import load_path_integrator
 from nlosrender.engine.pilot import Pilot, pilot_of
 from nlosrender.engine.plain_surfaces import only_normals_matter
 from nlosrender.engine.sampling import (
+    FIRST_SAMPLES,
     Budget,
     Schedule,
     accumulate,
@@ -198,7 +200,7 @@ class PathEngine:
             raise RenderError("the path engine produced a value that is not finite; please report the configuration")
         return Histogram(mean[..., :-1], variance[..., :-1], mean[..., -1], per_lane * shape.replicas, contrasts)
 
-    def settle(self, budget: Budget, known_squares: float = 0.0) -> Budget:
+    def settle(self, budget: Budget, known_squares: float = 0.0, seconds: float = math.inf) -> Budget:
         """Turn a target error into samples for the whole capture, found by a pilot on a few of its points.
 
         The number does not depend on how the capture is cut. Budgets with ``spp`` or a time limit stay as they are.
@@ -209,6 +211,8 @@ class PathEngine:
             What is asked for.
         known_squares
             As for ``render``, over the pilot's points.
+        seconds
+            As for ``settled_by_pilot``.
         """
         if budget.is_settled:
             return budget
@@ -220,10 +224,12 @@ class PathEngine:
         )
         transport = self._of_paths(pilot, shape, self._further_every(budget))
 
-        def look(schedule: Schedule) -> int:
-            return self._accumulate(pilot, shape, transport, schedule, Passes())[2]
+        def look(schedule: Schedule, passes: Passes) -> None:
+            self._accumulate(pilot, shape, transport, schedule, passes)
 
-        return settled_by_pilot(budget, shape.replicas, look, known_squares + self.second_squares(pilot))
+        known_squares += self.second_squares(pilot)
+        least = FIRST_SAMPLES * self.options.replicas
+        return settled_by_pilot(budget, shape.replicas, look, known_squares, seconds, least)
 
     @property
     def n_slots(self) -> int:

@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -29,6 +30,8 @@ DEFAULT_TARGET = 0.01  # where neither an error nor samples are asked for
 SETTLED_SHARE = 0.9  # of the target error: the pilot's estimate has an error of its own
 PILOT_ERROR = 1.5  # times the goal: when a pilot has seen enough. Low-discrepancy numbers beat the 1 / sqrt(N) beyond
 PILOT_LANES = 512
+MOST_QUICKLY = 16.0  # times the samples: how far errors are trusted to fall faster than as 1 / sqrt(samples)
+MOST_POWER = 0.8  # of the samples that errors fall with, where low-discrepancy numbers serve best
 
 Launch = Callable[[DeviceHistogram, LaneRandomness, int], LaneRandomness]
 
@@ -151,8 +154,17 @@ def pilot_replicas(replicas: int, n_sensors: int) -> int:
     return max(replicas, PILOT_LANES // n_sensors // 2 * 2)
 
 
+class _PilotEndedError(Exception):
+    """The time for a pilot is over."""
+
+
 def settled_by_pilot(
-    budget: Budget, replicas: int, look: Callable[[Schedule], int], known_squares: float = 0.0
+    budget: Budget,
+    replicas: int,
+    look: Callable[[Schedule, Passes], object],
+    known_squares: float = 0.0,
+    seconds: float = math.inf,
+    least: int = 1,
 ) -> Budget:
     """Return a budget of samples that meets a target error, found by a pilot.
 
@@ -163,15 +175,31 @@ def settled_by_pilot(
     replicas
         Of the pilot.
     look
-        Runs the pilot with a schedule and returns the samples per lane it took.
+        Runs the pilot with a schedule.
     known_squares
         As for ``Schedule``.
+    seconds
+        After which the pilot ends: what it has seen is extrapolated, and ``spp`` is None where that is nothing but
+        noise.
+    least
+        Samples: a pilot's lanes have ``FIRST_SAMPLES`` each at least, and fewer per lane err more than by the law.
     """
     goal = SETTLED_SHARE * (budget.target_error or DEFAULT_TARGET)
     schedule = Schedule(Budget(target_error=PILOT_ERROR * goal), replicas, known_squares)
-    per_lane = look(schedule)
-    error = schedule.errors[-1][1]
-    return replace(budget, spp=max(1, math.ceil(per_lane * replicas * (error / goal) ** 2)))
+    begun = time.perf_counter()
+
+    def end_in_time(take: object) -> None:
+        if time.perf_counter() - begun > seconds:
+            raise _PilotEndedError
+
+    with suppress(_PilotEndedError):
+        look(schedule, Passes(look=end_in_time))
+    per_lane, error = schedule.errors[-1]
+    if math.isinf(error):
+        return budget
+    if error > PILOT_ERROR * goal:  # it ended before it had seen enough
+        per_lane, error = schedule.samples_at(PILOT_ERROR * goal), PILOT_ERROR * goal
+    return replace(budget, spp=max(least, math.ceil(per_lane * replicas * (error / goal) ** 2)))
 
 
 class Schedule:
@@ -239,6 +267,17 @@ class Schedule:
         target = self.budget.target_error or error
         needed = done * (error / target) ** 2 if target > 0 else done
         self._next_look = int(min(max(needed * 1.05, done * 1.25), done * 4)) + 1
+
+    def samples_at(self, error: float) -> int:
+        """Return the samples per lane for an error below the last one: at first it falls as between the last looks."""
+        count, seen = self.errors[-1]
+        earlier = [(n, e) for n, e in self.errors[:-1] if n <= count / 2 and seen < e < math.inf]
+        power = 0.5
+        if earlier:
+            n, e = earlier[-1]
+            power = min(max(math.log(e / seen) / math.log(count / n), 0.5), MOST_POWER)
+        quickly = min((seen / error) ** (1 / power), MOST_QUICKLY)
+        return math.ceil(count * quickly * (seen / error / quickly**power) ** 2)
 
     def fraction(self, done: int, seconds: float) -> float:
         """Return the share of the work that is done, estimated, in [0, 1]."""

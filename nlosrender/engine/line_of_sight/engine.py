@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import drjit as dr
@@ -23,6 +24,7 @@ from nlosrender.engine.passes import Passes
 from nlosrender.engine.path_engine import PathOptions
 from nlosrender.engine.pilot import Pilot, pilot_of
 from nlosrender.engine.sampling import (
+    FIRST_SAMPLES,
     Budget,
     Sampled,
     Schedule,
@@ -116,12 +118,12 @@ class LineOfSightEngine:
             mean[..., :-1], variance[..., :-1], mean[..., -1], sampled.per_lane * shape.replicas, sampled.contrasts
         )
 
-    def settle(self, budget: Budget, known_squares: float = 0.0) -> Budget:
+    def settle(self, budget: Budget, known_squares: float = 0.0, seconds: float = math.inf) -> Budget:
         """Turn a target error into samples for the whole capture, found by a pilot on a few of its pixels.
 
         Parameters
         ----------
-        budget, known_squares
+        budget, known_squares, seconds
             As for the path engine.
         """
         if budget.is_settled:
@@ -130,10 +132,11 @@ class LineOfSightEngine:
         replicas = pilot_replicas(self.options.replicas, pilot.sensors.size)
         shape = replace(self.shape(pilot, self.n_slots), replicas=replicas)
 
-        def look(schedule: Schedule) -> int:
-            return self._accumulate(pilot, shape, schedule, Passes()).per_lane
+        def look(schedule: Schedule, passes: Passes) -> None:
+            self._accumulate(pilot, shape, schedule, passes)
 
-        return settled_by_pilot(budget, replicas, look, known_squares)
+        least = FIRST_SAMPLES * self.options.replicas
+        return settled_by_pilot(budget, replicas, look, known_squares, seconds, least)
 
     def _accumulate(self, batch: Batch | Pilot, shape: HistogramShape, schedule: Schedule, passes: Passes) -> Sampled:
         pixels = np.array(batch.sensors.flat_indices(self.capture.sensor_grid.nx), dtype=np.uint32)

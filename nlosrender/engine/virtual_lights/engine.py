@@ -120,10 +120,11 @@ class VirtualLightEngine:
         """Seconds spent compiling so far; the gather's own kernels count as rendering."""
         return self.paths.compile_seconds
 
-    def settle(self, budget: Budget) -> Budget:
+    def settle(self, budget: Budget, seconds: float = math.inf) -> Budget:
         """Turn a target error into settings for the whole capture, tried on a few of its points.
 
         The settings do not depend on how the capture is cut. With a time limit only the patches are settled.
+        A pilot of paths ends after ``seconds``, as for ``settled_by_pilot``.
         """
         if budget.fineness is not None:
             return budget
@@ -132,8 +133,10 @@ class VirtualLightEngine:
             if self.has_further_bounces and self.further is None:
                 squares = self.third.gather(pilot_of(self.capture), settled.fineness or FIRST_COARSENESS).squares
                 goal = REST_OF_MANY * (budget.target_error or DEFAULT_TARGET)
-                paths = self.paths.settle(replace(budget, target_error=goal), known_squares=squares)
+                paths = self.paths.settle(replace(budget, target_error=goal), squares, seconds)
                 settled = replace(settled, spp=paths.spp)
+            if math.isfinite(seconds):
+                return settled
             self._settled[budget] = settled
         return self._settled[budget]
 
