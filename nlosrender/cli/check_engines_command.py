@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from nlosrender.cli.json_output import OUTPUT
+
 if TYPE_CHECKING:
     from nlosrender.analysis.engine_check import EngineCheck, PairCheck
 
@@ -53,7 +55,14 @@ def check_engines(
     from nlosrender import pipeline
     from nlosrender.config.load import load_config
     from nlosrender.config.places import with_places
-    from nlosrender.errors import ComparisonError, ConfigError, RenderError
+    from nlosrender.errors import (
+        EXIT_COMPARISON_EXCEEDED,
+        EXIT_FAILURE,
+        EXIT_OK,
+        ComparisonError,
+        ConfigError,
+        RenderError,
+    )
 
     changes = list(overrides or [])
     loaded = load_config(config, changes)
@@ -68,10 +77,10 @@ def check_engines(
         )
     except ConfigError as error:
         raise with_places(error, config, changes) from error
+    apart = [pair for pair in check.pairs if not pair.agrees]
     if as_json:
-        import json
-
-        typer.echo(json.dumps(check.as_json(), allow_nan=False))
+        failed = EXIT_FAILURE if not check.pairs else EXIT_COMPARISON_EXCEEDED if apart else EXIT_OK
+        OUTPUT.print(check.as_json(), failed)
     else:
         for line in _lines(check):
             typer.echo(line)
@@ -79,7 +88,6 @@ def check_engines(
         typer.echo(f"warning: no technique samples {paths}; agreement says nothing about this light", err=True)
     if not check.pairs:
         raise RenderError(f"{config}: fewer than two techniques can render this scene; there is nothing to compare.")
-    apart = [pair for pair in check.pairs if not pair.agrees]
     if apart:
         raise ComparisonError("\n".join(f"{config}: {' and '.join(p.techniques)} differ: {p.worst}" for p in apart))
 

@@ -136,3 +136,10 @@ def test_numbers_that_json_does_not_know_are_null(capsys: pytest.CaptureFixture[
     """An estimate that knows nothing is null, wherever it stands: NaN would be refused by most readers."""
     OUTPUT.print({"a": float("nan"), "b": [float("inf"), 1.0], "c": {"d": (float("-inf"),)}})
     assert json.loads(capsys.readouterr().out) == {"a": None, "b": [None, 1.0], "c": {"d": [None]}}
+
+
+def test_commands_print_json_in_one_place() -> None:
+    """Printed by hand the object would be followed by a second one when the command fails; a schema is no report."""
+    folder = Path(app.__file__).parent
+    by_hand = [path.name for path in folder.glob("*.py") if "typer.echo(json.dumps(" in path.read_text()]
+    assert set(by_hand) <= {"json_output.py", "config_commands.py"}
