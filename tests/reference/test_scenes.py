@@ -39,7 +39,7 @@ def test_no_render_is_wrong_without_a_warning(seed):
         assert all(not r > 1 + 5 * s + found.asked for r, s in zip(found.energy, found.energy_noise, strict=True)), (
             found
         )
-    else:
+    elif not any("rays tell round surfaces apart" in warning for warning in found.warnings):
         # errors are estimated from few replicas and points; a target that was missed is a warning
         assert found.true <= 3 * found.stated + found.noise / 2, found
         assert found.worst_energy <= 6, found  # standard errors of few replicas; one in 1e5 of normal ones is above 4.4
@@ -48,5 +48,6 @@ def test_no_render_is_wrong_without_a_warning(seed):
 def test_stated_errors_are_within_two_of_the_truth():
     """Of the errors that are stated 95 % are within a factor of 2."""
     stated = [found for seed in scenes.SEEDS if not (found := verdict(seed)).is_unknown]
+    assert len(stated) >= len(scenes.SEEDS) / 2
     off = [str(found) for found in stated if not found.is_within_two]
     assert len(off) <= 0.05 * len(stated), "\n".join(off)
