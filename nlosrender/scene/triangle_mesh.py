@@ -158,9 +158,7 @@ class TriangleMesh:
 
     @staticmethod
     def merged(meshes: Sequence[TriangleMesh]) -> TriangleMesh:
-        """Return one mesh with the faces of all, in order; uvs and normals are kept when every part has them.
-
-        Colours are not kept: nothing that is merged has any.
+        """Return one mesh with the faces of all, in order; uvs, normals, colors are kept when every part has them.
 
         Raises
         ------
@@ -171,14 +169,13 @@ class TriangleMesh:
             raise ValueError("no meshes to merge: need at least one")
         offsets = np.cumsum([0] + [len(mesh.vertices) for mesh in meshes[:-1]])
         faces = [mesh.faces.astype(np.int64) + offset for mesh, offset in zip(meshes, offsets, strict=True)]
-        uvs = [mesh.uvs for mesh in meshes if mesh.uvs is not None]
-        normals = [mesh.normals for mesh in meshes if mesh.normals is not None]
-        return TriangleMesh(
-            np.concatenate([mesh.vertices for mesh in meshes]),
-            np.concatenate(faces),
-            np.concatenate(uvs) if len(uvs) == len(meshes) else None,
-            np.concatenate(normals) if len(normals) == len(meshes) else None,
-        )
+
+        def joined(name: str) -> Float64 | None:
+            rows = [values for mesh in meshes if (values := getattr(mesh, name)) is not None]
+            return np.concatenate(rows) if len(rows) == len(meshes) else None
+
+        vertices = np.concatenate([mesh.vertices for mesh in meshes])
+        return TriangleMesh(vertices, np.concatenate(faces), *(joined(name) for name in ("uvs", "normals", "colors")))
 
     def _cross_products(self) -> Float64:
         a, b, c = (self.vertices[self.faces[:, corner]] for corner in range(3))
