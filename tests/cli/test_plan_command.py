@@ -158,13 +158,17 @@ def test_walks_take_all_the_time_there_is(bounces: str, takes_all: bool) -> None
     assert (plan["seconds_estimate"] >= 1000) == takes_all  # the start counts, too
 
 
-def test_the_impossible_is_told_in_years():
-    """1e-12 takes (1e-2 / 1e-12)^2 = 1e20 times what 1 % does: years, with what to do, and why it is never reached."""
+def test_the_impossible_is_told_in_years(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A target of 1e-12 takes years: said so, with what to do, and why it is never reached."""
+    from nlosrender.engine import forecast
+
+    monkeypatch.setattr(forecast, "SETTLING_SECONDS", 0.1)
     changes = ["--set", "render.engine=path", "--set", "render.target_error=1e-12"]
     result = run("plan", write_config(), *changes)
     line = next(line for line in result.stdout.splitlines() if line.startswith("takes"))
     years = float(re.match(r"takes    about ([\d.e+]+) years for the whole", line)[1])
-    assert 1e8 < years < 1e18  # 1e20 times something between a microsecond and minutes
+    # 1 % takes about a second; errors fall as 1 / paths at the fastest: 1e10 s, 300 years, at least
+    assert years > 100
     assert "ask for a larger render.target_error" in result.stderr
     assert "no render gets there" in result.stderr
 
