@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Iterator, Mapping
 
@@ -18,8 +17,6 @@ from nlosrender.config.hidden_geometry import (
 from nlosrender.config.relay_wall import RectangleWallConfig
 from nlosrender.config.vectors import length
 
-ROUND_GAP = 3e-5  # of a scene's size: concentric balls and tubes closer than that are both lit
-PARALLEL = 1e-6  # rad, between axes
 FLOAT32_ROUNDING = 2.0**-24  # relative, at most
 
 
@@ -31,7 +28,6 @@ def config_warnings(config: Config) -> tuple[str, ...]:
         *config.notes,
         *_dark_scene(config),
         *_behind_the_wall(config),
-        *_round_surfaces_in_one_place(config),
         *_bounces(config),
         *_budget(config),
         *_file(config),
@@ -68,41 +64,6 @@ def _behind_the_wall(config: Config) -> Iterator[str]:
         sphere = _bounding_sphere(item)
         if sphere is not None and wall.height_above(sphere[0]) + sphere[1] <= 0:
             yield f"scene.hidden_geometry.{index} ({item.name}) lies behind the relay wall, where no light gets to."
-
-
-def _round_surfaces_in_one_place(config: Config) -> Iterator[str]:
-    """Yield pairs of round shapes that rays do not tell apart; flat ones are moved apart (``scene/coincident.py``)."""
-    wall = config.scene.wall
-    round_items = [
-        (f"scene.hidden_geometry.{index} ({item.name})", item)
-        for index, item in enumerate(config.scene.hidden_geometry)
-        if isinstance(item, (SphereConfig, CylinderConfig))
-    ]
-    middle = getattr(wall, "center", (0.0, 0.0, 0.0))  # a mesh has none
-    extent = max((side for side in wall.extent if math.isfinite(side)), default=0.0)
-    for (first, a), (second, b) in itertools.combinations(round_items, 2):
-        gap = _gap_of_twins(a, b)
-        told_apart = ROUND_GAP * max(extent, math.dist(middle, b.center))
-        if gap is not None and gap < told_apart:
-            yield (
-                f"{first} and {second} are {gap:.2g} m apart, and rays tell round surfaces apart from "
-                f"{told_apart:.2g} m on: both may be lit, one through the other, and the stated error does not know. "
-                "Leave out the one that is hidden, or move them apart."
-            )
-
-
-def _gap_of_twins(a: SphereConfig | CylinderConfig, b: SphereConfig | CylinderConfig) -> float | None:
-    """Return how far two balls or tubes that shine to the same side are apart where they are farthest [m]."""
-    if isinstance(a, SphereConfig) and isinstance(b, SphereConfig) and a.inside == b.inside:
-        return math.dist(a.center, b.center) + abs(a.radius - b.radius)
-    if isinstance(a, CylinderConfig) and isinstance(b, CylinderConfig) and a.inside == b.inside:
-        axes = [tuple(x / length(item.axis) for x in item.axis) for item in (a, b)]
-        along = sum((p - q) * x for p, q, x in zip(a.center, b.center, axes[0], strict=True))
-        cosine = abs(sum(x * y for x, y in zip(*axes, strict=True)))
-        if math.acos(min(cosine, 1.0)) < PARALLEL and abs(along) < (a.height + b.height) / 2:
-            off = math.sqrt(max(math.dist(a.center, b.center) ** 2 - along**2, 0.0))
-            return off + abs(a.radius - b.radius)
-    return None
 
 
 def _bounding_sphere(item: HiddenItemConfig) -> tuple[tuple[float, float, float], float] | None:

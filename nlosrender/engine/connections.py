@@ -15,8 +15,9 @@ from nlosrender.capture.bounces import FIRST_BOUNCE
 from nlosrender.engine.device_arrays import WallPoints
 from nlosrender.engine.histogram import DeviceHistogram
 from nlosrender.engine.transport import PathSettings, Transport
-from nlosrender.scene.build import BuiltScene, curvature
+from nlosrender.scene.build import BuiltScene
 from nlosrender.scene.pose import Float64
+from nlosrender.scene.round_surfaces import curvature
 
 LEAST_COSINE = 1e-2  # between a ray and a surface's normal
 # Ray offset along the normal, over 1 + the largest coordinate [engine units]. A ray from the wall to a point this far

@@ -14,9 +14,10 @@ from nlosrender.engine.connections import WALL_OFFSET, ray_offset
 from nlosrender.engine.engines import Engine
 from nlosrender.engine.path_engine import PathEngine
 from nlosrender.engine.virtual_lights.engine import RARE, VirtualLightEngine
-from nlosrender.scene.build import BuiltScene, curvature, wall_box
+from nlosrender.scene.build import BuiltScene, wall_box
 from nlosrender.scene.mesh_wall import MeshWall
 from nlosrender.scene.pose import Float64
+from nlosrender.scene.round_surfaces import curvature
 
 NEAREST_KNOWN = 1e-6  # engine units; nearer surfaces that are tilted or round lie some per cent nearer or farther
 NEAREST_TOLD = 2.0  # ray offsets from a curved wall within which light is lost

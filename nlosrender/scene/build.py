@@ -31,11 +31,11 @@ from nlosrender.scene.mesh_surfaces import read_surfaces
 from nlosrender.scene.pictures import upright_bsdf
 from nlosrender.scene.pose import Float64
 from nlosrender.scene.relay_wall import RelayWall
+from nlosrender.scene.round_surfaces import ROUND_PLUGINS, Nested, curvature, nested_surfaces
 from nlosrender.scene.triangle_mesh import TriangleMesh
 
 WALL_ID = "relay_wall"
 MOST_REACH = 1e5  # hidden geometry over the wall's size: float32 then tells points 1 % of the wall apart
-ROUND_PLUGINS = ("Sphere", "Cylinder")
 EXACT_PLUGINS = ("Rectangle", "Disk", *ROUND_PLUGINS)  # intersections in closed form, as those of meshes
 OVERLAP_TOLD = 1e-3  # of an item's area that coincides with other surfaces
 LEAST_EXTENT = 1e-12  # hidden geometry over the wall's size: the squares of areas stay numbers in float32
@@ -150,6 +150,12 @@ def _load_apart(
             shapes.append(_load_mesh(meshes[index], surface, bsdf))
         else:
             shapes.append(_load_shape(shape.description, surface, bsdf, unit))
+    nested = nested_surfaces(shapes)
+    for one in nested:
+        shape = loaded[one.hidden]
+        assert isinstance(shape, ShapeDescription)  # no mesh is round
+        description = _resized(shape.description, one.factor)
+        shapes[one.hidden] = _load_shape(description, surfaces[one.hidden], bsdfs[one.hidden], unit)
     told: dict[int, Overlap] = {}
     for seed in range(PASSES):
         contents: dict[str, object] = {"type": "scene", WALL_ID: wall_shape}
@@ -162,7 +168,26 @@ def _load_apart(
             shapes[index] = _load_mesh(meshes[index], surfaces[index], bsdfs[index])
         if not found:
             break
-    return scene, shapes, tuple(_overlap_warnings(surfaces, told))
+    return scene, shapes, (*_overlap_warnings(surfaces, told), *_nested_warnings(surfaces, nested))
+
+
+def _resized(description: Mapping[str, object], factor: float) -> dict[str, object]:
+    """Return the description of a sphere or cylinder with another radius."""
+    resized = dict(description)
+    if "radius" in resized:
+        return resized | {"radius": float(factor * np.asarray(resized["radius"], dtype=np.float64))}
+    to_world = np.array(resized["to_world"], dtype=np.float64)
+    to_world[:3, : 2 if resized["type"] == "cylinder" else 3] *= factor
+    return resized | {"to_world": to_world}
+
+
+def _nested_warnings(surfaces: Sequence[Surface], nested: Sequence[Nested]) -> Iterator[str]:
+    for one in nested:
+        hidden, other = surfaces[one.hidden].key, surfaces[one.other].key
+        yield (
+            f"{hidden} lies where {other} is, or closer than rays tell apart. It is taken to lie behind it. Leave it "
+            "out, or move one of them if it should be seen."
+        )
 
 
 def _overlap_warnings(surfaces: Sequence[Surface], found: Mapping[int, Overlap]) -> Iterator[str]:
@@ -261,17 +286,6 @@ def _load_shape(description: Mapping[str, object], surface: Surface, bsdf: mi.BS
         raise rejected(surface.key, f"Mitsuba rejects this shape: {first_line(error)}") from error
     check_surface(shape, f"{surface.key}.bsdf")
     return shape
-
-
-def curvature(shape: mi.Shape) -> float:
-    """Return 1 / radius [1 / engine unit] of a sphere or cylinder, 0 for other shapes."""
-    if shape.class_name() == "Sphere":
-        box = shape.bbox()
-        return 2 / float(np.ravel(box.max - box.min).max())
-    if shape.class_name() == "Cylinder":
-        to_world = np.array(mi.traverse(shape)["to_world"].matrix, dtype=np.float64).reshape(4, 4)
-        return 1 / float(np.linalg.norm(to_world[:3, 0]))
-    return 0.0
 
 
 def load_flat_serialized(plugin: Mapping[str, object]) -> mi.Mesh:

@@ -11,8 +11,10 @@ from typing import Any
 import numpy as np
 import pytest
 from quadrature import Setup, rectangle_cells, third_bounce
-from rendering import flat_wall, render
+from rendering import configured, flat_wall, render
 
+from nlosrender import pipeline
+from nlosrender.engine.backend import start_backend
 from nlosrender.scene.triangle_mesh import TriangleMesh
 
 SENSORS = (3, 2)
@@ -88,14 +90,47 @@ def test_both_faces_of_a_sheet_without_thickness_count_once(two_sided: bool, eng
     assert rendered([sheet], engine, folder=tmp_path) == pytest.approx(expected, rel=0.01)
 
 
+BALL = {"type": "sphere", "center": [0, 0, 1], "radius": 0.3}
+TUBE = {"type": "cylinder", "center": [0, 0, 1], "axis": [0.3, 1, 0], "radius": 0.05, "height": 0.6}
+
+
 @pytest.mark.parametrize("engine", ENGINES)
-def test_a_ball_inside_another_is_dark(engine: str) -> None:
-    """0.1 mm below a black surface of the same curvature."""
-    balls = [
-        {"type": "sphere", "center": [0, 0, 1], "radius": radius, "bsdf": {"type": "diffuse", "reflectance": albedo}}
-        for radius, albedo in ((0.3, 1.0), (0.3001, 0.0))
-    ]
-    assert rendered(balls, engine) == 0
+@pytest.mark.parametrize("gap", [1e-4, 1.5e-5, 1e-6, 0.0])
+@pytest.mark.parametrize("item", [BALL, TUBE], ids=["ball", "tube"])
+def test_what_lies_inside_a_black_shell_is_dark(item: dict[str, Any], gap: float, engine: str) -> None:
+    """However thin the space between; the later one is the shell where both have one radius."""
+    white, black = ({"bsdf": {"type": "diffuse", "reflectance": albedo}} for albedo in (1.0, 0.0))
+    # the open ends of a tube show its inside, which is black, too
+    assert rendered([item | white, item | black | {"radius": item["radius"] + gap}], engine) == 0
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+@pytest.mark.parametrize("gap", [1e-4, 1e-6])
+def test_a_black_lining_hides_the_ball_around_it(gap: float, engine: str) -> None:
+    """Seen from within, the smaller of two balls is in front."""
+    white, black = ({"bsdf": {"type": "diffuse", "reflectance": albedo}, "inside": True} for albedo in (1.0, 0.0))
+    around = {"type": "sphere", "center": [0, 0, 0], "radius": 2.0}
+    assert rendered([around | white, around | black | {"radius": 2.0 - gap}], engine) == 0
+
+
+@pytest.mark.parametrize(
+    ("items", "is_said"),
+    [
+        ((BALL, BALL | {"radius": 0.3000001}), True),
+        ((TUBE, TUBE), True),
+        ((BALL, BALL | {"radius": 0.3001}), False),
+        ((BALL, BALL | {"center": [0, 0.001, 1]}), False),
+        ((BALL, BALL | {"inside": True}), False),
+        ((TUBE, TUBE | {"axis": [0.31, 1, 0]}), False),
+        ((TUBE, TUBE | {"center": [0.3, 1, 1]}), False),
+        ((BALL, TUBE), False),
+    ],
+)
+def test_concentric_surfaces_are_said(items: tuple[dict[str, Any], ...], is_said: bool) -> None:
+    """Not those farther apart, beside each other along an axis, or seen from opposite sides."""
+    start_backend("llvm", colored=False, polarized=False)
+    warnings = pipeline.load_scene(configured(flat_wall(*items))).warnings
+    assert any("closer than rays tell apart" in text for text in warnings) == is_said
 
 
 def sheet(n: int, random: np.random.Generator, wave: float) -> TriangleMesh:
@@ -110,8 +145,6 @@ def sheet(n: int, random: np.random.Generator, wave: float) -> TriangleMesh:
 
 def test_nothing_is_moved_where_nothing_coincides(tmp_path: Path) -> None:
     """Neighbours, a plate through them, a sheet 1e-4 m behind, and one with other waves that crosses all."""
-    from nlosrender.engine.backend import start_backend
-
     start_backend("llvm", colored=False, polarized=False)
     import mitsuba as mi
 
@@ -132,8 +165,6 @@ def test_nothing_is_moved_where_nothing_coincides(tmp_path: Path) -> None:
 
 def test_a_sheet_cut_twice_becomes_two_layers() -> None:
     """All of the later one is moved, by one gap, in the order of the triangles or out of it."""
-    from nlosrender.engine.backend import start_backend
-
     start_backend("llvm", colored=False, polarized=False)
     import mitsuba as mi
 

@@ -14,7 +14,15 @@ STAGES = ("config", "scene", "capture", "engine", "sensor", "files", "rendering"
 SHARED = ("units", "errors", "interruption")
 MODULES = sorted(PACKAGE.rglob("*.py"))
 IN_STAGES = [path for path in MODULES if path.relative_to(PACKAGE).parts[0] in STAGES]
-RENDERING_SCENE = ("build.py", "coincident.py", "materials.py", "view.py", "xml_loading.py", "xml_textures.py")
+RENDERING_SCENE = (
+    "build.py",
+    "coincident.py",
+    "materials.py",
+    "round_surfaces.py",
+    "view.py",
+    "xml_loading.py",
+    "xml_textures.py",
+)
 BUILDERS = tuple(PACKAGE / "scene" / name for name in RENDERING_SCENE)
 MUST_NOT_RENDER = [
     path for path in MODULES if path.relative_to(PACKAGE).parts[0] not in ("engine", "bench") and path not in BUILDERS

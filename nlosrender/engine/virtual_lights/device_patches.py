@@ -18,8 +18,9 @@ from nlosrender.engine.space_filling import z_order
 from nlosrender.engine.virtual_lights.clearance import Surface
 from nlosrender.engine.virtual_lights.patches import Patches, split_weights
 from nlosrender.engine.virtual_lights.round_shapes import RoundShape
-from nlosrender.scene.build import ROUND_PLUGINS, BuiltScene
+from nlosrender.scene.build import BuiltScene
 from nlosrender.scene.pose import Float64
+from nlosrender.scene.round_surfaces import ROUND_PLUGINS
 
 # A textured patch is cut into this many squared parts, a random point of each is looked up: 16 of many, 144 of few.
 TEXTURE_SPLITS, FEW_PATCHES = (4, 12), 2**14

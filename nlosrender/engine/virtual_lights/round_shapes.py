@@ -9,8 +9,8 @@ import numpy as np
 
 from nlosrender.engine.virtual_lights.cells import WallDistance
 from nlosrender.engine.virtual_lights.patches import Patches, split_weights
-from nlosrender.scene.build import curvature
 from nlosrender.scene.pose import Float64
+from nlosrender.scene.round_surfaces import RoundSurface
 
 FEWEST_AROUND = 6  # parts of a cylinder's circumference
 EDGE = 1.052  # of the icosahedron in its unit sphere
@@ -28,13 +28,8 @@ class RoundShape:
     @classmethod
     def of(cls, index: int, shape: mi.Shape) -> RoundShape:
         """Return what a Mitsuba sphere or cylinder is."""
-        radius = (-1.0 if shape.has_flipped_normals() else 1.0) / curvature(shape)
-        if shape.class_name() == "Cylinder":
-            to_world = np.array(mi.traverse(shape)["to_world"].matrix, dtype=np.float64).reshape(4, 4)
-            return cls(index, to_world[:3, 3], radius, to_world[:3, 2])
-        box = shape.bbox()
-        low, high = (np.ravel(np.asarray(corner, dtype=np.float64)) for corner in (box.min, box.max))
-        return cls(index, (low + high) / 2, radius, np.zeros(3))
+        surface = RoundSurface.of(shape)
+        return cls(index, surface.centre, (-1 if surface.is_inside else 1) * surface.radius, surface.axis)
 
     @property
     def row(self) -> Float64:

@@ -20,7 +20,8 @@ from nlosrender.engine.virtual_lights.graded_cells import GradedCells, Grading
 from nlosrender.engine.virtual_lights.patches import Patches
 from nlosrender.engine.virtual_lights.regions import regions_of
 from nlosrender.engine.virtual_lights.round_shapes import RoundShape
-from nlosrender.scene.build import ROUND_PLUGINS, WALL_ID, BuiltScene
+from nlosrender.scene.build import WALL_ID, BuiltScene
+from nlosrender.scene.round_surfaces import ROUND_PLUGINS
 
 MAX_PATCHES = 2_000_000  # of one gather; beyond it the path engine is the better choice
 MOST_KEPT = 200_000  # patches of one resolution that are kept for the next call
