@@ -377,11 +377,12 @@ def test_a_cylinder_is_round(scan: str, inside: bool) -> None:
 
 def test_a_time_limit_that_the_gather_uses_up_still_gives_all_bounces() -> None:
     """What is left of the time may be nothing: the further bounces then get their shortest run."""
+    from nlosrender.engine.passes import Passes
     from nlosrender.engine.path_engine import Budget
 
     config = flat_wall(PLATE, BALL) | {"render": {"max_bounces": 5, "engine": "virtual_lights", "time_limit_s": 1e-6}}
     _, _, _, plan, engine = start(config)
     shares: list[float] = []
-    histogram = engine.render(plan.batches[0], Budget(time_limit_s=1e-6), shares.append)
+    histogram = engine.render(plan.batches[0], Budget(time_limit_s=1e-6), Passes(shares.append))
     assert (histogram.mean.sum(axis=(0, 2, 3, 4))[1:] > 0).all()
     assert all(0 <= share <= 1 for share in shares)
