@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import functools
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -25,12 +25,12 @@ from nlosrender.config.document import Config
 from nlosrender.config.load import config_hash, config_to_dict
 from nlosrender.config.warnings import config_warnings
 from nlosrender.engine.backend import Backend, batch_memory, physical_memory, start_backend
-from nlosrender.errors import ConfigError, OptionError, Problem
+from nlosrender.errors import OptionError
 from nlosrender.files.capture_file import CaptureHeader
 from nlosrender.files.chunks import sensor_tile
 from nlosrender.files.identity import capture_identity, files_read, identity_attributes
 from nlosrender.files.kinds import CAPTURE
-from nlosrender.files.part_attributes import MISSED, known_of, part_attributes, summed_attributes
+from nlosrender.files.part_attributes import part_attributes
 from nlosrender.files.partial_capture import PartialCapture
 from nlosrender.files.provenance import provenance_attributes
 from nlosrender.files.replacement import check_writable
@@ -38,6 +38,7 @@ from nlosrender.files.size import disk_warnings
 from nlosrender.rendering.dask_executor import render_on_cluster
 from nlosrender.rendering.dask_worker import Job
 from nlosrender.rendering.local import render_units, resumable
+from nlosrender.rendering.outcome import Outcome, missing_light
 from nlosrender.rendering.report import Progress, RenderReport, Stopwatch, Warn, Warnings, Watch
 from nlosrender.rendering.sharing import ALONE, Sharing
 from nlosrender.scene.hidden_geometry import Surface, hidden_surfaces
@@ -47,13 +48,10 @@ from nlosrender.scene.relay_wall import RelayWall, relay_wall_from_config
 if TYPE_CHECKING:
     from nlosrender.engine.path_engine import Budget
     from nlosrender.engine.unsampled_paths import UnsampledPaths
-    from nlosrender.files.sums import Sums
     from nlosrender.rendering.dask_cluster import Cluster
     from nlosrender.rendering.units import Engine
     from nlosrender.scene.build import BuiltScene
     from nlosrender.scene.view import BuiltView
-
-MISSED_BY = 1.25  # times the target: the estimate has an error of its own
 
 
 def render_capture(
@@ -145,15 +143,9 @@ def render_capture(
                 watch=(lambda standing: watch(replace(standing, error=None))) if unsampled else watch,
             )
             tally = partial.tally
-            bounces = engine.options.bounces
-            missing = tuple(paths.summary for paths in unsampled)
-            zero = () if tally.sums.squares else zero_capture(engine, unsampled, tally.sums, warnings)
-            lowest = min((paths.first_bounce for paths in unsampled), default=None)
-            results = summed_attributes(tally.sums, bounces, stopwatch.report(), missing, zero, lowest)
-            missed = missed_target(config, tally.sums.stated_error(missing))
-            if missed and selection == WHOLE:
-                results[MISSED] = missed
-            warnings.say([missed] if missed else [])
+            outcome = Outcome.of(config.render, engine, unsampled, tally.sums)
+            warnings.say(outcome.warnings)
+            results = outcome.attributes(stopwatch.report(), is_whole=selection == WHOLE)
             if selection != WHOLE:
                 results |= part_attributes(plan.part, plan.tiling, tally)
             partial.publish(results)
@@ -166,57 +158,18 @@ def render_capture(
         units=earlier + len(units),
         resumed_units=earlier,
         samples=tally.sums.samples or 0,
-        error_estimate=tally.sums.stated_error(missing),
-        energy=tally.sums.energy_per_bounce(bounces),
+        error_estimate=outcome.stated_error,
+        energy=tally.sums.energy_per_bounce(outcome.bounces),
         out_of_window=float(tally.sums.outside),
         n_bins=header.n_bins,
         n_triangles=engine.built.n_triangles,
         seconds=stopwatch.report(),
         warnings=tuple(warnings.said),
-        unsampled_paths=missing,
-        zero_because=zero,
-        error_estimate_per_bounce=known_of(tally.sums.errors_per_bounce(bounces), bounces, lowest),
-        energy_error_per_bounce=known_of(tally.sums.energy_errors(bounces), bounces, lowest),
+        unsampled_paths=outcome.missing,
+        zero_because=outcome.zero_because,
+        error_estimate_per_bounce=outcome.known_per_bounce(tally.sums.errors_per_bounce(outcome.bounces)),
+        energy_error_per_bounce=outcome.known_per_bounce(tally.sums.energy_errors(outcome.bounces)),
     )
-
-
-def missing_light(engine: Engine, strict: bool = False) -> tuple[UnsampledPaths, ...]:
-    """Return the paths that carry light and that no technique of the engine samples.
-
-    Raises
-    ------
-    ConfigError
-        ``strict``, and there are any.
-    """
-    from nlosrender.engine.unsampled_paths import unsampled_paths
-
-    found = unsampled_paths(engine)
-    if strict and found:
-        raise ConfigError([Problem("", paths.key, f"--strict: {paths.warning}") for paths in found])
-    return found
-
-
-def zero_capture(
-    engine: Engine, unsampled: Sequence[UnsampledPaths], sums: Sums, warnings: Warnings
-) -> tuple[str, ...]:
-    """Return why a capture is zero everywhere, and warn of it."""
-    from nlosrender.engine.zero_capture import zero_reasons
-
-    reasons = zero_reasons(engine, unsampled, float(sums.outside))
-    warnings.say([f"H is zero everywhere: {'; '.join(reasons)}."])
-    return reasons
-
-
-def missed_target(config: Config, stated: float) -> str | None:
-    """Return a warning where the stated error is above the asked-for one; None where it is not, or not known."""
-    asked = config.render.target_error
-    if asked is None or not stated > MISSED_BY * asked:
-        return None
-    limit = config.render.time_limit_s
-    why = "surfaces and paths cost more than the engine can take, or a pilot of a few points saw less than there is"
-    if limit is not None:
-        why = f"render.time_limit_s is {limit:g}, or {why}"
-    return f"render.target_error: {asked:.3g} was asked for, the error that is stated is {stated:.3g} ({why})."
 
 
 def started_backend(config: Config) -> Backend:

@@ -153,9 +153,9 @@ def _load_apart(
     nested = nested_surfaces(shapes)
     for one in nested:
         shape = loaded[one.hidden]
-        assert isinstance(shape, ShapeDescription)  # no mesh is round
-        description = _resized(shape.description, one.factor)
-        shapes[one.hidden] = _load_shape(description, surfaces[one.hidden], bsdfs[one.hidden], unit)
+        if isinstance(shape, ShapeDescription):  # as all round ones are
+            description = _resized(shape.description, one.factor)
+            shapes[one.hidden] = _load_shape(description, surfaces[one.hidden], bsdfs[one.hidden], unit)
     told: dict[int, Overlap] = {}
     for seed in range(PASSES):
         contents: dict[str, object] = {"type": "scene", WALL_ID: wall_shape}

@@ -10,6 +10,7 @@ from rendering import configured, flat_wall
 
 from nlosrender import pipeline
 from nlosrender.engine.backend import start_backend
+from nlosrender.rendering.outcome import MISSED_BY
 
 BOWL = {"type": "sphere", "center": [0, 0, 3], "radius": 3, "inside": True}
 FAR = {"type": "rectangle", "width": 0.5, "height": 0.4, "center": [0.1, 0, 2.4], "normal": [0, 0, -1]}
@@ -32,7 +33,7 @@ def test_the_second_bounce_counts_for_the_target(tmp_path: Path, engine: str) ->
     """
     config = bowl(tmp_path, engine=engine, target_error=TARGET)
     report = pipeline.render_capture(config)
-    assert report.error_estimate < pipeline.MISSED_BY * TARGET
+    assert report.error_estimate < MISSED_BY * TARGET
     if engine == "path":
         assert report.error_estimate > TARGET / 2
         return
