@@ -150,6 +150,8 @@ def _load_apart(
             shapes.append(_load_mesh(meshes[index], surface, bsdf))
         else:
             shapes.append(_load_shape(shape.description, surface, bsdf, unit))
+            if shapes[-1].is_mesh():  # a plugin's own
+                meshes[index] = _mesh_of(shapes[-1])
     nested = nested_surfaces(shapes)
     for one in nested:
         shape = loaded[one.hidden]
@@ -237,6 +239,19 @@ def _in_engine_units(mesh: TriangleMesh, surface: Surface, bsdf: mi.BSDF, unit: 
     if not len(mesh.faces):
         raise rejected(surface.key, f"too small in a scene of {unit:g} m: float32 rounds its triangles to nothing.")
     return without_double_faces(mesh, both_sides=_has_two_sides(bsdf))
+
+
+def _mesh_of(shape: mi.Mesh) -> TriangleMesh:
+    """Return the triangles of a mesh that Mitsuba has loaded [engine units]."""
+    parameters = mi.traverse(shape)
+
+    def rows(name: str, width: int, is_there: bool) -> Float64 | None:
+        return np.asarray(parameters[name], dtype=np.float64).reshape(-1, width) if is_there else None
+
+    uvs = rows("vertex_texcoords", 2, shape.has_vertex_texcoords())
+    normals = rows("vertex_normals", 3, shape.has_vertex_normals())
+    faces = np.asarray(parameters["faces"]).reshape(-1, 3)
+    return TriangleMesh(np.asarray(parameters["vertex_positions"]).reshape(-1, 3), faces, uvs, normals)
 
 
 def _has_two_sides(bsdf: mi.BSDF) -> bool:

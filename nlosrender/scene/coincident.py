@@ -23,7 +23,7 @@ LEAST_POINTS = 2**16  # tried on all meshes of a scene
 STEP = 1.25  # gaps by which triangles are moved: what has been moved is not found again
 FLATNESS = 4.0  # gaps that the corners of a triangle may be off the plane of the other
 EDGE = 1e-3  # barycentric distance from an edge within which a neighbour in the same plane may be met
-PASSES = 8  # so many layers in one place are told apart
+PASSES = 32  # so many layers in one place are told apart
 
 
 @dataclass(frozen=True, eq=False)

@@ -77,6 +77,22 @@ def test_a_union_of_plates_in_one_plane_counts_once(engine: str) -> None:
 
 
 @pytest.mark.parametrize("engine", ENGINES)
+def test_of_many_layers_the_last_is_seen(engine: str) -> None:
+    """A dozen, the last one grey and the others white."""
+    plates = [plate(0.6, 0.6, (0, 0, 1), albedo) for albedo in (*[0.9] * 11, 0.3)]
+    assert rendered(plates, engine) == pytest.approx(light_of(plates[-1:]), rel=0.01)
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_a_poster_on_a_mesh_of_mitsuba(engine: str) -> None:
+    """A plugin's own triangles are looked at as those of other items: a cube whose front a black plate covers."""
+    to_world = [[0.3, 0, 0, 0], [0, 0.3, 0, 0], [0, 0, 0.3, 1.3], [0, 0, 0, 1]]
+    cube = {"type": "mitsuba", "shape": {"type": "cube", "to_world": to_world}}
+    covered = rendered([cube, plate(0.6, 0.6, (0, 0, 1), 0.0)], engine)
+    assert covered < 1e-3 * rendered([cube], engine)
+
+
+@pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize("two_sided", [True, False])
 def test_both_faces_of_a_sheet_without_thickness_count_once(two_sided: bool, engine: str, tmp_path: Path) -> None:
     """One quadrilateral listed both ways round: cut along other diagonals, so no two triangles are the same."""
