@@ -15,7 +15,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from nlosrender.scene.coincident import PASSES, Overlap, moved_apart, overlaps
+from nlosrender.scene.coincident import PASSES, Overlap, coincident_disks, moved_apart, overlaps
 from nlosrender.scene.double_faces import without_double_faces
 from nlosrender.scene.hidden_geometry import (
     Bounds,
@@ -152,12 +152,12 @@ def _load_apart(
             shapes.append(_load_shape(shape.description, surface, bsdf, unit))
             if shapes[-1].is_mesh():  # a plugin's own
                 meshes[index] = _mesh_of(shapes[-1])
-    nested = nested_surfaces(shapes)
+    nested = nested_surfaces(shapes, wall_shape)
     for one in nested:
-        shape = loaded[one.hidden]
+        shape = loaded[one.moved]
         if isinstance(shape, ShapeDescription):  # as all round ones are
             description = _resized(shape.description, one.factor)
-            shapes[one.hidden] = _load_shape(description, surfaces[one.hidden], bsdfs[one.hidden], unit)
+            shapes[one.moved] = _load_shape(description, surfaces[one.moved], bsdfs[one.moved], unit)
     told: dict[int, Overlap] = {}
     for seed in range(PASSES):
         contents: dict[str, object] = {"type": "scene", WALL_ID: wall_shape}
@@ -170,7 +170,9 @@ def _load_apart(
             shapes[index] = _load_mesh(meshes[index], surfaces[index], bsdfs[index])
         if not found:
             break
-    return scene, shapes, (*_overlap_warnings(surfaces, told), *_nested_warnings(surfaces, nested))
+    disks = coincident_disks(shapes)
+    warnings = *_overlap_warnings(surfaces, told), *_nested_warnings(surfaces, nested), *_disk_warnings(surfaces, disks)
+    return scene, shapes, warnings
 
 
 def _resized(description: Mapping[str, object], factor: float) -> dict[str, object]:
@@ -185,10 +187,19 @@ def _resized(description: Mapping[str, object], factor: float) -> dict[str, obje
 
 def _nested_warnings(surfaces: Sequence[Surface], nested: Sequence[Nested]) -> Iterator[str]:
     for one in nested:
-        hidden, other = surfaces[one.hidden].key, surfaces[one.other].key
+        if one.is_hidden:
+            hidden, other = surfaces[one.moved].key, surfaces[one.other].key
+            yield (
+                f"{hidden} lies where {other} is, or closer than rays tell apart. It is taken to lie behind it. Leave "
+                "it out, or move one of them if it should be seen."
+            )
+
+
+def _disk_warnings(surfaces: Sequence[Surface], pairs: Sequence[tuple[int, int]]) -> Iterator[str]:
+    for disk, other in pairs:
         yield (
-            f"{hidden} lies where {other} is, or closer than rays tell apart. It is taken to lie behind it. Leave it "
-            "out, or move one of them if it should be seen."
+            f"{surfaces[disk].key}: a disk in one place with {surfaces[other].key}, or closer than rays tell apart: "
+            "either may be met there, light may count twice, and the stated error does not know. Move one of them."
         )
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import mitsuba as mi
@@ -13,6 +13,7 @@ from nlosrender.scene.coincident import GAP, STEP
 from nlosrender.scene.pose import Float64
 
 ROUND_PLUGINS = ("Sphere", "Cylinder")
+WALL = -1  # number of the relay wall
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,11 +58,12 @@ class RoundSurface:
 
 @dataclass(frozen=True)
 class Nested:
-    """A sphere or cylinder that lies so close to a concentric one that it is given another radius."""
+    """A sphere or cylinder that is given another radius, so that rays tell it from a concentric one."""
 
-    hidden: int  # its number
-    other: int  # the one it is hidden by
+    moved: int  # its number
+    other: int  # the next one
     factor: float  # new radius over its own
+    is_hidden: bool  # by the other; not where the two are seen from opposite sides
 
 
 def curvature(shape: mi.Shape) -> float:
@@ -69,20 +71,46 @@ def curvature(shape: mi.Shape) -> float:
     return 1 / RoundSurface.of(shape).radius if shape.class_name() in ROUND_PLUGINS else 0.0
 
 
-def nested_surfaces(shapes: Sequence[mi.Shape]) -> list[Nested]:
-    """Return which spheres and cylinders have to be made smaller, or larger if seen from within, to be hidden.
+def nested_surfaces(shapes: Sequence[mi.Shape], wall: mi.Shape) -> list[Nested]:
+    """Return which spheres and cylinders get another radius: of those as near to a concentric one as rays can tell.
 
-    Of two with one radius the later one is seen.
+    Of surfaces with one radius the later one is in front: outermost where they are seen from outside, innermost where
+    they are seen from within, and these lie inside the former. Before a round relay wall hidden surfaces are in front.
     """
-    surfaces = {n: RoundSurface.of(shape) for n, shape in enumerate(shapes) if shape.class_name() in ROUND_PLUGINS}
-    found = []
-    for (i, a), (j, b) in itertools.combinations(surfaces.items(), 2):
-        apart, gap = a.distance_of_axes(b), max(a.gap, b.gap)
-        if a.is_inside != b.is_inside or apart + abs(a.radius - b.radius) >= gap:
-            continue
-        sign = -1 if a.is_inside else 1
-        hidden, other = (i, j) if sign * (b.radius - a.radius) >= 0 else (j, i)
-        radius = surfaces[other].radius - sign * (STEP * gap + apart)
-        if radius > 0:
-            found.append(Nested(hidden, other, radius / surfaces[hidden].radius))
-    return found
+    everything = dict(enumerate([wall, *shapes], WALL))
+    surfaces = {n: RoundSurface.of(shape) for n, shape in everything.items() if shape.class_name() in ROUND_PLUGINS}
+    groups = [{number} for number in surfaces]
+    for i, j in itertools.combinations(surfaces, 2):
+        a, b = surfaces[i], surfaces[j]
+        if a.distance_of_axes(b) + abs(a.radius - b.radius) < max(a.gap, b.gap):
+            one, other = (next(group for group in groups if n in group) for n in (i, j))
+            if one is not other:
+                one |= other
+                groups.remove(other)
+    return [nested for group in groups if len(group) > 1 for nested in _spread({n: surfaces[n] for n in group})]
+
+
+def _spread(group: Mapping[int, RoundSurface]) -> list[Nested]:
+    """Return the new radii of concentric surfaces, from the one that is seen inwards and outwards."""
+    gap = max(surface.gap for surface in group.values())
+    apart = max(a.distance_of_axes(b) for a, b in itertools.permutations(group.values(), 2))
+    step = STEP * gap + (apart if np.isfinite(apart) else 0.0)
+
+    def place(number: int) -> tuple[float, bool, int]:
+        surface = group[number]  # radii that differ by less than float32 rounds are one
+        return round(surface.radius / (1e-2 * gap)), not surface.is_inside, -number if surface.is_inside else number
+
+    order = sorted(group, key=place)
+    outward = [k for k, number in enumerate(order) if not group[number].is_inside]
+    anchor = order.index(WALL) if WALL in group else max(outward, default=0)
+    radii = {number: group[number].radius for number in order}
+    nested = []
+    inwards = [(order[k], order[k + 1], -1) for k in range(anchor - 1, -1, -1)]
+    outwards = [(order[k], order[k - 1], 1) for k in range(anchor + 1, len(order))]
+    for number, other, sign in (*inwards, *outwards):
+        needed = radii[other] + sign * step
+        if sign * (needed - radii[number]) > 0 and needed > 0:
+            radii[number] = needed
+            is_hidden = group[number].is_inside == group[other].is_inside and other != WALL
+            nested.append(Nested(number, other, needed / group[number].radius, is_hidden))
+    return nested

@@ -129,6 +129,35 @@ def test_a_black_lining_hides_the_ball_around_it(gap: float, engine: str) -> Non
     assert rendered([around | white, around | black | {"radius": 2.0 - gap}], engine) == 0
 
 
+@pytest.mark.parametrize("engine", ENGINES)
+@pytest.mark.parametrize("item", [BALL, TUBE | {"radius": 0.3}], ids=["ball", "tube"])
+def test_a_surface_seen_from_outside_and_within_is_two(item: dict[str, Any], engine: str) -> None:
+    """One radius, one item for each side, in either order: as if the inner one were 1 cm smaller."""
+    alone = rendered([item, item | {"inside": True, "radius": item["radius"] - 0.01}], engine)
+    assert rendered([item, item | {"inside": True}], engine) == pytest.approx(alone, rel=0.02)
+    assert rendered([item | {"inside": True}, item], engine) == pytest.approx(alone, rel=0.02)
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_what_two_layers_hide_stays_hidden_beside_the_shorter(engine: str) -> None:
+    """A can, black paint on it, and a short label on the paint: the can is dark."""
+    can = TUBE | {"axis": [0, 1, 0], "radius": 0.3, "bsdf": {"type": "diffuse", "reflectance": 0.8}}
+    paint = can | {"bsdf": {"type": "diffuse", "reflectance": 0.0}}
+    label = can | {"height": 0.1, "bsdf": {"type": "diffuse", "reflectance": 0.1}}
+    apart = [item | {"radius": radius} for item, radius in ((can, 0.29), (paint, 0.3), (label, 0.301))]
+    assert rendered([can, paint, label], engine) == pytest.approx(rendered(apart, engine), rel=0.03)
+
+
+@pytest.mark.parametrize("gap", [0.0, 1e-3])
+def test_a_disk_in_the_plane_of_a_plate_is_said(gap: float) -> None:
+    """Disks are no triangles, and are not moved."""
+    start_backend("llvm", colored=False, polarized=False)
+    shape = {"type": "disk", "to_world": [[0.2, 0, 0, 0], [0, 0.2, 0, 0], [0, 0, -1, 1 - gap], [0, 0, 0, 1]]}
+    items = [plate(0.6, 0.6, (0, 0, 1), 0.8), {"type": "mitsuba", "shape": shape}]
+    warnings = pipeline.load_scene(configured(flat_wall(*items))).warnings
+    assert any("a disk in one place" in text for text in warnings) == (gap == 0)
+
+
 @pytest.mark.parametrize(
     ("items", "is_said"),
     [
