@@ -17,7 +17,6 @@ from nlosrender.engine.histogram import DeviceHistogram
 from nlosrender.engine.transport import PathSettings, Transport
 from nlosrender.scene.build import BuiltScene
 from nlosrender.scene.pose import Float64
-from nlosrender.scene.round_surfaces import curvature
 
 LEAST_COSINE = 1e-2  # between a ray and a surface's normal
 # Ray offset along the normal, over 1 + the largest coordinate [engine units]. A ray from the wall to a point this far
@@ -214,7 +213,7 @@ def off_the_surface(built: BuiltScene, positions: Float64, normals: Float64, sha
     Shadow rays end there: whatever lies in front of the surface by more than the offset is met. ``shapes`` (n,) are
     the indices of their shapes in the scene.
     """
-    curvatures = np.array([curvature(shape) for shape in built.scene.shapes()])[shapes]
+    curvatures = built.curvature_of_shapes[shapes]
     scale = ray_offset(built) * (1 + np.abs(positions).max(axis=1, initial=0.0)) * np.maximum(curvatures, 1)
     if built.wall.is_planar:
         highest = HEIGHT_SHARE * np.abs(positions[:, 2]) / np.maximum(np.abs(normals[:, 2]), HEIGHT_SHARE)

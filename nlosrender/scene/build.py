@@ -61,26 +61,30 @@ class BuiltScene:
         """Whether the wall is a plane and every hidden surface made of triangles."""
         return self.wall.is_planar and all(shape.is_mesh() for shape in self.hidden_shapes)
 
-    @property
+    @cached_property
     def has_exact_hits(self) -> bool:
         """Whether rays meet every hidden surface where float32 has it; curves and distance grids are searched for."""
         return all(shape.is_mesh() or shape.class_name() in EXACT_PLUGINS for shape in self.hidden_shapes)
 
     @cached_property
+    def curvature_of_shapes(self) -> Float64:
+        """1 / radius (n,) [1 / engine unit] of spheres and cylinders, 0 for other shapes; in the scene's order."""
+        return np.array([curvature(shape) for shape in self.scene.shapes()])
+
+    @cached_property
     def curvatures(self) -> mi.Float:
-        """1 / radius [1 / engine unit] of spheres and cylinders, 0 for other shapes; index = registry of shapes."""
-        shapes = self.scene.shapes()
+        """``curvature_of_shapes`` on the device; index = registry of shapes."""
         registry = np.array(dr.reinterpret_array(mi.UInt32, self.scene.shapes_dr()))
         values = np.zeros(int(registry.max(initial=0)) + 1, np.float32)
-        values[registry] = [curvature(shape) for shape in shapes]
+        values[registry] = self.curvature_of_shapes
         table = mi.Float(values)
         dr.eval(table)
         return table
 
-    @cached_property
+    @property
     def is_curved(self) -> bool:
         """Whether any shape is a sphere or a cylinder."""
-        return any(shape.class_name() in ROUND_PLUGINS for shape in self.scene.shapes())
+        return bool(self.curvature_of_shapes.any())
 
     @property
     def wall_bsdf(self) -> mi.BSDF:

@@ -16,6 +16,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from nlosrender.scene.pose import Float64
 from nlosrender.scene.triangle_mesh import TriangleMesh
 
 GAP = 2e-6  # over 1 + the largest coordinate [engine units]: four times the ray offset
@@ -62,12 +63,15 @@ def overlaps(
     first = np.zeros(len(in_scene), np.uint32)  # triangle in ``joined`` of each of the scene's shapes, plus 1
     for number in meshes:
         first[in_scene.index(shapes[number])] = np.searchsorted(owners, number) + 1
-    pairs = _pairs(scene, joined, mi.UInt32(first), seed)
+    areas = joined.areas()
+    pairs = _pairs(scene, joined, areas, mi.UInt32(first), seed)
+    if not pairs.size:
+        return []
     # in a mesh what faces away from the wall counts as later: both sides of a sheet are then one layer each
     turned_away = np.einsum("ij,ij->i", joined.face_normals(), joined.vertices[joined.faces[:, 0]]) > 0
     rank = (2 * owners + turned_away) * len(owners) + np.arange(len(owners))
     earlier, later = np.take_along_axis(pairs, np.argsort(rank[pairs], axis=0), axis=0)
-    areas, result = joined.areas(), []
+    result = []
     for number in np.unique(owners[later]).tolist():
         of_this = owners[later] == number
         faces = np.zeros(len(owners), bool)
@@ -115,12 +119,12 @@ def moved_apart(mesh: TriangleMesh, faces: NDArray[np.bool_], *, both_sides: boo
     return TriangleMesh.merged([mesh.subset(~faces), moved]) if not faces.all() else moved
 
 
-def _pairs(scene: mi.Scene, mesh: TriangleMesh, first: mi.UInt32, seed: int) -> NDArray[np.uint32]:
+def _pairs(scene: mi.Scene, mesh: TriangleMesh, areas: Float64, first: mi.UInt32, seed: int) -> NDArray[np.uint32]:
     """Return pairs (2, n) of triangles of ``mesh`` in one plane, one within ``GAP`` before a point of the other.
 
-    ``first`` tells for each shape of the scene with which triangle of ``mesh`` it begins, plus 1; 0 for other shapes.
+    ``areas`` (m,) are those of its triangles. ``first`` tells for each shape of the scene with which triangle of
+    ``mesh`` it begins, plus 1; 0 for other shapes.
     """
-    areas = mesh.areas()
     count = max(LEAST_POINTS, len(areas))
     copies = 1 + np.ceil(areas / areas.sum() * count).astype(np.intp)
     own = mi.UInt32(np.repeat(np.arange(len(areas), dtype=np.uint32), copies))

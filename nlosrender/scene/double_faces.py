@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -25,23 +23,6 @@ def without_double_faces(mesh: TriangleMesh, *, both_sides: bool) -> TriangleMes
     twins = first_of_doubles(mesh.vertices[mesh.faces], both_sides=both_sides)
     mask = twins == np.arange(len(twins))
     return mesh if mask.all() else mesh.subset(mask)
-
-
-def doubles_of_earlier(corners: Sequence[NDArray[np.floating]], both_sides: bool) -> list[NDArray[np.bool_]]:
-    """Return for every mesh which of its triangles lie exactly where one of an earlier mesh does.
-
-    Parameters
-    ----------
-    corners
-        (m, 3, 3) of each mesh, in one frame. A mesh's own double faces do not count.
-    both_sides
-        As for ``without_double_faces``.
-    """
-    everything = np.concatenate(corners)
-    owners = np.repeat(np.arange(len(corners)), [len(part) for part in corners])
-    twins = first_of_doubles(everything, both_sides=both_sides)
-    doubles = owners > owners[twins]
-    return np.split(doubles, np.cumsum([len(part) for part in corners])[:-1])
 
 
 def first_of_doubles(corners: NDArray[np.floating], *, both_sides: bool) -> NDArray[np.intp]:
