@@ -33,7 +33,7 @@ def merge(
 ) -> None:
     """Put the parts of a capture together; what is missing, there twice, damaged or not its own is named."""
     from nlosrender.cli.progress import progress_bar
-    from nlosrender.cli.stated_error import energies_by_bounce, error_in_words
+    from nlosrender.cli.stated_error import energies_by_bounce, stated_error_lines
     from nlosrender.files.merge import merge_captures
 
     with progress_bar("merge", hidden=quiet) as (progress, _, _):
@@ -44,11 +44,7 @@ def merge(
         OUTPUT.print(dataclasses.asdict(report) | {"output": str(report.output)})
     elif not quiet:
         typer.echo(f"wrote {report.output} from {report.parts} parts")
-        stated = error_in_words(report.error_estimate, report.unsampled_paths, report.zero_because)
-        typer.echo(f"  error estimate  {stated}")
-        for missing in report.unsampled_paths:
-            typer.echo(f"  not sampled     {missing}")
-        for reason in report.zero_because:
-            typer.echo(f"  zero because    {reason}")
+        for line in stated_error_lines(report.error_estimate, report.unsampled_paths, report.zero_because):
+            typer.echo(line)
         energies = energies_by_bounce(report.energy, report.energy_error_per_bounce)
         typer.echo(f"  energy          bounce {energies}; outside the time window: {report.out_of_window:.4g}")

@@ -183,7 +183,7 @@ def _print_json(report: RenderReport) -> None:
 
 
 def _print_report(report: RenderReport) -> None:
-    from nlosrender.cli.stated_error import energies_by_bounce, error_in_words, errors_by_bounce
+    from nlosrender.cli.stated_error import energies_by_bounce, errors_by_bounce, stated_error_lines
 
     seconds = report.seconds
     typer.echo(f"wrote {report.output}" + (f", {report.part} of the capture" if report.part else ""))
@@ -192,12 +192,8 @@ def _print_report(report: RenderReport) -> None:
     typer.echo(f"  engine          {report.engine}: {report.reason}")
     is_view = report.engine == LINE_OF_SIGHT  # that engine renders nothing else
     paths = f", {report.samples} paths per {'pixel' if is_view else 'sensor point'}" if report.samples else ""
-    stated = error_in_words(report.error_estimate, report.unsampled_paths, report.zero_because)
-    typer.echo(f"  error estimate  {stated}{paths}")
-    for missing in report.unsampled_paths:
-        typer.echo(f"  not sampled     {missing}")
-    for reason in report.zero_because:
-        typer.echo(f"  zero because    {reason}")
+    for line in stated_error_lines(report.error_estimate, report.unsampled_paths, report.zero_because, paths):
+        typer.echo(line)
     typer.echo(
         f"  per bounce      {errors_by_bounce(report.error_estimate_per_bounce)} (relative L2; -: no light or unknown)"
     )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 
 
 def error_in_words(error: float, unsampled: Sequence[str], zero_because: Sequence[str]) -> str:
@@ -23,13 +23,22 @@ def error_in_words(error: float, unsampled: Sequence[str], zero_because: Sequenc
     return f"{error:.2%} (relative L2)" if math.isfinite(error) else "unknown: nothing but noise"
 
 
+def stated_error_lines(
+    error: float, unsampled: Sequence[str], zero_because: Sequence[str], remark: str = ""
+) -> Iterator[str]:
+    """Yield the lines of a report: the stated error and a remark, and why it is not known; parameters as above."""
+    yield f"  error estimate  {error_in_words(error, unsampled, zero_because)}{remark}"
+    yield from (f"  not sampled     {missing}" for missing in unsampled)
+    yield from (f"  zero because    {reason}" for reason in zero_because)
+
+
 def errors_by_bounce(errors: Mapping[str, object]) -> str:
     """Return the relative errors of bounces that have one, or whose one is not known: "3: 1.2 %, 4: unknown"."""
     return ", ".join(f"{name}: {_percent(error)}" for name, error in errors.items())
 
 
 def energies_by_bounce(energies: Mapping[str, object], errors: Mapping[str, object]) -> str:
-    """Return energies with their standard errors: "3: 0.364 +- 0.002, 4: 0.0058 (error unknown)"."""
+    """Return energies with their standard errors: "3: 0.364 +- 0.002, 4: 0.0058", without one where it is not known."""
     return ", ".join(f"{name}: {_with_error(energy, errors.get(name))}" for name, energy in energies.items())
 
 
