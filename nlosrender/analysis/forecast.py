@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING
 from nlosrender.capture.arrivals import filled_shares
 from nlosrender.capture.plan import Plan
 from nlosrender.config.document import Config
+from nlosrender.constants import readable_duration
 from nlosrender.engine.backend import Backend, scene_memory
 from nlosrender.files.capture_file import CaptureHeader
 from nlosrender.files.size import FileSize, forecast_size
 from nlosrender.scene.mesh_report import MeshReport
-from nlosrender.units import readable_duration
 
 if TYPE_CHECKING:
     from nlosrender.engine.engines import Engine

@@ -8,11 +8,11 @@ from collections.abc import Mapping
 from math import prod
 from pathlib import Path
 
+from nlosrender.constants import opl_to_seconds
 from nlosrender.errors import FileError
 from nlosrender.files.part_attributes import UNSAMPLED, ZERO, text_list
 from nlosrender.files.reader import read_header
 from nlosrender.files.stored_header import StoredHeader
-from nlosrender.units import opl_to_seconds
 
 
 def summarise(path: str | Path) -> dict[str, object]:

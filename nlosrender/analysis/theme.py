@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from nlosrender.units import SPEED_OF_LIGHT
+from nlosrender.constants import SPEED_OF_LIGHT
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

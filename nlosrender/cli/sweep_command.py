@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import typer
 
 from nlosrender.cli.json_output import OUTPUT
-from nlosrender.units import readable_duration
+from nlosrender.constants import readable_duration
 
 if TYPE_CHECKING:
     from nlosrender.analysis.forecast import Forecast

@@ -11,13 +11,13 @@ from pathlib import Path
 
 import numpy as np
 
+from nlosrender.constants import opl_to_seconds
 from nlosrender.errors import FileError, OptionError
 from nlosrender.files.layout import Float64
 from nlosrender.files.mat73 import chunk_rows, new_mat73
 from nlosrender.files.rectified import Rectification, rectification
 from nlosrender.files.scan import Float32, Scan
 from nlosrender.files.wall_order import SAME, OrderedCapture
-from nlosrender.units import opl_to_seconds
 
 PS = 1e12  # picoseconds in a second
 FK_BIN_PS = 32.0  # their program's constant: the file has no place for it

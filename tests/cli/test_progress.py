@@ -15,8 +15,8 @@ from commands import run
 
 from nlosrender.cli import progress, progress_log
 from nlosrender.cli.progress_log import LEAST_SECONDS, MOST_SECONDS, ProgressLog
+from nlosrender.constants import readable_duration
 from nlosrender.rendering.report import Standing
-from nlosrender.units import readable_duration
 
 SCENE = """\
 name: plate

@@ -17,9 +17,9 @@ from scipy.io.matlab import matfile_version
 from typer.testing import CliRunner
 
 from nlosrender.cli.app import app
+from nlosrender.constants import SPEED_OF_LIGHT
 from nlosrender.errors import FileError, OptionError
 from nlosrender.files.exports import FORMATS, export_capture
-from nlosrender.units import SPEED_OF_LIGHT
 
 POINT = (0.1, -0.2, 0.8)
 SENSORS = cells(5, 4, 1.0, 0.8)  # equal spacings, as one format needs them

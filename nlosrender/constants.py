@@ -14,11 +14,6 @@ def opl_to_seconds(opl: float) -> float:
     return opl / SPEED_OF_LIGHT
 
 
-def seconds_to_opl(seconds: float) -> float:
-    """Return the optical path length [m] that light covers in ``seconds`` [s]."""
-    return seconds * SPEED_OF_LIGHT
-
-
 _DURATIONS = ((100.0, 1.0, "s"), (6000.0, 60.0, "min"), (172_800.0, 3600.0, "h"), (6e7, 86_400.0, "days"))
 SECONDS_PER_YEAR = 31_557_600.0  # Julian
 
