@@ -19,7 +19,7 @@ $(VENV)/.installed: pyproject.toml .constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { echo "need Python 3.11 or newer; $(PYTHON) is older (set PYTHON=...)"; exit 1; }
 	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV) || { echo "python venv is missing: on Debian and Ubuntu, apt-get install python3-venv"; exit 1; }
 	$(PIP) install $(PINS) --editable .
-	@$(BIN)/python -c 'import sys; from nlosrender.engine.llvm import choose_library; found = choose_library(); sys.exit(found is None or not found.is_proven)' \
+	@$(BIN)/python -c 'import sys; from nlosrender.engine.backend.llvm import choose_library; found = choose_library(); sys.exit(found is None or not found.is_proven)' \
 		|| { echo "no LLVM known to work on this system: installing one into $(VENV)"; $(PIP) install $(PINS) --editable '.[llvm]'; }
 	@touch $@
 

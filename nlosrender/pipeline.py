@@ -24,7 +24,7 @@ from nlosrender.capture.time_axis import TimeAxis, resolve_time_axis
 from nlosrender.config.document import Config
 from nlosrender.config.load import config_hash, config_to_dict
 from nlosrender.config.warnings import config_warnings
-from nlosrender.engine.backend import Backend, batch_memory, physical_memory, start_backend
+from nlosrender.engine.backend.start import Backend, batch_memory, physical_memory, start_backend
 from nlosrender.errors import OptionError
 from nlosrender.files.capture_file import CaptureHeader
 from nlosrender.files.chunks import sensor_tile
@@ -46,8 +46,8 @@ from nlosrender.scene.placing import placed
 from nlosrender.scene.relay_wall import RelayWall, relay_wall_from_config
 
 if TYPE_CHECKING:
-    from nlosrender.engine.path_engine import Budget
-    from nlosrender.engine.unsampled_paths import UnsampledPaths
+    from nlosrender.engine.path.engine import Budget
+    from nlosrender.engine.preflight.unsampled_paths import UnsampledPaths
     from nlosrender.rendering.dask_cluster import Cluster
     from nlosrender.rendering.units import Engine
     from nlosrender.scene.build import BuiltScene
@@ -188,7 +188,7 @@ def set_up_engine(
     config: Config, backend: Backend, selection: Selection = WHOLE, sharing: Sharing = ALONE
 ) -> tuple[Plan, Engine, CaptureHeader]:
     """Stages 2 to 4 up to the first ray: scene, capture, plan, engine, and what the file will say of them."""
-    from nlosrender.engine.skipped import shared_samples
+    from nlosrender.engine.preflight.omitted_work import shared_samples
 
     built = load_view(config) if config.capture.is_line_of_sight else load_scene(config)
     capture, time_axis = describe_capture(config, built.wall, built)
@@ -199,7 +199,7 @@ def set_up_engine(
 
 def settled_budget(config: Config, engine: Engine) -> Budget:
     """Return when to stop, settled for the whole capture at once: no unit's result depends on how the work is cut."""
-    from nlosrender.engine.path_engine import Budget
+    from nlosrender.engine.path.engine import Budget
 
     return engine.settle(Budget(config.render.spp, config.render.target_error, config.render.time_limit_s))
 
@@ -259,8 +259,8 @@ def check_engines(
     if config.capture.is_line_of_sight:
         raise OptionError("check-engines: one technique renders line_of_sight captures; there is nothing to compare.")
     backend = started_backend(config)
-    from nlosrender.engine.path_engine import Budget
-    from nlosrender.engine.pilot import pilot_of
+    from nlosrender.engine.launch.pilot_points import pilot_of
+    from nlosrender.engine.path.engine import Budget
 
     built = load_scene(config)
     capture, time_axis = describe_capture(config, built.wall, built)
@@ -285,8 +285,8 @@ def late_warnings(
     config: Config, backend: Backend, plan: Plan, engine: Engine, header: CaptureHeader, sharing: Sharing = ALONE
 ) -> Iterator[str]:
     """Yield the warnings that take a scene, a plan and an engine; ``config_warnings`` needs none of them."""
-    from nlosrender.engine.memory import memory_warnings
-    from nlosrender.engine.scene_warnings import scene_warnings
+    from nlosrender.engine.preflight.batch_memory import memory_warnings
+    from nlosrender.engine.preflight.scene_warnings import scene_warnings
 
     yield from scene_warnings(engine)
     yield from memory_warnings(engine, plan, sharing.memory_limit(config.render.memory_limit_bytes), backend.lanes)
@@ -358,7 +358,7 @@ def prepare(
     replicas: int | None = None,
 ) -> tuple[Plan, Engine]:
     """Stages 3 and 4: cut the work into units and set up the engine; ``replicas`` other than the plan's on request."""
-    from nlosrender.engine.path_engine import PathOptions
+    from nlosrender.engine.path.engine import PathOptions
     from nlosrender.engine.planner import choose_engine
 
     render = config.render

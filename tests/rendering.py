@@ -19,7 +19,7 @@ from nlosrender.capture.plan import Plan, plan_capture
 from nlosrender.capture.time_axis import TimeAxis
 from nlosrender.config.document import Config
 from nlosrender.config.load import parse_config
-from nlosrender.engine.backend import start_backend
+from nlosrender.engine.backend.start import start_backend
 
 Array = NDArray[np.float64]
 Scene = Mapping[str, Any]
@@ -126,7 +126,7 @@ def render(
     """
     validated = configured(config, overrides, folder)
     backend = start_backend("llvm", colored=validated.is_colored, polarized=validated.render.polarized)
-    from nlosrender.engine.path_engine import Budget, PathEngine
+    from nlosrender.engine.path.engine import Budget, PathEngine
 
     built = pipeline.load_scene(validated)
     capture, time_axis = pipeline.describe_capture(validated, built.wall, built)
@@ -155,7 +155,7 @@ def render(
         variance[where] = histogram.variance.reshape(mean[where].shape)
         outside[where] = histogram.outside.reshape(outside[where].shape)
         samples.append(histogram.samples)
-    from nlosrender.engine.histogram import relative_l2_error
+    from nlosrender.engine.launch.histogram import relative_l2_error
 
     error = relative_l2_error(float(variance.sum()), float((mean**2).sum()))
     return Rendering(mean, variance, outside, capture, time_axis, bounces, min(samples), error, plan)

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from rendering import configured, flat_wall
 
 from nlosrender import pipeline
-from nlosrender.engine.backend import start_backend
+from nlosrender.engine.backend.start import start_backend
 
 Array = NDArray[np.float64]
 Item = dict[str, Any]

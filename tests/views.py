@@ -13,7 +13,7 @@ from rendering import configured
 
 from nlosrender import pipeline
 from nlosrender.config.document import Config
-from nlosrender.engine.backend import start_backend
+from nlosrender.engine.backend.start import start_backend
 
 Array = NDArray[np.float64]
 Scene = Mapping[str, Any]
@@ -69,8 +69,8 @@ def see(
     backend = start_backend("llvm", colored=validated.is_colored, polarized=validated.render.polarized)
     from nlosrender.capture.plan import Batch
     from nlosrender.capture.tile import Tile
+    from nlosrender.engine.launch.sample_schedule import Budget
     from nlosrender.engine.line_of_sight.engine import LineOfSightEngine
-    from nlosrender.engine.sampling import Budget
 
     _, engine, _ = pipeline.set_up_engine(validated, backend)
     engine = LineOfSightEngine(

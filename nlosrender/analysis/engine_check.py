@@ -26,8 +26,8 @@ from nlosrender.errors import NlosError
 
 if TYPE_CHECKING:
     from nlosrender.engine.engines import Engine
-    from nlosrender.engine.pilot import Pilot
-    from nlosrender.engine.sampling import Budget
+    from nlosrender.engine.launch.pilot_points import Pilot
+    from nlosrender.engine.launch.sample_schedule import Budget
 
 Float64 = NDArray[np.float64]
 GATHER_SHARE = 0.1  # of the target error: an error that may have one sign everywhere adds up over bins and points

@@ -11,14 +11,14 @@ from nlosrender.capture.arrivals import filled_shares
 from nlosrender.capture.plan import Plan
 from nlosrender.config.document import Config
 from nlosrender.constants import readable_duration
-from nlosrender.engine.backend import Backend, scene_memory
+from nlosrender.engine.backend.start import Backend, scene_memory
 from nlosrender.files.capture_file import CaptureHeader
 from nlosrender.files.size import FileSize, forecast_size
 from nlosrender.scene.mesh_report import MeshReport
 
 if TYPE_CHECKING:
     from nlosrender.engine.engines import Engine
-    from nlosrender.engine.skipped import Skipped
+    from nlosrender.engine.preflight.omitted_work import Skipped
 
 LONGEST_WAIT = 30 * 86_400.0  # s
 
@@ -85,10 +85,10 @@ def forecast_render(
     RenderError
         A batch cannot be rendered.
     """
-    from nlosrender.engine.forecast import estimate_render_time
-    from nlosrender.engine.memory import batch_bytes
-    from nlosrender.engine.path_engine import Budget
-    from nlosrender.engine.skipped import skipped_work
+    from nlosrender.engine.path.engine import Budget
+    from nlosrender.engine.preflight.batch_memory import batch_bytes
+    from nlosrender.engine.preflight.omitted_work import skipped_work
+    from nlosrender.engine.preflight.time_estimate import estimate_render_time
 
     render, capture, time_axis = config.render, engine.capture, engine.time_axis
     n_bytes = batch_bytes(engine, plan)  # refuses what is too large before the pilot allocates a part of it

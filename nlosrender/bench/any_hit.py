@@ -39,9 +39,9 @@ def trace_any_hit(loaded: LoadedScene, lit: LitPatches, *, only_asked: bool = Fa
     import drjit as dr
     import mitsuba as mi
 
-    from nlosrender.engine.connections import WALL_OFFSET
-    from nlosrender.engine.device_arrays import on_device
-    from nlosrender.engine.space_filling import z_order
+    from nlosrender.engine.launch.device_arrays import on_device
+    from nlosrender.engine.launch.morton import z_order
+    from nlosrender.engine.path.laser_connections import WALL_OFFSET
 
     built, n_sensors = loaded.built, loaded.capture.n_sensors
     points = loaded.capture.sensor_grid.positions.reshape(-1, 3) / built.unit

@@ -21,7 +21,7 @@ from nlosrender.bench.meshes import write_ply
 from nlosrender.bench.race import FIRST_SAMPLES, Contender
 from nlosrender.bench.references import Reference
 from nlosrender.bench.runs import LoadedScene, Run
-from nlosrender.engine import llvm
+from nlosrender.engine.backend import llvm
 from nlosrender.errors import BackendError
 from nlosrender.scene.hidden_geometry import MeshFile
 from nlosrender.scene.triangle_mesh import TriangleMesh

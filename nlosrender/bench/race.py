@@ -66,7 +66,7 @@ class OwnContender:
         RenderError
             The result is not finite, or does not fit the memory.
         """
-        from nlosrender.engine.path_engine import Budget
+        from nlosrender.engine.path.engine import Budget
 
         if self.counts_paths:
             budget = Budget(spp=FIRST_SAMPLES * 4**level)

@@ -63,7 +63,7 @@ def gather_rate(loaded: LoadedScene) -> GatherRate:
     RenderError
         The virtual-light engine does not take the scene.
     """
-    from nlosrender.engine.path_engine import Budget
+    from nlosrender.engine.path.engine import Budget
 
     plan, engine = virtual_lights_of(loaded)
     fineness = engine.settle(Budget(target_error=GATHER_TARGET)).fineness or 1.0

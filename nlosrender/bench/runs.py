@@ -14,12 +14,12 @@ from nlosrender import pipeline
 from nlosrender.bench.scenes import BenchScene
 from nlosrender.capture.grids import Capture
 from nlosrender.capture.time_axis import TimeAxis
-from nlosrender.engine.backend import Backend, start_backend
+from nlosrender.engine.backend.start import Backend, start_backend
 from nlosrender.errors import RenderError
 
 if TYPE_CHECKING:
     from nlosrender.capture.plan import Plan
-    from nlosrender.engine.path_engine import Budget
+    from nlosrender.engine.path.engine import Budget
     from nlosrender.engine.virtual_lights.engine import VirtualLightEngine
     from nlosrender.scene.build import BuiltScene
 
@@ -122,7 +122,7 @@ def render(loaded: LoadedScene, budget: Budget, seed: int = 0, options: Mapping[
     RenderError
         The result is not finite, or does not fit the memory.
     """
-    from nlosrender.engine.histogram import relative_l2_error
+    from nlosrender.engine.launch.histogram import relative_l2_error
     from nlosrender.engine.virtual_lights.engine import VirtualLightEngine
 
     config = loaded.scene.config(split_bounces=False, seed=seed, **(options or {}))

@@ -92,7 +92,7 @@ def _measure(
             if begun.read()[0] + expected > seconds or measured[-1][1] * growth > LONGEST:
                 break
         loaded = load(scene_of(int(size)))
-        from nlosrender.engine.path_engine import Budget  # the backend has to be started before
+        from nlosrender.engine.path.engine import Budget  # the backend has to be started before
 
         runs = [render(loaded, Budget(target_error=TARGET), seed, {"engine": "auto"}) for seed in range(2)]
         if runs[1].seconds < SHORT:  # the first run compiles; long runs are not repeated

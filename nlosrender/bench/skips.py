@@ -15,7 +15,7 @@ from nlosrender.bench.scenes import WALL_SIZE, BenchScene, closed_room, many_las
 if TYPE_CHECKING:
     from nlosrender.capture.plan import Batch
     from nlosrender.engine.engines import Engine
-    from nlosrender.engine.path_engine import Budget, PathEngine
+    from nlosrender.engine.path.engine import Budget, PathEngine
     from nlosrender.engine.virtual_lights.engine import VirtualLightEngine
 
 ROUNDS = 3
@@ -70,7 +70,7 @@ def measure_skips(scenes: Sequence[BenchScene]) -> list[Saving]:
 
 def of_gather(loaded: LoadedScene) -> Iterator[Saving]:
     """Yield what the gather leaves out: rays nothing can stop, the dark patches, colour."""
-    from nlosrender.engine.path_engine import Budget
+    from nlosrender.engine.path.engine import Budget
 
     plan, engine = virtual_lights_of(loaded)
     fineness = engine.settle(Budget(target_error=GATHER_TARGET)).fineness or 1.0
@@ -101,7 +101,7 @@ def _tracing_all(engine: VirtualLightEngine, gather: Callable[[], Float64]) -> C
 
 def _without_clearances(gather: Callable[[], Float64]) -> Callable[[], Float64]:
     """Return ``gather`` with rays all the way to every patch that faces a sensor point."""
-    from nlosrender.engine.virtual_lights import clearance
+    from nlosrender.engine.virtual_lights.visibility import masks as clearance
 
     def traced() -> Float64:
         known, clearance.LEAST_POINTS = clearance.LEAST_POINTS, NEVER
@@ -115,7 +115,7 @@ def _without_clearances(gather: Callable[[], Float64]) -> Callable[[], Float64]:
 
 def _of_regions(loaded: LoadedScene) -> Iterator[Saving]:
     """Yield what patches of their own close to the wall save the parts of the sensor grid."""
-    from nlosrender.engine.virtual_lights.tessellator import Tessellator
+    from nlosrender.engine.virtual_lights.elements.tessellator import Tessellator
     from nlosrender.engine.virtual_lights.third_bounce import ThirdBounce
 
     plan, engine = virtual_lights_of(loaded)
@@ -140,8 +140,8 @@ def _of_reciprocity(loaded: LoadedScene) -> Iterator[Saving]:
 def of_paths(loaded: LoadedScene) -> Iterator[Saving]:
     """Yield what the path engine leaves out: rays nothing can stop, the technique that is not needed."""
     from nlosrender import pipeline
-    from nlosrender.engine.path_engine import PathEngine
-    from nlosrender.engine.path_integrator import load_path_integrator
+    from nlosrender.engine.path.engine import PathEngine
+    from nlosrender.engine.path.full_loop import load_path_integrator
 
     config = loaded.scene.config(engine="path", split_bounces=False, spp=PATHS)
     plan, engine = pipeline.prepare(config, loaded.backend, loaded.built, loaded.capture, loaded.time_axis)
@@ -149,7 +149,7 @@ def of_paths(loaded: LoadedScene) -> Iterator[Saving]:
         return
 
     def render(other: PathEngine) -> Callable[[], Float64]:
-        from nlosrender.engine.path_engine import Budget
+        from nlosrender.engine.path.engine import Budget
 
         return lambda: np.concatenate([other.render(b, Budget(spp=PATHS)).mean for b in plan.batches], axis=3)
 
@@ -175,7 +175,7 @@ def of_paths(loaded: LoadedScene) -> Iterator[Saving]:
 def _of_late_light(loaded: LoadedScene) -> Iterator[Saving]:
     """Yield what is left out that comes after the window: of as many paths, and of walks to the same error."""
     from nlosrender import pipeline
-    from nlosrender.engine.path_engine import Budget, PathEngine
+    from nlosrender.engine.path.engine import Budget, PathEngine
     from nlosrender.engine.virtual_lights.engine import VirtualLightEngine
 
     built, capture, time_axis = loaded.built, loaded.capture, loaded.time_axis

@@ -51,7 +51,7 @@ def bench(
     from nlosrender.bench.benchmark import PARTS, run_benchmark
     from nlosrender.bench.report import table, write_json, write_plot
     from nlosrender.bench.scenes import built_in_scenes
-    from nlosrender.engine.backend import start_backend
+    from nlosrender.engine.backend.start import start_backend
 
     if mesh is not None and not mesh.is_file():
         raise typer.BadParameter(f"{mesh}: there is no such file", param_hint="--mesh")

@@ -22,8 +22,8 @@ def doctor(as_json: Annotated[bool, typer.Option("--json", help="Print one JSON 
 
     Exits with 6 when nothing on this machine can render.
     """
-    from nlosrender.engine import llvm
-    from nlosrender.engine.backend import cuda_available, start_backend
+    from nlosrender.engine.backend import llvm
+    from nlosrender.engine.backend.start import cuda_available, start_backend
     from nlosrender.errors import EXIT_OK, BackendError
     from nlosrender.files.provenance import package_versions
 

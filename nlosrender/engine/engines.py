@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TypeAlias
 
 from nlosrender.engine.line_of_sight.engine import LineOfSightEngine
-from nlosrender.engine.path_engine import PathEngine
+from nlosrender.engine.path.engine import PathEngine
 from nlosrender.engine.virtual_lights.engine import VirtualLightEngine
 
 SamplingEngine: TypeAlias = PathEngine | LineOfSightEngine

@@ -10,9 +10,9 @@ from nlosrender.capture.time_axis import TimeAxis
 from nlosrender.config.render import RenderConfig
 from nlosrender.engine.engines import Engine
 from nlosrender.engine.line_of_sight.engine import LineOfSightEngine
-from nlosrender.engine.path_engine import PathEngine, PathOptions
+from nlosrender.engine.path.engine import PathEngine, PathOptions
+from nlosrender.engine.virtual_lights.elements.tessellator import MAX_PATCHES, can_tessellate, wall_sees_itself
 from nlosrender.engine.virtual_lights.engine import VirtualLightEngine, is_lambertian
-from nlosrender.engine.virtual_lights.tessellator import MAX_PATCHES, can_tessellate, wall_sees_itself
 from nlosrender.engine.virtual_lights.third_bounce import FIRST_COARSENESS
 from nlosrender.scene.build import BuiltScene
 from nlosrender.scene.view import BuiltView

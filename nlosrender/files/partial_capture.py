@@ -22,7 +22,7 @@ from types import TracebackType
 from typing import Any
 
 from nlosrender.config.canonical import tree_hash
-from nlosrender.engine.passes import Kept
+from nlosrender.engine.launch.passes import Kept
 from nlosrender.errors import FileError
 from nlosrender.files.capture_file import CaptureHeader
 from nlosrender.files.header_writer import root_attributes

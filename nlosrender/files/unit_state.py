@@ -17,7 +17,7 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from nlosrender.engine.passes import Kept, Snapshot
+from nlosrender.engine.launch.passes import Kept, Snapshot
 from nlosrender.files.journal import line_of, record_of
 from nlosrender.files.unit_log import UnitKey
 

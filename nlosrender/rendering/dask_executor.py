@@ -27,7 +27,7 @@ from nlosrender.rendering.units import UnitWriter
 if TYPE_CHECKING:
     from distributed import Future, as_completed
 
-    from nlosrender.engine.path_engine import Budget
+    from nlosrender.engine.path.engine import Budget
 
 STOP_SECONDS = 20.0  # that units in flight have after a signal: a batch system waits 30 s before it kills
 PER_WORKER = 2  # units on the way for each worker: the one it renders, and the next or the last

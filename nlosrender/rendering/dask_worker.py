@@ -16,7 +16,7 @@ from nlosrender.capture.plan import Plan, Unit, replicas_for
 from nlosrender.config.canonical import tree_hash
 from nlosrender.config.document import Config
 from nlosrender.config.load import config_to_dict
-from nlosrender.engine.backend import Backend, BackendName, limit_threads, start_backend
+from nlosrender.engine.backend.start import Backend, BackendName, limit_threads, start_backend
 from nlosrender.errors import BackendError, ConfigError, NlosError, Problem
 from nlosrender.files.capture_file import CaptureHeader
 from nlosrender.files.identity import capture_identity, differences
@@ -118,7 +118,7 @@ def render_remotely(
             with stopwatch.stage("scene"):
                 engine, cutter = _DESK.prepared(job)
                 limit_threads(threads or _threads_of_worker())
-            from nlosrender.engine.path_engine import Budget
+            from nlosrender.engine.path.engine import Budget
 
             finished = rendered(engine, unit, Budget(**budget), store_variance, stopwatch)
         begun = time.perf_counter()

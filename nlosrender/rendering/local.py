@@ -9,7 +9,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from nlosrender.capture.plan import Unit
-from nlosrender.engine.passes import Passes
+from nlosrender.engine.launch.passes import Passes
 from nlosrender.errors import FileError, IncompleteRender, InterruptedRender, RenderError
 from nlosrender.files.partial_capture import PartialCapture
 from nlosrender.files.sums import Sums
@@ -19,7 +19,7 @@ from nlosrender.rendering.unit_in_flight import UnitInFlight, UnitStopped
 from nlosrender.rendering.units import RenderedUnit, UnitWriter, finished_unit, render_unit
 
 if TYPE_CHECKING:
-    from nlosrender.engine.path_engine import Budget
+    from nlosrender.engine.path.engine import Budget
     from nlosrender.rendering.units import Engine
 
 

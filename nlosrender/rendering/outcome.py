@@ -12,7 +12,7 @@ from nlosrender.errors import ConfigError, Problem
 from nlosrender.files.part_attributes import MISSED, known_of, summed_attributes
 
 if TYPE_CHECKING:
-    from nlosrender.engine.unsampled_paths import UnsampledPaths
+    from nlosrender.engine.preflight.unsampled_paths import UnsampledPaths
     from nlosrender.files.sums import Sums
     from nlosrender.rendering.units import Engine
 
@@ -32,7 +32,7 @@ class Outcome:
     @classmethod
     def of(cls, render: RenderConfig, engine: Engine, unsampled: tuple[UnsampledPaths, ...], sums: Sums) -> Outcome:
         """Return the outcome of a render whose units are ``sums`` together."""
-        from nlosrender.engine.zero_capture import zero_reasons
+        from nlosrender.engine.preflight.zero_capture import zero_reasons
 
         zero = () if sums.squares else zero_reasons(engine, unsampled, float(sums.outside))
         stated = sums.stated_error(tuple(paths.summary for paths in unsampled))
@@ -77,7 +77,7 @@ def missing_light(engine: Engine, strict: bool = False) -> tuple[UnsampledPaths,
     ConfigError
         ``strict``, and there are any.
     """
-    from nlosrender.engine.unsampled_paths import unsampled_paths
+    from nlosrender.engine.preflight.unsampled_paths import unsampled_paths
 
     found = unsampled_paths(engine)
     if strict and found:

@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 
 from nlosrender.capture.plan import UNIT_SAMPLES
-from nlosrender.engine.backend import PROCESS_BYTES, physical_memory
+from nlosrender.engine.backend.start import PROCESS_BYTES, physical_memory
 from nlosrender.errors import ConfigError, Problem
 
 # 64 MB with the variance, before it is packed: a message a network carries, and a loss a dying worker may cause

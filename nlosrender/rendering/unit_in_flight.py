@@ -8,14 +8,14 @@ from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
 from nlosrender.capture.plan import Unit
-from nlosrender.engine.passes import Kept, Passes, Snapshot
+from nlosrender.engine.launch.passes import Kept, Passes, Snapshot
 from nlosrender.errors import FileError
 from nlosrender.files.partial_capture import PartialCapture
 from nlosrender.interruption import StopRequest
 from nlosrender.rendering.report import Progress, Warn
 
 if TYPE_CHECKING:
-    from nlosrender.engine.path_engine import Budget
+    from nlosrender.engine.path.engine import Budget
 
 KEEP_SECONDS = 30.0  # between two states, so that a kill costs no more than about a minute; quick units never keep one
 KEEP_COST = 0.1  # share of the time that keeping may take: states may have gigabytes

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nlosrender.capture.plan import Unit
-from nlosrender.engine.passes import Passes, Snapshot
+from nlosrender.engine.launch.passes import Passes, Snapshot
 from nlosrender.files import layout
 from nlosrender.files.partial_capture import PartialCapture
 from nlosrender.files.pieces import Cutter, PackedChunk, packed_chunks
@@ -21,8 +21,8 @@ from nlosrender.rendering.report import Stopwatch
 
 if TYPE_CHECKING:
     from nlosrender.engine.engines import Engine
-    from nlosrender.engine.histogram import Histogram
-    from nlosrender.engine.path_engine import Budget
+    from nlosrender.engine.launch.histogram import Histogram
+    from nlosrender.engine.path.engine import Budget
 
 
 def render_unit(engine: Engine, unit: Unit, budget: Budget, passes: Passes) -> Histogram:
@@ -70,7 +70,7 @@ def _snapshot(histogram: Histogram) -> Snapshot:
 
 
 def _histogram(kept: Snapshot) -> Histogram:
-    from nlosrender.engine.histogram import Histogram
+    from nlosrender.engine.launch.histogram import Histogram
 
     arrays = kept.arrays
     samples = kept.numbers["samples"]
@@ -79,7 +79,7 @@ def _histogram(kept: Snapshot) -> Histogram:
 
 def joined_histogram(unit: Unit, pieces: list[Histogram]) -> Histogram:
     """Put the histograms of a unit's batches together, sensor points row by row."""
-    from nlosrender.engine.histogram import Histogram
+    from nlosrender.engine.launch.histogram import Histogram
 
     rows, columns = unit.sensors.shape
     arrays = {}

@@ -17,7 +17,7 @@ from rendering import flat_wall
 from triangle_soup import hits, mesh_of, triangles_of, unit_normals
 from varied_scenes import Stage
 
-from nlosrender.engine.backend import start_backend
+from nlosrender.engine.backend.start import start_backend
 
 Array = NDArray[np.float64]
 RECTANGLE = np.array([[-0.5, -0.4, 0.0], [0.5, 0.45, 0.0]])
@@ -115,7 +115,7 @@ def cleared(triangles: Array, points: Array, normals: Array, others: Array, outl
     import drjit as dr
     import mitsuba as mi
 
-    from nlosrender.engine.virtual_lights.clearance import Clearances, Surface
+    from nlosrender.engine.virtual_lights.visibility.masks import Clearances, Surface
 
     built: Any = SimpleNamespace(wall=SimpleNamespace(is_planar=planar), hidden_shapes=(mesh_of(triangles),))
     surface = Surface(vectors(mi.Point3f, points), vectors(mi.Vector3f, normals), vectors(mi.Vector3f, others))
@@ -155,7 +155,7 @@ def assert_sound(
     tuple
         How many of these ways are not free, and how many are said to be.
     """
-    from nlosrender.engine.virtual_lights.clearance import MOST_RISE, RISE
+    from nlosrender.engine.virtual_lights.visibility.masks import MOST_RISE, RISE
 
     planes, n_hidden, n_open = unit_normals(triangles), 0, 0
     for k, point in enumerate(points):
@@ -184,7 +184,7 @@ def test_nothing_hides_a_point_from_where_it_is_said_to_be_open(name: str, recta
     import drjit as dr
     import mitsuba as mi
 
-    from nlosrender.engine.virtual_lights.clearance import Outlook
+    from nlosrender.engine.virtual_lights.visibility.masks import Outlook
 
     random = np.random.default_rng(7)
     triangles = SCENES[name](random).astype(np.float32).astype(np.float64)
@@ -216,7 +216,7 @@ LETTER = {"type": "letters", "text": "E", "height": 0.7, "center": [0.1, 0, 0.9]
 @pytest.fixture
 def eager(monkeypatch: pytest.MonkeyPatch) -> None:
     """Look for clearances however few sensor points there are."""
-    from nlosrender.engine.virtual_lights import clearance
+    from nlosrender.engine.virtual_lights.visibility import masks as clearance
 
     monkeypatch.setattr(clearance, "LEAST_POINTS", 0)
 
@@ -254,7 +254,7 @@ def test_what_an_engine_says_of_its_patches_is_so(hidden: tuple[dict[str, Any], 
 
 def is_open(lit: Any) -> NDArray[np.bool_]:
     """Return which patches are open to all tiles."""
-    from nlosrender.engine.virtual_lights.clearance import OF_ALL
+    from nlosrender.engine.virtual_lights.visibility.masks import OF_ALL
 
     return lit.clearance == OF_ALL
 
@@ -308,7 +308,7 @@ def test_a_sphere_counts_by_its_box() -> None:
 @pytest.mark.usefixtures("eager")
 def test_a_screen_leaves_the_tiles_beside_its_shadow_open() -> None:
     """A screen over the left half of the way hides the point from the left tiles of the wall only."""
-    from nlosrender.engine.virtual_lights.clearance import OF_COLUMN, TILES, Outlook
+    from nlosrender.engine.virtual_lights.visibility.masks import OF_COLUMN, TILES, Outlook
 
     # from (0, 0, 1) the screen at half the height, from x = -0.3 to -0.02, hides x from -0.6 to -0.04
     screen = np.array([[[-0.3, -0.5, 0.5], [-0.02, -0.5, 0.5], [-0.02, 0.5, 0.5]]])
@@ -321,7 +321,7 @@ def test_a_screen_leaves_the_tiles_beside_its_shadow_open() -> None:
 
 def test_before_a_curved_wall_and_to_few_points_nothing_is_known() -> None:
     """All rays are traced, all the way."""
-    from nlosrender.engine.virtual_lights.clearance import LEAST_POINTS, OF_ALL, Outlook
+    from nlosrender.engine.virtual_lights.visibility.masks import LEAST_POINTS, OF_ALL, Outlook
 
     point, down = np.array([[0.0, 0, 0.5]]), np.array([[0.0, 0, -1]])
     far = flat(0.9)
@@ -333,7 +333,7 @@ def test_before_a_curved_wall_and_to_few_points_nothing_is_known() -> None:
 
 def test_nothing_is_known_of_points_behind_the_wall_or_in_it() -> None:
     """Rays find the wall itself there."""
-    from nlosrender.engine.virtual_lights.clearance import Outlook
+    from nlosrender.engine.virtual_lights.visibility.masks import Outlook
 
     points, down = np.array([[0.0, 0, -0.1], [0, 0, 0]]), np.array([[0.0, 0, -1], [0, 0, -1]])
     assert not cleared(flat(0.9), points, down, down, Outlook.around([RECTANGLE], MANY)).any()

@@ -18,7 +18,7 @@ from rendering import flat_wall
 from varied_scenes import Stage
 
 from nlosrender.bench.meshes import grid_faces, write_ply
-from nlosrender.engine.backend import start_backend
+from nlosrender.engine.backend.start import start_backend
 
 Item = dict[str, Any]
 NEVER = 10**12  # points
@@ -74,7 +74,7 @@ def sheet(folder: Path, n: int, height: float, waves: float, **place: Any) -> It
 
 def both(stage: Stage, monkeypatch: pytest.MonkeyPatch, coarseness: float) -> list[NDArray[np.float64]]:
     """Return the third bounce with clearances, and with rays all the way to every patch."""
-    from nlosrender.engine.virtual_lights import clearance
+    from nlosrender.engine.virtual_lights.visibility import masks as clearance
 
     results, third = [], stage.engine.third
     for least in (0, NEVER):
@@ -168,7 +168,7 @@ def test_nor_of_clusters(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, scan: 
 @pytest.mark.parametrize("scan", ["single", pytest.param("confocal", marks=pytest.mark.slow)])
 def test_nor_of_regions(monkeypatch: pytest.MonkeyPatch, scan: str) -> None:
     """Each region of the sensor grid looks out of a rectangle of its own."""
-    from nlosrender.engine.virtual_lights import regions
+    from nlosrender.engine.virtual_lights.elements import sensor_regions as regions
 
     monkeypatch.setattr(regions, "LEAST_POINTS", 16)
     monkeypatch.setattr(regions, "POINTS_PER_PATCH", 1)
@@ -179,8 +179,8 @@ def test_nor_of_regions(monkeypatch: pytest.MonkeyPatch, scan: str) -> None:
 
 def test_nor_of_further_bounces(monkeypatch: pytest.MonkeyPatch) -> None:
     """Sites of walks are looked at past the same surfaces: from one seed the same impulses arrive."""
-    from nlosrender.engine.path_engine import Budget
-    from nlosrender.engine.virtual_lights import clearance
+    from nlosrender.engine.path.engine import Budget
+    from nlosrender.engine.virtual_lights.visibility import masks as clearance
 
     results = []
     for least in (0, NEVER):

@@ -14,7 +14,7 @@ from quadrature import Setup, rectangle_cells, third_bounce
 from rendering import configured, flat_wall, render
 
 from nlosrender import pipeline
-from nlosrender.engine.backend import start_backend
+from nlosrender.engine.backend.start import start_backend
 from nlosrender.scene.triangle_mesh import TriangleMesh
 
 SENSORS = (3, 2)

@@ -75,7 +75,7 @@ def test_cutting_a_render_into_launches_changes_no_bit(
     config = interreflections(max_bounces=max_bounces, capture={"laser_spot_radius": spot})
     usual = render(config, hidden_fraction=hidden_fraction)
     # loaded by the render above, once the backend had been started
-    sampling = sys.modules["nlosrender.engine.sampling"]
+    sampling = sys.modules["nlosrender.engine.launch.sample_schedule"]
     monkeypatch.setattr(sampling, "FIRST_SAMPLES", 3)
     monkeypatch.setattr(sampling, "PASS_SECONDS", 1e-9)  # one sample per lane and launch
     assert_same(usual, render(config, hidden_fraction=hidden_fraction))

@@ -105,7 +105,7 @@ def test_batches_change_no_bit() -> None:
 
 def test_samples_of_a_launch_all_count(monkeypatch: pytest.MonkeyPatch) -> None:
     """Many short launches are one long one, to the last bit."""
-    from nlosrender.engine import sampling
+    from nlosrender.engine.launch import sample_schedule as sampling
 
     long = see(crowded())
     monkeypatch.setattr(sampling, "FIRST_SAMPLES", 3)
@@ -164,7 +164,7 @@ def test_index_of_a_principled_surface(index: dict[str, float]) -> None:
     ball = {"type": "sphere", "center": [0, 0, 0], "radius": 0.5}
     bsdf = {"type": "principled", "spec_trans": 0.5, **index}
     view = see(view_config({**ball, "bsdf": bsdf}, emitters=[PANEL], spp=16))
-    from nlosrender.engine.line_of_sight.transport import refractive_indices
+    from nlosrender.engine.line_of_sight.view_params import refractive_indices
 
     assert max(np.array(refractive_indices(view.engine.built.scene))) == pytest.approx(1.5, rel=1e-5)
 

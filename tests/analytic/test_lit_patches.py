@@ -11,7 +11,7 @@ from rendering import flat_wall
 from varied_scenes import Stage
 
 from nlosrender.capture.plan import Batch, Tile
-from nlosrender.engine.backend import start_backend
+from nlosrender.engine.backend.start import start_backend
 
 DIFFUSE = {"type": "diffuse", "reflectance": 0.6}
 PLATE = {
@@ -72,7 +72,7 @@ def test_a_batch_after_others_says_what_it_says_alone(scan: str) -> None:
 @pytest.mark.parametrize("scan", ["single", "confocal"])
 def test_one_laser_lights_each_resolution_once(scan: str, lighting: list[int]) -> None:
     """Two resolutions are gathered of every batch, the pilot has gathered some before."""
-    from nlosrender.engine.pilot import pilot_of
+    from nlosrender.engine.launch.pilot_points import pilot_of
 
     third = gather_of(scan)
     for batch in (pilot_of(third.paths.capture), *BATCHES[scan]):
@@ -104,8 +104,8 @@ def test_many_patches_are_not_kept(monkeypatch: pytest.MonkeyPatch, lighting: li
 def test_what_was_lit_for_a_few_points_is_cleared_for_many(monkeypatch: pytest.MonkeyPatch) -> None:
     """A pilot asks rays for everything; the capture after it leaves out those that it would leave out by itself."""
     start_backend("llvm")
-    from nlosrender.engine.pilot import pilot_of
-    from nlosrender.engine.virtual_lights import clearance
+    from nlosrender.engine.launch.pilot_points import pilot_of
+    from nlosrender.engine.virtual_lights.visibility import masks as clearance
 
     monkeypatch.setattr(clearance, "LEAST_POINTS", 20)
     third, batch = gather_of("single"), BATCHES["single"][0]

@@ -12,7 +12,7 @@ from agreement import assert_agrees
 from quadrature import Array, Cells, Frame, Setup, grid_points, midpoints, rectangle_cells, third_bounce, third_bounces
 from rendering import flat_wall, render
 
-from nlosrender.engine.backend import start_backend
+from nlosrender.engine.backend.start import start_backend
 
 REPLICAS = 32
 QUADRATURE = 2e-3  # as derived in test_plate.py

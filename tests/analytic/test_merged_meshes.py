@@ -13,7 +13,7 @@ from rendering import flat_wall
 from varied_scenes import Stage
 
 from nlosrender.bench.meshes import grid_faces, write_ply
-from nlosrender.engine.backend import start_backend
+from nlosrender.engine.backend.start import start_backend
 
 Array = NDArray[np.float64]
 N_FINE = 70  # rows of squares of a fine sheet: 15 mm of 0.8 m, far below the size allowed at coarseness 1, 0.2 m
@@ -75,7 +75,7 @@ def test_clusters_send_on_the_light_of_their_members(
 
     They are lit by their shading normals and seen by their own.
     """
-    from nlosrender.engine.virtual_lights.clusters import Merger
+    from nlosrender.engine.virtual_lights.elements.clusters import Merger
 
     tessellator = tessellated(sheet(tmp_path, N_FINE) | {"face_normals": face_normals}, folder=tmp_path)
     cells, normals, areas = tessellator.cells, tessellator.shared.normals, tessellator.shared.areas
@@ -141,7 +141,7 @@ def rendered(
     config: dict[str, Any], folder: Path, target: float, monkeypatch: pytest.MonkeyPatch
 ) -> tuple[Array, float, Array, int]:
     """Return H (laser, sensor, bin), the error stated, H with no triangles merged, and the number of patches."""
-    from nlosrender.engine.path_engine import Budget
+    from nlosrender.engine.path.engine import Budget
 
     stage = Stage.of(config, folder)
     engine = stage.engine
@@ -150,7 +150,7 @@ def rendered(
     stated = float(np.sqrt(result.variance.sum() / (result.mean**2).sum()))
     used = len(engine.tessellator.patches(budget.fineness))
     engine.tessellator._kept.cache_clear()
-    monkeypatch.setattr("nlosrender.engine.virtual_lights.graded_cells.MERGED", 0.0)
+    monkeypatch.setattr("nlosrender.engine.virtual_lights.elements.size_field.MERGED", 0.0)
     truth = engine.third.gather(stage.batch, min(budget.fineness, 1.0) / 2).values[0, 0, ..., :-1] * engine.paths.scale
     return result.mean[0, stage.bounces.slot(3)], stated, truth, used
 
@@ -229,7 +229,7 @@ def smooth_ball(folder: Path, n: int) -> dict[str, Any]:
 
 def test_a_fine_mesh_of_a_ball_is_the_ball(tmp_path: Path) -> None:
     """Merged triangles with shading normals send on what Mitsuba's own sphere does, within what both state."""
-    from nlosrender.engine.path_engine import Budget
+    from nlosrender.engine.path.engine import Budget
 
     ball = {"type": "sphere", "center": [0.1, -0.1, 0.7], "radius": 0.25}
     ball["bsdf"] = {"type": "diffuse", "reflectance": 0.8}

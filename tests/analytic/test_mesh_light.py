@@ -9,7 +9,7 @@ import pytest
 from quadrature import Setup, box_cells, grid_points, rectangle_cells, third_bounces
 from rendering import flat_wall, render
 
-from nlosrender.engine.backend import start_backend
+from nlosrender.engine.backend.start import start_backend
 
 EDGES = 0.1 * np.arange(61)
 LASER, SENSORS = np.array([[[0.3, -0.2, 0.0]]]), grid_points(5, 3, 2.0, 1.6)
@@ -56,7 +56,7 @@ def test_warnings_go_by_the_normals_that_light_goes_by(tmp_path: Path, normal: i
     from rendering import configured
 
     from nlosrender.capture.part import WHOLE
-    from nlosrender.engine.scene_warnings import scene_warnings
+    from nlosrender.engine.preflight.scene_warnings import scene_warnings
     from nlosrender.pipeline import set_up_engine
 
     corners = ["v -0.1 -0.1 0.8", "v -0.1 0.3 0.8", "v 0.5 0.3 0.8"]

@@ -10,7 +10,7 @@ import pytest
 from rendering import Rendering, configured, flat_wall, render
 
 from nlosrender import pipeline
-from nlosrender.engine.backend import start_backend
+from nlosrender.engine.backend.start import start_backend
 
 POINT = (0.05, 0.05, 0.0)  # one of the four sensor points
 WALKS = {"engine": "path", "max_bounces": 5, "spp": 65536}
@@ -37,7 +37,7 @@ def scene(item: dict[str, Any]) -> dict[str, Any]:
 def warnings_of(config: dict[str, Any]) -> tuple[str, ...]:
     """Return what the scene's geometry is warned of."""
     backend = start_backend("llvm")
-    from nlosrender.engine.scene_warnings import scene_warnings
+    from nlosrender.engine.preflight.scene_warnings import scene_warnings
 
     validated = configured(config)
     built = pipeline.load_scene(validated)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from rendering import Rendering, configured, flat_wall, render
 
 from nlosrender import pipeline
-from nlosrender.engine.backend import start_backend
+from nlosrender.engine.backend.start import start_backend
 
 TARGET = 0.01
 CENTER = (0.05, 0.05)
@@ -178,7 +178,7 @@ def test_what_goes_to_and_fro_before_a_laser_point_is_not_taken_for_known() -> N
     fifth = result.bounce(5)
     assert fifth.sum() > 0
     assert np.all(np.sqrt(result.bounce_variance(5)) >= 2.9 * fifth)
-    from nlosrender.engine.scene_warnings import scene_warnings
+    from nlosrender.engine.preflight.scene_warnings import scene_warnings
 
     for max_bounces, is_told in ((5, True), (3, False)):
         said = scene_warnings(set_up(scene(plate(1e-4), scan="single", max_bounces=max_bounces)))

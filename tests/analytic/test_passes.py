@@ -15,8 +15,8 @@ from views import view_config
 from nlosrender import pipeline
 from nlosrender.capture.plan import Batch, Unit
 from nlosrender.capture.tile import Tile
-from nlosrender.engine.backend import start_backend
-from nlosrender.engine.passes import Kept, Passes, Snapshot
+from nlosrender.engine.backend.start import start_backend
+from nlosrender.engine.launch.passes import Kept, Passes, Snapshot
 from nlosrender.files.unit_state import read_state, write_state
 from nlosrender.rendering.units import render_unit
 
@@ -65,7 +65,7 @@ def prepared(scene: dict[str, Any]) -> Callable[[Passes], Any]:
     """Return what renders all of a capture as one unit, every time as a process that has just been started."""
     config = configured(scene)
     backend = start_backend("llvm", colored=config.is_colored)
-    from nlosrender.engine.path_engine import Budget
+    from nlosrender.engine.path.engine import Budget
 
     def render(passes: Passes) -> Any:
         plan, engine, _ = pipeline.set_up_engine(config, backend)
@@ -84,8 +84,9 @@ def prepared(scene: dict[str, Any]) -> Callable[[Passes], Any]:
 def _short_passes(monkeypatch: pytest.MonkeyPatch) -> None:
     """Passes of a few paths, patches and sites."""
     start_backend("llvm")
-    from nlosrender.engine import sampling
-    from nlosrender.engine.virtual_lights import further_bounces, gather_passes
+    from nlosrender.engine.launch import sample_schedule as sampling
+    from nlosrender.engine.virtual_lights.gather import gather_passes
+    from nlosrender.engine.virtual_lights.vpls import gather as further_bounces
 
     monkeypatch.setattr(sampling, "MOST_AT_FIRST", 2**9)
     monkeypatch.setattr(sampling, "PASS_SECONDS", math.inf)

@@ -55,7 +55,7 @@ def test_every_round_shape_is_refined() -> None:
     """From one resolution to the next, whatever the number of patches of the others: its error would not show."""
     from test_virtual_lights import start
 
-    from nlosrender.engine.virtual_lights.tessellator import Tessellator
+    from nlosrender.engine.virtual_lights.elements.tessellator import Tessellator
 
     balls = [{"type": "sphere", "center": [x, 0, 1], "radius": radius} for x, radius in ((0.5, 0.3), (-0.5, 0.02))]
     rods = [{"type": "cylinder", "center": [0, 0.5, 1], "axis": [1, 0, 0], "radius": 0.01, "height": 0.8}]
@@ -71,7 +71,7 @@ def test_a_thin_rod_is_cut_along_as_a_flat_strip_is() -> None:
     """Its radius limits the patches around it, not along it: their number falls from (length / radius) to its root."""
     from test_virtual_lights import start
 
-    from nlosrender.engine.virtual_lights.tessellator import Tessellator
+    from nlosrender.engine.virtual_lights.elements.tessellator import Tessellator
 
     rod = {"type": "cylinder", "center": [0, 0.5, 1], "axis": [1, 0, 0], "radius": 0.002, "height": 0.8}
     built, capture, *_ = start(flat_wall(rod))

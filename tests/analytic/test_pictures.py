@@ -17,7 +17,7 @@ from rendering import configured, flat_wall, render
 from views import view_config
 
 from nlosrender import pipeline
-from nlosrender.engine.backend import start_backend
+from nlosrender.engine.backend.start import start_backend
 
 TEXELS = np.array([[0.1, 0.9, 0.3], [0.6, 0.2, 0.8]], dtype=np.float32)  # not symmetric in any way
 ROWS, COLUMNS = TEXELS.shape

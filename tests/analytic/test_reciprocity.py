@@ -9,7 +9,7 @@ import pytest
 from rendering import configured, flat_wall
 
 from nlosrender import pipeline
-from nlosrender.engine.backend import start_backend
+from nlosrender.engine.backend.start import start_backend
 
 GREY = {"type": "diffuse", "reflectance": 0.6}
 PLATE = {"type": "rectangle", "width": 0.8, "height": 0.6, "center": [0.1, 0, 1.0], "normal": [0, 0, -1], "bsdf": GREY}

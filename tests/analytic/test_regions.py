@@ -8,7 +8,7 @@ from rendering import configured, flat_wall
 
 from nlosrender import pipeline
 from nlosrender.capture.plan import Batch, Tile
-from nlosrender.engine.backend import start_backend
+from nlosrender.engine.backend.start import start_backend
 
 ROOM = {"type": "room", "size": [2.0, 1.6, 1.2], "bsdf": {"type": "diffuse", "reflectance": 0.5}}
 PLATE = {"type": "rectangle", "width": 0.8, "height": 0.6, "center": [0, 0, 1.0], "normal": [0, 0, -1]}
@@ -29,7 +29,7 @@ def engine_of(*hidden: dict, scan: str = "single", sensors: tuple[int, int] = SE
 def eager(monkeypatch: pytest.MonkeyPatch) -> None:
     """Make regions of few sensor points, at no price: a test has no time for grids where they pay."""
     start_backend("llvm")
-    from nlosrender.engine.virtual_lights import regions
+    from nlosrender.engine.virtual_lights.elements import sensor_regions as regions
 
     monkeypatch.setattr(regions, "LEAST_POINTS", 16)
     monkeypatch.setattr(regions, "POINTS_PER_PATCH", 1)
@@ -39,7 +39,7 @@ def eager(monkeypatch: pytest.MonkeyPatch) -> None:
 def undivided(monkeypatch: pytest.MonkeyPatch):
     """Return a function that makes an engine as ``engine_of``, without regions."""
     start_backend("llvm")
-    from nlosrender.engine.virtual_lights import tessellator
+    from nlosrender.engine.virtual_lights.elements import tessellator
 
     def make(*hidden: dict, **more):
         with monkeypatch.context() as patch:
@@ -116,7 +116,7 @@ def test_cells_are_no_longer_than_their_distance_from_the_region() -> None:
 def test_cells_that_are_small_enough_are_quartered_by_nobody() -> None:
     """Parted first and quartered then, cells are those quartered at once: as many, of the same sizes and distances."""
     engine = engine_of(ROOM, PLATE)
-    from nlosrender.engine.virtual_lights.cells import Cells, parted, quartered, triangles_of_mesh
+    from nlosrender.engine.virtual_lights.elements.subdivision import Cells, parted, quartered, triangles_of_mesh
 
     distance, shapes = engine.tessellator.distance, engine.built.hidden_shapes
     once = quartered(Cells.joined([triangles_of_mesh(engine.built, 1, shape) for shape in shapes]), distance, None, 0.3)

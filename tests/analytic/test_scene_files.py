@@ -18,7 +18,7 @@ from nlosrender.config.bsdf_table import MEDIA, METALS
 from nlosrender.config.document import Config
 from nlosrender.config.mitsuba_xml import read_mitsuba_xml
 from nlosrender.config.xml_shapes import placement
-from nlosrender.engine.backend import start_backend
+from nlosrender.engine.backend.start import start_backend
 from nlosrender.errors import ConfigError
 from nlosrender.scene.transforms import transform_matrix
 
@@ -65,7 +65,7 @@ def test_glass_in_a_blend_of_a_scene_file(tmp_path: Path) -> None:
       <bsdf type='diffuse'/></bsdf></shape>
       <shape type='sphere'><bsdf type='twosided'><bsdf type='principled'/></bsdf></shape>"""
     view = seen(tmp_path, blend)
-    from nlosrender.engine.line_of_sight.transport import refractive_indices
+    from nlosrender.engine.line_of_sight.view_params import refractive_indices
 
     indices = np.array(refractive_indices(view.engine.built.scene))
     assert indices[indices != 1].tolist() == [pytest.approx(1.3)]
@@ -126,7 +126,7 @@ def test_a_mask_of_a_scene_file(tmp_path: Path, opacity: str, warns: bool) -> No
 def bent_and_unbent(config: Config) -> list[str]:
     """What is said of light that crosses a surface in two ways, before a render."""
     _, engine, _ = pipeline.set_up_engine(config, pipeline.started_backend(config))
-    from nlosrender.engine.scene_warnings import scene_warnings
+    from nlosrender.engine.preflight.scene_warnings import scene_warnings
 
     return [text for text in scene_warnings(engine) if "bent as well as unbent" in text]
 

@@ -10,7 +10,7 @@ import pytest
 from rendering import Scene, configured, flat_wall, render
 
 from nlosrender import pipeline
-from nlosrender.engine.backend import start_backend
+from nlosrender.engine.backend.start import start_backend
 
 GREY = {"type": "diffuse", "reflectance": 0.7}
 BLACK = {"type": "diffuse", "reflectance": 0.0}

@@ -12,7 +12,7 @@ from rendering import configured, flat_wall, render
 from views import view_config
 
 from nlosrender import pipeline
-from nlosrender.engine.backend import start_backend
+from nlosrender.engine.backend.start import start_backend
 from nlosrender.errors import ConfigError
 from nlosrender.scene.mesh_file import read_mesh
 

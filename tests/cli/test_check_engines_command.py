@@ -10,7 +10,7 @@ from commands import run
 
 from nlosrender.analysis.engine_check import Trial, compare_trials
 from nlosrender.capture.bounces import BounceAxis
-from nlosrender.engine.pilot import Pilot, Selection
+from nlosrender.engine.launch.pilot_points import Pilot, Selection
 from nlosrender.errors import EXIT_BAD_INPUT, EXIT_COMPARISON_EXCEEDED, EXIT_OK, EXIT_USAGE
 
 PILOT = Pilot(Selection((3, 8, 21)), Selection((0,)))

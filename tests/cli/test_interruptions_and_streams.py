@@ -18,7 +18,7 @@ from point_captures import cells, point_light, points_header, write_points
 
 from nlosrender.capture.part import Selection
 from nlosrender.cli.progress import progress_bar
-from nlosrender.engine import backend
+from nlosrender.engine.backend import start as backend
 from nlosrender.errors import EXIT_BAD_INPUT, EXIT_FAILURE, EXIT_INTERRUPTED, EXIT_OK, FileError
 from nlosrender.files.exports import export_capture
 from nlosrender.files.filled_folder import filled_folder

@@ -39,10 +39,10 @@ def folder(tmp_path: Path) -> Path:
 
 def test_every_command_has_the_same_line(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """From the file's text, worked out by hand; the warnings come with each of them."""
-    from nlosrender.engine import backend
+    from nlosrender.engine.backend import start as backend
 
     backend.start_backend("llvm")
-    from nlosrender.engine import forecast
+    from nlosrender.engine.preflight import time_estimate as forecast
 
     monkeypatch.setattr(forecast, "PILOT_SECONDS", 0.02)
     checked, planned = run(folder, "validate", "a.yaml"), run(folder, "plan", "a.yaml")

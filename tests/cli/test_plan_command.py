@@ -48,10 +48,10 @@ runner = CliRunner()
 @pytest.fixture(autouse=True)
 def short_pilot(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """Half a second per pilot is for users."""
-    from nlosrender.engine import backend
+    from nlosrender.engine.backend import start as backend
 
     backend.start_backend("llvm")  # Mitsuba starts before the engine modules are imported
-    from nlosrender.engine import forecast
+    from nlosrender.engine.preflight import time_estimate as forecast
 
     monkeypatch.setattr(forecast, "PILOT_SECONDS", 0.02)
     monkeypatch.chdir(tmp_path)
@@ -160,7 +160,7 @@ def test_walks_take_all_the_time_there_is(bounces: str, takes_all: bool) -> None
 
 def test_the_impossible_is_told_in_years(monkeypatch: pytest.MonkeyPatch) -> None:
     """A target of 1e-12 takes years: said so, with what to do, and why it is never reached."""
-    from nlosrender.engine import forecast
+    from nlosrender.engine.preflight import time_estimate as forecast
 
     monkeypatch.setattr(forecast, "SETTLING_SECONDS", 0.1)
     changes = ["--set", "render.engine=path", "--set", "render.target_error=1e-12"]

@@ -126,7 +126,7 @@ def test_the_time_limit_counts_earlier_runs(tmp_path: Path, monkeypatch: pytest.
     limited = scene(spp=None, time_limit_s=1.5, **TIGHT)
     with pytest.raises(InterruptedRender):
         render(limited, tmp_path / "a.hdf5", progress=_Interruption(0.7, KeyboardInterrupt))
-    from nlosrender.engine.path_engine import PathEngine
+    from nlosrender.engine.path.engine import PathEngine
 
     true_render, limits = PathEngine.render, []
 

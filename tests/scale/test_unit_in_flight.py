@@ -13,7 +13,7 @@ import pytest
 from rendering import configured, flat_wall
 
 from nlosrender.config.document import Config
-from nlosrender.engine.backend import start_backend
+from nlosrender.engine.backend.start import start_backend
 from nlosrender.errors import FileError, IncompleteRender, InterruptedRender
 from nlosrender.files.partial_capture import PartialCapture
 from nlosrender.pipeline import render_capture
@@ -26,7 +26,7 @@ PLATE = {"type": "rectangle", "width": 0.8, "height": 0.6, "center": [0.1, 0, 1.
 def config(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Config:
     """A capture of one unit in several launches, however fast the machine; a signal ends it at once."""
     start_backend("llvm")
-    from nlosrender.engine import sampling
+    from nlosrender.engine.launch import sample_schedule as sampling
 
     monkeypatch.setattr(sampling, "PASS_SECONDS", math.inf)  # launches of 1, 4, 20, ... paths a lane
     monkeypatch.setattr(unit_in_flight, "SOON_SECONDS", 0.0)

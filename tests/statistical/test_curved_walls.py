@@ -14,7 +14,7 @@ from rendering import flat_wall, render
 from varied_scenes import Stage, ball, diffuse, plate
 from wall_meshes import flat, globe, sheet, wavy, write_ply
 
-from nlosrender.engine.backend import start_backend
+from nlosrender.engine.backend.start import start_backend
 
 GREY = {"bsdf": diffuse(0.6)}
 WITHIN, BEFORE = ball((0.1, 0.05, 0.1), 0.2), plate((0.1, -0.05, 1.6), (0.1, 0.2, -1.0), (0.7, 0.6))
@@ -52,7 +52,7 @@ def compare(
 ) -> None:
     """Render a wall with both engines, ``seeds`` times each, and compare sums."""
     start_backend("llvm")
-    from nlosrender.engine.path_engine import Budget
+    from nlosrender.engine.path.engine import Budget
 
     write_ply(folder / "waves.ply", *sheet(wavy(2.0, 1.6, 0.1), 12, 10))
     stage = Stage.of(scene(name, scan, max_bounces=max_bounces), folder)
@@ -120,7 +120,7 @@ def test_a_finer_and_finer_globe_becomes_the_sphere(tmp_path: Path) -> None:
 def test_points_on_the_edges_of_a_mesh_wall_are_said(tmp_path: Path) -> None:
     """3 columns of sensor points over 12 of quads: the middle one lies on an edge; the warning counts its points."""
     start_backend("llvm")
-    from nlosrender.engine.scene_warnings import scene_warnings
+    from nlosrender.engine.preflight.scene_warnings import scene_warnings
 
     write_ply(tmp_path / "waves.ply", *sheet(wavy(2.0, 1.6, 0.1), 12, 10))
     config = scene("waves", "single")

@@ -10,7 +10,7 @@ from agreement import assert_agrees
 from rendering import Rendering, configured, flat_wall, render
 
 from nlosrender import pipeline
-from nlosrender.engine.backend import start_backend
+from nlosrender.engine.backend.start import start_backend
 
 REPLICAS = 32
 GREY = {"type": "diffuse", "reflectance": 0.8}
@@ -30,7 +30,7 @@ def path_engine(config: dict, **options: object):
     """Return the path engine of a configuration with fields of its options, and its plan."""
     validated = configured(config)
     backend = start_backend("llvm", colored=False)
-    from nlosrender.engine.path_engine import PathEngine
+    from nlosrender.engine.path.engine import PathEngine
 
     built = pipeline.load_scene(validated)
     capture, time_axis = pipeline.describe_capture(validated, built.wall, built)
@@ -77,7 +77,7 @@ def test_a_number_of_samples_that_is_no_multiple_is_not_biased() -> None:
     sums = {}
     for every, seeds in ((5, range(1, 9)), (1, range(101, 109))):
         plan, engine = path_engine(config, replicas=REPLICAS, hidden_fraction=1.0, further_every=every)
-        from nlosrender.engine.path_engine import Budget
+        from nlosrender.engine.path.engine import Budget
 
         sums[every] = []
         for seed in seeds:
@@ -96,7 +96,7 @@ def test_paths_that_begin_directly_agree_with_traced_ones(
     max_bounces: int | None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Both loops trace the same paths: all bounces of a mesh that hides parts of itself."""
-    from nlosrender.engine import path_integrator
+    from nlosrender.engine.path import full_loop as path_integrator
 
     box = {"type": "box", "center": [0.1, 0.1, 0.5], "size": [0.3, 0.2, 0.2], "rotate_deg": [10, 20, 30], "bsdf": GREY}
     config = scene(*HIDDEN, box, max_bounces=max_bounces, split_bounces=False)
@@ -111,7 +111,7 @@ def test_paths_that_begin_directly_agree_with_traced_ones(
 @pytest.mark.parametrize("hidden_fraction", [0.0, 1.0])
 def test_launches_and_batches_do_not_show(hidden_fraction: float, monkeypatch: pytest.MonkeyPatch) -> None:
     """The same bits in a few launches and in many, in one batch and in several."""
-    from nlosrender.engine import sampling
+    from nlosrender.engine.launch import sample_schedule as sampling
 
     config = scene(sensors=(5, 7), spp=200)
     options: dict = {"hidden_fraction": hidden_fraction, "further_every": 3}
@@ -132,7 +132,7 @@ def test_all_turns_are_equally_likely_and_taken_together() -> None:
     import mitsuba as mi
     from scipy import stats
 
-    from nlosrender.engine.further_paths import TURN_TILE, first_turns
+    from nlosrender.engine.path.roulette import TURN_TILE, first_turns
 
     nx, ny, replicas, every = 50, 42, 3, 5
     points = np.arange(nx * ny, dtype=np.uint32)
@@ -154,7 +154,7 @@ def test_all_turns_are_equally_likely_and_taken_together() -> None:
 )
 def test_time_and_variance_are_balanced(third: float, further: float, expected: int) -> None:
     """The share has the least product of variance A + n B and time 1 + 2 / n: n = sqrt(2 A / B), from 1 to 8."""
-    from nlosrender.engine.further_paths import LoopCost, best_every
+    from nlosrender.engine.path.roulette import LoopCost, best_every
 
     cost = LoopCost(2.0, 8, 3)
     assert best_every(lambda n: third + n * further, cost, split=False) == expected
@@ -167,7 +167,7 @@ def test_time_and_variance_are_balanced(third: float, further: float, expected: 
 @pytest.mark.parametrize("max_bounces", [3, None])
 def test_what_cannot_matter_is_not_thinned(max_bounces: int | None) -> None:
     """Every path goes on without roulette, where few are traced, and where bounces kept apart are found by BSDF."""
-    from nlosrender.engine.path_engine import Budget
+    from nlosrender.engine.path.engine import Budget
 
     many, few = Budget(spp=2**22), Budget(spp=64)
     _, engine = path_engine(scene(max_bounces=max_bounces, split_bounces=False))
@@ -182,8 +182,8 @@ def test_what_cannot_matter_is_not_thinned(max_bounces: int | None) -> None:
 @pytest.mark.parametrize("hidden_fraction", [0.0, 1.0])
 def test_any_frame_serves_where_only_normals_matter(hidden_fraction: float) -> None:
     """Grey diffuse surfaces look the same from frames of their textures and from any others around the normal."""
-    from nlosrender.engine.path_engine import Budget
-    from nlosrender.engine.path_integrator import load_path_integrator
+    from nlosrender.engine.path.engine import Budget
+    from nlosrender.engine.path.full_loop import load_path_integrator
 
     plan, engine = path_engine(scene(), replicas=REPLICAS, hidden_fraction=hidden_fraction)
     assert engine.settings.only_normals_matter

@@ -13,7 +13,7 @@ import pytest
 from numpy.typing import NDArray
 from varied_scenes import SIDE, SLANTED, TRAPS, Item, Stage, Trap, ball, diffuse, plate, room
 
-from nlosrender.engine.backend import start_backend
+from nlosrender.engine.backend.start import start_backend
 
 Array = NDArray[np.float64]
 N_SCENES = 44
@@ -100,7 +100,7 @@ class Honesty:
 def judged(trap: Trap, folder: Path) -> Honesty:
     """Render a scene as a file would hold it, and once more far better."""
     start_backend("llvm")
-    from nlosrender.engine.path_engine import Budget
+    from nlosrender.engine.path.engine import Budget
 
     stage: Stage = trap.stage(folder)
     assert stage.engine.name == "virtual_lights"
@@ -113,7 +113,7 @@ def judged(trap: Trap, folder: Path) -> Honesty:
 
 def compared(point: str, target: float, result: Any, truth: Array, truth_variance: Array) -> Honesty:
     """Return how a histogram compares to a truth with a variance of its own, which is no error of the histogram."""
-    from nlosrender.engine.histogram import relative_l2_error
+    from nlosrender.engine.launch.histogram import relative_l2_error
 
     noise, energy = float(truth_variance.sum()), float((truth**2).sum())
     assert energy > 0, f"{point}: nothing arrives in the window"
@@ -185,7 +185,7 @@ def test_the_path_engine_confirms_the_error(number: int, tmp_path: Path) -> None
     """Errors against the other engine, its noise taken off: what both resolutions miss would show."""
     trap = random_trap(number)
     start_backend("llvm")
-    from nlosrender.engine.path_engine import Budget
+    from nlosrender.engine.path.engine import Budget
 
     stage = trap.stage(tmp_path)
     target = trap.settings["target_error"]
@@ -220,7 +220,7 @@ def touching_scene() -> Trap:
 def test_noise_falls_as_the_square_root_of_the_rounds(scene: Callable[[], Trap], tmp_path: Path) -> None:
     """From 1 to 64 rounds, with no bin far off: 1/r^2 near the sensor points is sampled for."""
     start_backend("llvm")
-    from nlosrender.engine.path_engine import Budget
+    from nlosrender.engine.path.engine import Budget
 
     stage, rounds, n_seeds = scene().stage(tmp_path), np.array([1, 4, 16, 64]), 8
     errors = []

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from rendering import configured, flat_wall, render
 from varied_scenes import GREY_WALL, LEGS, SIDE, SLANTED, Item, Stage, room
 
-from nlosrender.engine.backend import start_backend
+from nlosrender.engine.backend.start import start_backend
 
 Array = NDArray[np.float64]
 SEEDS, OTHER_SEEDS = range(1, 11), range(101, 111)
@@ -31,7 +31,7 @@ def scene(*hidden: Item, scan: str = "single", n_bins: int = SHORT, width: float
 
 def with_outside(stage: Stage, engine: str, seeds: range) -> Array:
     """Render once per seed; return (seed, row, bin), the light outside the window as one more bin."""
-    from nlosrender.engine.path_engine import Budget
+    from nlosrender.engine.path.engine import Budget
 
     results = stage.repeated(Budget(**BUDGETS[engine]), seeds)
     rows = np.concatenate([results.means, results.outsides[..., None]], axis=-1)
@@ -92,7 +92,7 @@ def test_a_window_that_holds_everything_keeps_every_bit(
     engine: str, scan: str, max_bounces: int | None, width: float
 ) -> None:
     """Nothing is late: not a random number is drawn for it. Where bounces end, nothing is even compared."""
-    from nlosrender.engine.path_engine import Budget
+    from nlosrender.engine.path.engine import Budget
 
     config = scene(*OPEN, scan=scan, n_bins=LONG, width=width, max_bounces=max_bounces, engine=engine)
     stage = Stage.of(config)
@@ -130,7 +130,7 @@ def test_kernels_do_not_know_where_the_window_ends() -> None:
     stage = Stage.of(scene(ROOM, engine="virtual_lights"))
     import drjit as dr
 
-    from nlosrender.engine.path_engine import Budget
+    from nlosrender.engine.path.engine import Budget
 
     engine, lights = stage.engine.paths, stage.engine
     hashes = []
@@ -175,9 +175,10 @@ def test_without_survivors_no_light_comes_after_the_window(engine: str, scan: st
     One sensor point and one laser point: the bound is exact. The third bounce of the virtual lights is no walk's.
     """
     stage = Stage.of(scene(ROOM, engine=engine, scan=scan, sensors=(1, 1), capture=LEGS, width=0.2))
-    from nlosrender.engine import deadline
-    from nlosrender.engine.path_engine import Budget
-    from nlosrender.engine.virtual_lights import sites, walks
+    from nlosrender.engine.launch import time_gate as deadline
+    from nlosrender.engine.path.engine import Budget
+    from nlosrender.engine.virtual_lights.vpls import sampler as sites
+    from nlosrender.engine.virtual_lights.vpls import subpaths as walks
 
     def outside_and_inside() -> tuple[float, float]:
         result = stage.seeded(3).render(stage.batch, Budget(**BUDGETS[engine]))
@@ -217,7 +218,7 @@ def test_one_late_path_in_eight_carries_the_light_of_all() -> None:
     import drjit as dr
     import mitsuba as mi
 
-    from nlosrender.engine.deadline import Deadline, thinned_out
+    from nlosrender.engine.launch.time_gate import Deadline, thinned_out
 
     n = 2**16
     lane = dr.arange(mi.UInt32, n)
@@ -246,7 +247,7 @@ def test_one_late_path_in_eight_carries_the_light_of_all() -> None:
 def share_in_time(late_roulette: bool) -> float:
     """Return the share of a round's impulses that could reach some sensor point within the window."""
     stage = Stage.of(scene(ROOM, engine="virtual_lights"))
-    from nlosrender.engine.virtual_lights import further_bounces
+    from nlosrender.engine.virtual_lights.vpls import gather as further_bounces
 
     engine = with_options(stage.engine, late_roulette=late_roulette)
     shares, walk_back = [], further_bounces.walk_back
@@ -289,7 +290,7 @@ def test_sites_that_only_late_light_reaches_are_few() -> None:
 
 def test_what_is_thinned_out_is_said() -> None:
     """The plan names it where paths or walks may end after the window, and only there."""
-    from nlosrender.engine.skipped import skipped_work
+    from nlosrender.engine.preflight.omitted_work import skipped_work
 
     what = "most paths on which light can only arrive after the time window"
     for keys, expected in (

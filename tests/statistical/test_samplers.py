@@ -12,8 +12,8 @@ from rendering import configured, flat_wall
 from scipy import stats
 
 from nlosrender import pipeline
-from nlosrender.engine.backend import start_backend
-from nlosrender.engine.low_discrepancy import recurrence_steps
+from nlosrender.engine.backend.start import start_backend
+from nlosrender.engine.launch.recurrence import recurrence_steps
 
 N = 2**20
 SPHERE = {"type": "sphere", "center": [0.4, 0.2, 0.7], "radius": 0.2}
@@ -47,7 +47,7 @@ def sampled() -> Sampled:
     import drjit as dr
     import mitsuba as mi
 
-    from nlosrender.engine.surface_sampler import SurfaceSampler
+    from nlosrender.engine.launch.surface_sampler import SurfaceSampler
 
     built = pipeline.load_scene(config)
     sampler = SurfaceSampler(built)
@@ -180,7 +180,7 @@ def test_the_guide_leads_to_the_entry_that_covers_a_number() -> None:
     start_backend("llvm")
     import mitsuba as mi
 
-    from nlosrender.engine.surface_sampler import SurfaceSampler
+    from nlosrender.engine.launch.surface_sampler import SurfaceSampler
 
     sampler = SurfaceSampler(pipeline.load_scene(config))
     edges = np.array(sampler._table.edges).astype(np.int64)

@@ -6,7 +6,7 @@ import numpy as np
 from rendering import flat_wall, render
 from scipy.ndimage import convolve1d
 
-from nlosrender.engine.backend import start_backend
+from nlosrender.engine.backend.start import start_backend
 
 PLATE = {"type": "rectangle", "width": 0.8, "height": 0.6, "center": [0.1, 0, 1], "normal": [0, 0, -1]}
 BINS = (1.8, 0.01, 160)
@@ -15,7 +15,7 @@ WIDTH = 8  # bins
 
 def test_a_kernel_estimates_the_smoothed_histogram_with_less_noise() -> None:
     """H with a kernel is H without it, convolved; its variance is far smaller; its total is the same."""
-    from nlosrender.engine.temporal_kernel import kernel_shares
+    from nlosrender.engine.launch.temporal_kernel import kernel_shares
 
     start_backend()
     settings = {"engine": "path", "spp": 4096, "bins": BINS, "sensors": (3, 2)}

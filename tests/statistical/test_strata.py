@@ -7,7 +7,7 @@ import pytest
 from agreement import assert_agrees
 from rendering import configured, flat_wall, render
 
-from nlosrender.engine.backend import start_backend
+from nlosrender.engine.backend.start import start_backend
 
 PLATE = {
     "type": "rectangle",
@@ -43,7 +43,7 @@ def test_every_stratum_is_visited_once(first: int, n: int) -> None:
     """Path i of a stage of n takes its first coordinate from the i-th of n equal parts, at one place in all parts."""
     import mitsuba as mi
 
-    from nlosrender.engine.strata import Strata, first_coordinate
+    from nlosrender.engine.launch.systematic_sequence import Strata, first_coordinate
 
     starts = np.array([0, 1, 2**31, 2**32 - 1], dtype=np.uint32)
     strata = Strata.of_stage(range(first, first + n), mi.UInt32(starts))
@@ -64,8 +64,8 @@ def test_the_place_within_the_parts_is_uniform(seed: int) -> None:
     import mitsuba as mi
     from scipy import stats
 
-    from nlosrender.engine.strata import Strata, first_coordinate
-    from nlosrender.engine.transport import LaneRandomness
+    from nlosrender.engine.launch.launch_params import LaneRandomness
+    from nlosrender.engine.launch.systematic_sequence import Strata, first_coordinate
 
     n = 5
     lanes = mi.UInt32(np.arange(4096, dtype=np.uint32))
@@ -78,8 +78,8 @@ def test_the_place_within_the_parts_is_uniform(seed: int) -> None:
 @pytest.mark.parametrize("max_bounces", [3, 5])
 def test_launches_do_not_show(max_bounces: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """The same samples give the same bits in three launches and in many."""
-    from nlosrender.engine import sampling
-    from nlosrender.engine.path_engine import Budget
+    from nlosrender.engine.launch import sample_schedule as sampling
+    from nlosrender.engine.path.engine import Budget
 
     plan, engine = path_engine(flat_wall(PLATE, BEHIND, max_bounces=max_bounces))
     budget = Budget(spp=165 * engine.options.replicas)  # the first two launches take 32 and 128
@@ -95,7 +95,7 @@ def test_launches_do_not_show(max_bounces: int, monkeypatch: pytest.MonkeyPatch)
 @pytest.mark.parametrize("hidden", [(PLATE,), (PLATE, BEHIND)], ids=["alone", "occluded"])
 def test_direct_paths_agree_with_traced_ones(scan: str, hidden: tuple, monkeypatch: pytest.MonkeyPatch) -> None:
     """Asking whether a sampled point is seen gives what tracing a ray to it and looking what it meets gives."""
-    from nlosrender.engine import path_integrator
+    from nlosrender.engine.path import full_loop as path_integrator
 
     config = flat_wall(*hidden, scan=scan, spp=8192, bins=(1.0, 0.05, 60))
     direct = render(config, replicas=16)
@@ -117,8 +117,8 @@ def test_rays_that_nothing_can_stop_are_left_out(max_bounces: int, hidden: dict)
     """One convex object alone, or a convex room: the same numbers with and without visibility rays."""
     from dataclasses import replace
 
-    from nlosrender.engine.path_engine import Budget
-    from nlosrender.engine.path_integrator import load_path_integrator
+    from nlosrender.engine.path.engine import Budget
+    from nlosrender.engine.path.full_loop import load_path_integrator
 
     plan, engine = path_engine(flat_wall(hidden, max_bounces=max_bounces, spp=512))
     assert not engine.settings.needs_visibility

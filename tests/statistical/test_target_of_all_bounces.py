@@ -9,7 +9,7 @@ import pytest
 from rendering import configured, flat_wall
 
 from nlosrender import pipeline
-from nlosrender.engine.backend import start_backend
+from nlosrender.engine.backend.start import start_backend
 from nlosrender.rendering.outcome import MISSED_BY
 
 BOWL = {"type": "sphere", "center": [0, 0, 3], "radius": 3, "inside": True}
@@ -38,7 +38,7 @@ def test_the_second_bounce_counts_for_the_target(tmp_path: Path, engine: str) ->
         assert report.error_estimate > TARGET / 2
         return
     backend = start_backend("llvm")
-    from nlosrender.engine.path_engine import Budget
+    from nlosrender.engine.path.engine import Budget
 
     engines = [pipeline.set_up_engine(config, backend)[1] for _ in range(2)]
     engines[1].paths.second_squares = lambda batch: 0.0  # as if the third bounce were all

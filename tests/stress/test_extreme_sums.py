@@ -8,7 +8,7 @@ from conftest import Ledger
 from rendering import render
 from stressed import BOTH, ENGINES, PLATE, relative_difference, scene
 
-from nlosrender.engine.backend import start_backend
+from nlosrender.engine.backend.start import start_backend
 
 SIDE = {"type": "rectangle", "width": 1.0, "height": 1.0, "center": [-0.5, 0.0, 0.5], "normal": [1.0, 0.2, -0.1]}
 
@@ -19,7 +19,7 @@ def deposited(first: float, then: float, times: int) -> float:
     import drjit as dr
     import mitsuba as mi
 
-    from nlosrender.engine.histogram import DeviceHistogram, HistogramShape
+    from nlosrender.engine.launch.histogram import DeviceHistogram, HistogramShape
 
     lanes = 128
     histogram = DeviceHistogram(HistogramShape(2, lanes // 2, 1, 1, 1, 3))

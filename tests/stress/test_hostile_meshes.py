@@ -99,7 +99,7 @@ def test_mixed_polygons_are_read_in_turn(tmp_path: Path) -> None:
 
 def test_normals_are_those_mitsuba_computes(tmp_path: Path) -> None:
     """A file without normals gets the angle-weighted ones that Mitsuba's own reader gives it, to float32."""
-    from nlosrender.engine.backend import start_backend
+    from nlosrender.engine.backend.start import start_backend
 
     start_backend("llvm")
     import mitsuba as mi

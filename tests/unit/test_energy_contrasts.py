@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from nlosrender.engine import backend
+from nlosrender.engine.backend import start as backend
 
 backend.start_backend("llvm")  # Mitsuba starts before the engine modules are imported
 
-from nlosrender.engine.energy_contrasts import (  # noqa: E402
+from nlosrender.engine.launch.energy_contrasts import (  # noqa: E402
     CONTRASTS,
     RoundContrasts,
     contrasts_of_deviation,

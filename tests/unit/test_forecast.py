@@ -15,7 +15,7 @@ from nlosrender.capture.bounces import BounceAxis
 from nlosrender.capture.limits import refuse_impossible_grids, refuse_impossible_samples
 from nlosrender.capture.part import Part, Tiling
 from nlosrender.capture.plan import Batch, Plan, Tile, Unit
-from nlosrender.engine.backend import start_backend
+from nlosrender.engine.backend.start import start_backend
 from nlosrender.errors import ConfigError
 from nlosrender.files.size import FileSize, disk_warnings, forecast_size
 
@@ -160,7 +160,7 @@ def skipped(*hidden, wall=None, **render) -> dict[str, str]:
     scene["scene"]["relay_wall"] = wall or scene["scene"]["relay_wall"]
     config = configured(scene)
     _, _, engine = prepared(config)
-    from nlosrender.engine.skipped import skipped_work  # the backend has to be started before
+    from nlosrender.engine.preflight.omitted_work import skipped_work  # the backend has to be started before
 
     items = skipped_work(engine, scene_is_colored=config.scene.is_colored)
     return {item.what: item.why for item in items}
@@ -221,7 +221,7 @@ def test_no_triangle_is_said_to_be_skipped_when_none_is():
 
 
 def warnings_of(*hidden, scan="exhaustive", **keys) -> list[str]:
-    from nlosrender.engine.scene_warnings import scene_warnings
+    from nlosrender.engine.preflight.scene_warnings import scene_warnings
 
     _, _, engine = prepared(configured(flat_wall(*hidden, scan=scan, **{"spp": None, "engine": "auto", **keys})))
     return list(scene_warnings(engine))
@@ -292,7 +292,7 @@ def test_bins_finer_than_the_arithmetic_are_said():
 
 def test_triangles_that_take_more_than_the_memory_limit_are_said():
     """A limit is for the process: what a mesh takes is in no batch."""
-    from nlosrender.engine.memory import memory_warnings
+    from nlosrender.engine.preflight.batch_memory import memory_warnings
 
     backend, plan, engine = prepared(configured(flat_wall(PLATE)))
     engine.built = replace(engine.built, n_triangles=10**6)
@@ -304,7 +304,7 @@ def test_triangles_that_take_more_than_the_memory_limit_are_said():
 
 def test_a_memory_limit_is_checked_against_machine_and_lanes():
     """A limit above the machine's memory, and one that leaves processors idle, are said; a plain one is not."""
-    from nlosrender.engine.memory import memory_warnings
+    from nlosrender.engine.preflight.batch_memory import memory_warnings
 
     config = configured(flat_wall(PLATE, scan="exhaustive", sensors=(50, 30), lasers=(9, 8)))
     backend, plan, engine = prepared(config)
@@ -324,7 +324,7 @@ def test_a_memory_limit_is_checked_against_machine_and_lanes():
 )
 def test_a_batch_larger_than_the_machine_is_the_configurations_fault(monkeypatch, engine, message):
     """The key that helps is named: only the gather needs rows for every processor."""
-    from nlosrender.engine import memory
+    from nlosrender.engine.preflight import batch_memory as memory
 
     backend, plan, used = prepared(configured(flat_wall(PLATE, engine=engine, spp=None)))
     monkeypatch.setattr(memory, "physical_memory", lambda: 1000)
@@ -335,8 +335,8 @@ def test_a_batch_larger_than_the_machine_is_the_configurations_fault(monkeypatch
 
 def test_the_gather_takes_what_is_said():
     """Its sums, in whole blocks of bins; and a batch of few points does not take rows for every processor."""
-    from nlosrender.engine.memory import batch_bytes
-    from nlosrender.engine.virtual_lights.block_histogram import BlockHistogram
+    from nlosrender.engine.preflight.batch_memory import batch_bytes
+    from nlosrender.engine.virtual_lights.gather.block_histogram import BlockHistogram
 
     config = configured(flat_wall(PLATE, sensors=(50, 30), bins=(0.0, 9.0, 1), engine="auto", spp=None))
     _, plan, engine = prepared(config)
@@ -367,7 +367,7 @@ class _ClockworkPaths:
         return budget if target is None else replace(budget, spp=round(target**-2) if self.sees_light else None)
 
     def render(self, batch, budget, passes=None):
-        from nlosrender.engine.histogram import Histogram
+        from nlosrender.engine.launch.histogram import Histogram
 
         samples = budget.spp * 2 if budget.spp else 1000
         self.clock.now += self.overhead + self.per_path * samples * batch.sensors.size
@@ -378,7 +378,7 @@ class _ClockworkPaths:
 
 @pytest.fixture
 def clockwork(monkeypatch):
-    from nlosrender.engine import forecast
+    from nlosrender.engine.preflight import time_estimate as forecast
 
     clock = SimpleNamespace(now=0.0)
     monkeypatch.setattr(forecast.time, "perf_counter", lambda: clock.now)
@@ -391,8 +391,8 @@ WHOLE = plan_of((Batch(Tile(0, 3, 0, 5), Tile(0, 1, 0, 1)),), 2, 1000)
 
 def test_time_is_linear_in_paths(clockwork):
     """A clockwork of known speed is extrapolated exactly: samples, sensor points, overhead."""
-    from nlosrender.engine.forecast import estimate_render_time
-    from nlosrender.engine.path_engine import Budget
+    from nlosrender.engine.path.engine import Budget
+    from nlosrender.engine.preflight.time_estimate import estimate_render_time
 
     for spp in (100, 5000):
         estimate = estimate_render_time(clockwork, WHOLE, Budget(spp=spp), lanes=8)
@@ -401,8 +401,8 @@ def test_time_is_linear_in_paths(clockwork):
 
 def test_half_the_error_takes_four_times_as_long(clockwork):
     """What the engine settles is what is extrapolated: 1 / sqrt(n) = target at n = target^-2."""
-    from nlosrender.engine.forecast import estimate_render_time
-    from nlosrender.engine.path_engine import Budget
+    from nlosrender.engine.path.engine import Budget
+    from nlosrender.engine.preflight.time_estimate import estimate_render_time
 
     for target in (0.02, 0.01):
         estimate = estimate_render_time(clockwork, WHOLE, Budget(target_error=target), lanes=8)
@@ -411,8 +411,8 @@ def test_half_the_error_takes_four_times_as_long(clockwork):
 
 def test_a_time_limit_is_never_exceeded(clockwork):
     """Alone it is the answer; beside another goal it caps it."""
-    from nlosrender.engine.forecast import estimate_render_time
-    from nlosrender.engine.path_engine import Budget
+    from nlosrender.engine.path.engine import Budget
+    from nlosrender.engine.preflight.time_estimate import estimate_render_time
 
     assert estimate_render_time(clockwork, WHOLE, Budget(time_limit_s=7), lanes=8).seconds == 7
     assert estimate_render_time(clockwork, WHOLE, Budget(spp=10**9, time_limit_s=7), lanes=8).seconds == 7
@@ -421,8 +421,8 @@ def test_a_time_limit_is_never_exceeded(clockwork):
 
 def test_pure_noise_gives_no_number(clockwork):
     """No estimate is better than a wrong one."""
-    from nlosrender.engine import forecast
-    from nlosrender.engine.path_engine import Budget
+    from nlosrender.engine.path.engine import Budget
+    from nlosrender.engine.preflight import time_estimate as forecast
 
     clockwork.sees_light = False
     estimate = forecast.estimate_render_time(clockwork, WHOLE, Budget(target_error=0.01), lanes=8)
@@ -432,7 +432,7 @@ def test_pure_noise_gives_no_number(clockwork):
 
 def test_the_pilot_lies_within_a_batch_and_its_memory():
     """However large the batch, the pilot takes PILOT_BYTES or one sensor point, in the middle of it."""
-    from nlosrender.engine.forecast import PILOT_BYTES, pilot_batch
+    from nlosrender.engine.preflight.time_estimate import PILOT_BYTES, pilot_batch
 
     engine = SimpleNamespace(capture=SimpleNamespace(scan_type="single"))
     for rows, columns, n_bytes in ((30, 50, 10**10), (3, 500, 10**9), (40, 1, 10**9), (2, 3, 10**12), (3, 5, 10)):
@@ -447,7 +447,7 @@ def test_the_pilot_lies_within_a_batch_and_its_memory():
 
 def test_many_lasers_are_cut_once_the_pilot_is_down_to_one_sensor_point():
     """An exhaustive capture with a million lasers must not make the forecast as heavy as the render."""
-    from nlosrender.engine.forecast import PILOT_BYTES, pilot_batch
+    from nlosrender.engine.preflight.time_estimate import PILOT_BYTES, pilot_batch
 
     engine = SimpleNamespace(capture=SimpleNamespace(scan_type="exhaustive"))
     lasers = Tile(0, 1000, 0, 999)

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from nlosrender.engine import llvm
-from nlosrender.engine.backend import PROCESS_BYTES, batch_memory, scene_memory
+from nlosrender.engine.backend import llvm
+from nlosrender.engine.backend.start import PROCESS_BYTES, batch_memory, scene_memory
 from nlosrender.errors import ConfigError
 
 
@@ -96,7 +96,7 @@ def test_a_dr_jit_imported_too_early_is_an_error_not_a_crash(monkeypatch):
     code = (
         "import drjit\n"
         "drjit.detail.llvm_version = lambda: (15, 0, 6)\n"  # as on a machine whose system library is LLVM 15
-        "from nlosrender.engine.backend import start_backend\n"
+        "from nlosrender.engine.backend.start import start_backend\n"
         "start_backend('llvm')\n"
     )
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)

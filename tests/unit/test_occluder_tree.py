@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 from triangle_soup import mesh_of
 
-from nlosrender.engine.backend import start_backend
+from nlosrender.engine.backend.start import start_backend
 
 Array = NDArray[np.float64]
 
@@ -22,7 +22,7 @@ def backend() -> None:
 
 def tree_of(triangles: Array) -> Any:
     """Return the tree of triangles (n, 3, 3)."""
-    from nlosrender.engine.virtual_lights.occluder_tree import OccluderTree
+    from nlosrender.engine.virtual_lights.visibility.bvh import OccluderTree
 
     return OccluderTree.of([mesh_of(triangles)])
 
@@ -36,7 +36,7 @@ def soup(count: int) -> Array:
 @pytest.mark.parametrize("count", [1, 2, 8, 9, 1000])
 def test_every_triangle_is_in_a_leaf_and_every_box_holds_its_children(count: int) -> None:
     """A walk down from the root may pass over nothing but what lies outside a box."""
-    from nlosrender.engine.virtual_lights.occluder_tree import BOX, LEAF
+    from nlosrender.engine.virtual_lights.visibility.bvh import BOX, LEAF
 
     triangles, tree = soup(count).astype(np.float32), tree_of(soup(count))
     n_leaves, boxes = int(tree.n_leaves[0]), np.array(tree.boxes).reshape(-1, BOX)

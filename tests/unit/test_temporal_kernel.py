@@ -7,7 +7,7 @@ import pytest
 
 from nlosrender.capture.limits import refuse_wide_kernel
 from nlosrender.capture.time_axis import TimeAxis
-from nlosrender.engine.backend import start_backend
+from nlosrender.engine.backend.start import start_backend
 from nlosrender.errors import ConfigError
 
 WIDTHS = (0.3, 1.0, 2.0, 4.7, 12.0)
@@ -22,7 +22,7 @@ def backend() -> None:
 @pytest.mark.parametrize("width", WIDTHS)
 def test_shares_are_those_of_the_kernel_spread_over_a_bin(width: float) -> None:
     """Against quadrature: a path anywhere in bin 0, its kernel cut at the bins' edges."""
-    from nlosrender.engine.temporal_kernel import TemporalKernel
+    from nlosrender.engine.launch.temporal_kernel import TemporalKernel
 
     kernel = TemporalKernel(width)
     half, n = width / 2, 4000
@@ -44,7 +44,7 @@ def test_smoothing_is_a_convolution_that_loses_no_light(width: float) -> None:
     """Every row by itself; what leaves the window goes to the entry for it, at both ends."""
     import mitsuba as mi
 
-    from nlosrender.engine.temporal_kernel import TemporalKernel
+    from nlosrender.engine.launch.temporal_kernel import TemporalKernel
 
     rows, n_bins = 3, 7
     kernel = TemporalKernel(width)

@@ -6,7 +6,7 @@ from nlosrender import pipeline
 from nlosrender.bench.paper.figure import PaperFigure, Table
 from nlosrender.bench.paper.rooms import ROOMS, write_mesh
 from nlosrender.bench.paper.study import Study
-from nlosrender.engine.backend import start_backend
+from nlosrender.engine.backend.start import start_backend
 
 OWN = {
     "z-letter": "the Z letter",

@@ -11,7 +11,7 @@ from scipy import stats
 from nlosrender import pipeline
 from nlosrender.capture.grids import Capture
 from nlosrender.config.document import Config
-from nlosrender.engine.backend import start_backend
+from nlosrender.engine.backend.start import start_backend
 
 if TYPE_CHECKING:
     from nlosrender.scene.view import BuiltView

@@ -12,18 +12,11 @@ import numpy as np
 from nlosrender.capture.grids import Capture
 from nlosrender.capture.plan import MOST_SUMS, Batch
 from nlosrender.capture.time_axis import TimeAxis
-from nlosrender.engine.histogram import DeviceHistogram, Histogram, HistogramShape
-from nlosrender.engine.line_of_sight.integrator import trace_view
-from nlosrender.engine.line_of_sight.transport import (
-    ViewSettings,
-    ViewTransport,
-    crosses_rough_surfaces,
-    view_transport,
-)
-from nlosrender.engine.passes import Passes
-from nlosrender.engine.path_engine import PathOptions
-from nlosrender.engine.pilot import Pilot, pilot_of
-from nlosrender.engine.sampling import (
+from nlosrender.engine.launch.histogram import DeviceHistogram, Histogram, HistogramShape
+from nlosrender.engine.launch.launch_params import LaneRandomness
+from nlosrender.engine.launch.passes import Passes
+from nlosrender.engine.launch.pilot_points import Pilot, pilot_of
+from nlosrender.engine.launch.sample_schedule import (
     FIRST_SAMPLES,
     Budget,
     Sampled,
@@ -32,7 +25,14 @@ from nlosrender.engine.sampling import (
     pilot_replicas,
     settled_by_pilot,
 )
-from nlosrender.engine.transport import LaneRandomness
+from nlosrender.engine.line_of_sight.loop import trace_view
+from nlosrender.engine.line_of_sight.view_params import (
+    ViewSettings,
+    ViewTransport,
+    crosses_rough_surfaces,
+    view_transport,
+)
+from nlosrender.engine.path.engine import PathOptions
 from nlosrender.errors import RenderError
 from nlosrender.scene.view import BuiltView
 

@@ -14,23 +14,17 @@ from nlosrender.capture.bounces import THIRD_BOUNCE
 from nlosrender.capture.grids import Capture
 from nlosrender.capture.plan import Batch
 from nlosrender.capture.time_axis import TimeAxis
-from nlosrender.engine.device_arrays import on_device
-from nlosrender.engine.energy_contrasts import RoundContrasts, contrasts_of_deviation
-from nlosrender.engine.histogram import Histogram
-from nlosrender.engine.passes import Passes, Snapshot
-from nlosrender.engine.path_engine import PathEngine, PathOptions
-from nlosrender.engine.pilot import Pilot, pilot_of
-from nlosrender.engine.sampling import DEFAULT_TARGET, Budget
-from nlosrender.engine.virtual_lights.further_bounces import (
-    SHARES_OF_THIRD,
-    SQUARES,
-    FurtherBounces,
-    rounds_needed,
-)
-from nlosrender.engine.virtual_lights.lights import GatherSettings
-from nlosrender.engine.virtual_lights.occlusion import nothing_occludes
+from nlosrender.engine.launch.device_arrays import on_device
+from nlosrender.engine.launch.energy_contrasts import RoundContrasts, contrasts_of_deviation
+from nlosrender.engine.launch.histogram import Histogram
+from nlosrender.engine.launch.occlusion import nothing_occludes
+from nlosrender.engine.launch.passes import Passes, Snapshot
+from nlosrender.engine.launch.pilot_points import Pilot, pilot_of
+from nlosrender.engine.launch.sample_schedule import DEFAULT_TARGET, Budget
+from nlosrender.engine.path.engine import PathEngine, PathOptions
+from nlosrender.engine.virtual_lights.elements.tessellator import Tessellator, wall_sees_itself
+from nlosrender.engine.virtual_lights.gather.lighting import GatherSettings
 from nlosrender.engine.virtual_lights.reciprocity import is_reciprocal
-from nlosrender.engine.virtual_lights.tessellator import Tessellator, wall_sees_itself
 from nlosrender.engine.virtual_lights.third_bounce import (
     FIRST_COARSENESS,
     REFINEMENT,
@@ -38,6 +32,12 @@ from nlosrender.engine.virtual_lights.third_bounce import (
     ThirdBounce,
     difference_divisor,
     estimated_error,
+)
+from nlosrender.engine.virtual_lights.vpls.gather import (
+    SHARES_OF_THIRD,
+    SQUARES,
+    FurtherBounces,
+    rounds_needed,
 )
 from nlosrender.errors import RenderError
 from nlosrender.scene.build import BuiltScene

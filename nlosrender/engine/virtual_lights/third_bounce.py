@@ -11,17 +11,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nlosrender.capture.plan import Batch
-from nlosrender.engine.device_arrays import on_device
-from nlosrender.engine.histogram import HistogramShape, relative_l2_error
-from nlosrender.engine.passes import Passes, Snapshot
-from nlosrender.engine.path_engine import PathEngine
-from nlosrender.engine.pilot import Pilot
-from nlosrender.engine.transport import Transport
-from nlosrender.engine.virtual_lights.block_histogram import BlockHistogram
-from nlosrender.engine.virtual_lights.clearance import Clearances, Outlook, count_sensors
-from nlosrender.engine.virtual_lights.device_patches import Places, upload_patches
-from nlosrender.engine.virtual_lights.gather_passes import GatherPasses
-from nlosrender.engine.virtual_lights.lights import (
+from nlosrender.engine.launch.device_arrays import on_device
+from nlosrender.engine.launch.histogram import HistogramShape, relative_l2_error
+from nlosrender.engine.launch.launch_params import Transport
+from nlosrender.engine.launch.passes import Passes, Snapshot
+from nlosrender.engine.launch.pilot_points import Pilot
+from nlosrender.engine.path.engine import PathEngine
+from nlosrender.engine.virtual_lights.elements.patches import Patches
+from nlosrender.engine.virtual_lights.elements.tessellator import MAX_PATCHES, MOST_KEPT, Tessellator
+from nlosrender.engine.virtual_lights.gather.block_histogram import BlockHistogram
+from nlosrender.engine.virtual_lights.gather.device_patches import Places, upload_patches
+from nlosrender.engine.virtual_lights.gather.gather_passes import GatherPasses
+from nlosrender.engine.virtual_lights.gather.lighting import (
     ROWS,
     Clearing,
     GatherSettings,
@@ -30,8 +31,7 @@ from nlosrender.engine.virtual_lights.lights import (
     illuminate,
     lights_of,
 )
-from nlosrender.engine.virtual_lights.patches import Patches
-from nlosrender.engine.virtual_lights.tessellator import MAX_PATCHES, MOST_KEPT, Tessellator
+from nlosrender.engine.virtual_lights.visibility.masks import Clearances, Outlook, count_sensors
 
 FIRST_COARSENESS = 1.0
 NEAR = 1e-3  # engine units: the centres of nearer patches are rounded by more than 1e-4 of their distance

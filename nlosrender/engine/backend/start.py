@@ -1,0 +1,165 @@
+"""Start Mitsuba with the variant a scene needs, on a machine that may lack LLVM or a GPU.
+
+This is the only place that picks a variant. Everything after it is the same code for LLVM and CUDA.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from dataclasses import dataclass
+from typing import Literal
+
+from nlosrender.engine.backend import llvm
+from nlosrender.errors import BackendError, ConfigError, Problem
+from nlosrender.interruption import uninterrupted
+
+BackendName = Literal["auto", "llvm", "cuda"]
+
+
+@dataclass(frozen=True)
+class Backend:
+    """What runs the kernels."""
+
+    name: Literal["llvm", "cuda"]
+    variant: str  # Mitsuba variant, e.g. "llvm_ad_mono"
+    library: str  # the LLVM library, or "CUDA driver"
+
+    @property
+    def lanes(self) -> int:
+        """Number of parallel lanes that keeps this backend busy."""
+        # 128 lanes keep two cores at full speed, 8 x 8 points with their two replicas eight vector units, and 32 x 32
+        # points any machine. Not the cores there are: the same capture is to be the same file on every machine. More
+        # replicas than needed cost memory and slow the convergence of low-discrepancy numbers.
+        return 2**17 if self.name == "cuda" else 128
+
+
+def cuda_available() -> bool:
+    """Return whether an NVIDIA driver with at least one device is on this machine, without starting Dr.Jit."""
+    import ctypes
+
+    name = "nvcuda.dll" if sys.platform == "win32" else "libcuda.so.1"
+    try:
+        driver = ctypes.CDLL(name)
+        count = ctypes.c_int(0)
+        return driver.cuInit(0) == 0 and driver.cuDeviceGetCount(ctypes.byref(count)) == 0 and count.value > 0
+    except (OSError, AttributeError):
+        return False
+
+
+def start_backend(wanted: BackendName = "auto", *, colored: bool = False, polarized: bool = False) -> Backend:
+    """Choose LLVM or CUDA, and activate the Mitsuba variant; Ctrl-C waits until that is done.
+
+    Parameters
+    ----------
+    wanted
+        ``auto`` takes CUDA where a device is present, otherwise LLVM.
+    colored
+        Render three channels; otherwise one.
+    polarized
+        Carry Stokes vectors, in grey.
+
+    Raises
+    ------
+    BackendError
+        There is no GPU although ``cuda`` is wanted, or no LLVM that works, or no current folder. The message says what
+        to do.
+    KeyboardInterrupt
+        Ctrl-C was pressed meanwhile.
+    """
+    with uninterrupted():  # an import that Ctrl-C cuts off ends in errors of its own, or a crash
+        return _started(wanted, colored, polarized)
+
+
+def _started(wanted: BackendName, colored: bool, polarized: bool) -> Backend:
+    try:
+        os.getcwd()
+    except OSError as error:  # Mitsuba's import would end the process
+        raise BackendError(f"the current folder is gone ({error.strerror}). Change to another one.") from error
+    if wanted == "cuda" and not cuda_available():
+        raise BackendError(
+            "render.backend: cuda: no NVIDIA driver with a device was found. Use backend: llvm, or install the driver."
+        )
+    name: Literal["llvm", "cuda"] = "cuda" if wanted == "cuda" or (wanted == "auto" and cuda_available()) else "llvm"
+    library = "CUDA driver" if name == "cuda" else _load_llvm()
+    variant = f"{name}_ad_{'mono_polarized' if polarized else 'rgb' if colored else 'mono'}"
+    try:
+        import mitsuba
+
+        mitsuba.set_variant(variant)
+        mitsuba.set_log_level(mitsuba.LogLevel.Error)  # its warnings go to stdout, into the middle of our JSON
+    except ImportError as error:
+        raise BackendError(f"Mitsuba cannot start its variant {variant}: {error}. Try 'nlosrender doctor'.") from error
+    return Backend(name, variant, library)
+
+
+def limit_threads(count: int) -> None:
+    """Let Dr.Jit use so many threads of this process; the backend is started."""
+    import drjit
+
+    if drjit.thread_count() != count:
+        drjit.set_thread_count(count)
+
+
+def _load_llvm() -> str:
+    if "drjit" in sys.modules:
+        return _loaded_library()
+    library = llvm.choose_library()
+    if library is None:
+        found = "; ".join(f"{candidate.path}: {candidate.verdict}" for candidate in llvm.find_libraries())
+        raise BackendError(f"no usable LLVM library was found ({found or 'none at all'}). {llvm.ADVICE}")
+    llvm.load_library(library.path)
+    return str(library.path)
+
+
+def _loaded_library() -> str:
+    """Return the library of a Dr.Jit that was imported earlier: it keeps what it found then."""
+    import drjit
+
+    named = os.environ.get(llvm.ENVIRONMENT_VARIABLE)
+    major = drjit.detail.llvm_version()[0]
+    if named is None and major not in llvm.PROVEN_MAJORS:
+        raise BackendError(
+            f"Dr.Jit was imported before its LLVM could be chosen and took version {major}, which may abort the "
+            "process. Call nlosrender.engine.backend.start.start_backend before anything imports drjit or mitsuba."
+        )
+    return named or f"LLVM {major}, found by Dr.Jit"
+
+
+PROCESS_BYTES = 400e6  # Python, Mitsuba, LLVM and a small scene, before any histogram
+TRIANGLE_BYTES = 700.0  # at most at one time: read, put into trees, cut, merged and lit
+
+
+def physical_memory() -> int:
+    """Return the machine's memory [bytes]; 8 GiB where the system does not tell."""
+    return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") if hasattr(os, "sysconf") else 8 << 30
+
+
+def batch_memory(limit: int | None, n_triangles: int = 0) -> int:
+    """Return the bytes one batch may take.
+
+    Parameters
+    ----------
+    limit
+        The user's for the process; None: a quarter of the machine's memory, beside what the scene takes.
+    n_triangles
+        Of the scene. However many, an eighth of what the program leaves is for batches.
+
+    Raises
+    ------
+    ConfigError
+        The limit is below what the program itself needs.
+    """
+    beside = 0 if limit is None else scene_memory(n_triangles)
+    if limit is None:
+        limit = physical_memory() // 4
+    if limit <= PROCESS_BYTES:
+        message = f"got {limit / 1e6:.0f} MB, need more than {PROCESS_BYTES / 1e6:.0f} MB, which the program takes "
+        raise ConfigError(Problem("", "render.memory_limit", f"{message}before any histogram."))
+    left = limit - PROCESS_BYTES
+    return int(max(left - beside, left / 8))
+
+
+def scene_memory(n_triangles: int) -> int:
+    """Return the bytes that a scene of so many triangles takes, about."""
+    return round(TRIANGLE_BYTES * n_triangles)

@@ -1,0 +1,150 @@
+"""Contrasts: sums over a capture with random signs, from which the error of its energy follows.
+
+The variance of a sum over sensor points is not the sum of their variances where they share walks, and an exhaustive
+capture's lasers share paths. What is independent are replicas: of every sensor point apart where paths are traced, of
+all of them together where walks are shared, and there the rounds, too. A contrast adds up the energies of replicas
+with signs that cancel the energy itself, two replicas against each other (balanced half-samples, McCarthy 1969). It is
+linear in H: contrasts of the parts of a capture add up to that of the whole, whatever correlates between them. The mean
+square of ``CONTRASTS`` of them estimates the variance of the energy, with as many degrees of freedom as there are
+contrasts, or independent pairs where these are fewer.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nlosrender.engine.launch.histogram import DeviceHistogram
+
+CONTRASTS = 32  # a standard error of the energy's error of 1 / sqrt(2 * 32) = 13 %
+FEW_PAIRS = 8  # of replicas: with fewer, places of the wall have weights in the contrasts
+Contrasts = NDArray[np.float64]  # (contrast, channel, slot) [J m^-2 sr^-1]
+
+
+def no_contrasts(channels: int, slots: int) -> Contrasts:
+    """Return the contrasts of what is exact."""
+    return np.zeros((CONTRASTS, channels, slots))
+
+
+def contrasts_of_points(
+    histogram: DeviceHistogram, sensors: NDArray[np.integer], factor: float, slots: range
+) -> Contrasts:
+    """Return the contrasts of sensor points with replicas of their own.
+
+    Parameters
+    ----------
+    histogram
+        After the last launch.
+    sensors
+        (sensors,) flat indices of its sensor points in the capture: the signs of a sensor point are the same for all
+        lasers, in whatever batch.
+    factor
+        What sums are multiplied by to become H, replicas added.
+    slots
+        Bounce slots of the result, as for ``DeviceHistogram.statistics``.
+    """
+    energies = histogram.energies().sum(axis=2)  # (replica, sensor, slot, channel)
+    pairs = energies.shape[0] // 2
+    differences = energies[0 : 2 * pairs : 2] - energies[1 : 2 * pairs : 2]
+    keys = np.arange(pairs)[:, None] * 2**32 + np.asarray(sensors, dtype=np.int64)
+    sums = np.einsum("kps,psbc->kcb", random_signs(keys), differences, optimize=True)
+    return _in_slots(sums * (factor * _unpaired(energies.shape[0])), slots)
+
+
+class RoundContrasts:
+    """Contrasts of sensor points that share walks: every replica of a group of rounds has a sign for all of them.
+
+    Parameters
+    ----------
+    histogram
+        That the rounds are added to, empty.
+    sensors, grid
+        (sensors,) flat indices of its sensor points; columns and rows of their grid.
+    """
+
+    def __init__(self, histogram: DeviceHistogram, sensors: NDArray[np.integer], grid: tuple[int, int]):
+        shape = histogram.shape
+        self._histogram, self.groups = histogram, 0
+        self._weights = np.stack([np.ones((CONTRASTS, shape.sensors)), _slow_weights(sensors, grid)])
+        self._wanted = math.ceil(CONTRASTS / max(shape.replicas // 2, 1))
+        self.grouped = np.zeros((2, CONTRASTS, shape.replicas, shape.slots, shape.channels))
+        self.sums = np.zeros((2, CONTRASTS, shape.channels, shape.slots))
+
+    def restore(self, sums: NDArray[np.float64], grouped: NDArray[np.float64], groups: int) -> None:
+        """Go on from the values that these attributes had."""
+        self.sums[:], self.grouped[:], self.groups = sums, grouped, groups
+
+    def add(self, done: int, is_last: bool) -> None:
+        """Take what has been added since the last group, now that so many rounds are done; not after every round."""
+        every = 2 ** max(0, math.floor(math.log2(done / self._wanted)))
+        if not (is_last or done % every == 0):
+            return
+        energies = np.einsum("wks,rsbc->wkrbc", self._weights, self._histogram.energies().sum(axis=2), optimize=True)
+        added = energies - self.grouped
+        self.grouped = energies
+        pairs = added.shape[2] // 2
+        differences = added[:, :, 0 : 2 * pairs : 2] - added[:, :, 1 : 2 * pairs : 2]
+        signs = random_signs(np.arange(pairs) * 2**32 + self.groups)
+        self.sums += np.einsum("kp,wkpbc->wkcb", signs, differences)
+        self.groups += 1
+
+    def result(self, factor: float, slots: range) -> Contrasts:
+        """Return the contrasts; parameters as for ``contrasts_of_points``."""
+        replicas = self._histogram.shape.replicas
+        is_few = replicas // 2 * self.groups < FEW_PAIRS
+        return _in_slots(self.sums[int(is_few)] * (factor * _unpaired(replicas)), slots)
+
+
+def contrasts_of_deviation(
+    deviation: NDArray[np.float64], sensors: NDArray[np.integer], grid: tuple[int, int]
+) -> NDArray[np.float64]:
+    """Return the contrasts (contrast, channel) of a known deviation, estimated minus true, of one bounce.
+
+    Parameters
+    ----------
+    deviation
+        (channel, laser, sensor, bin) [J m^-2 sr^-1]: one sample of it.
+    sensors, grid
+        As for ``RoundContrasts``.
+    """
+    per_sensor = deviation.sum(axis=(1, 3))
+    return np.asarray(_slow_weights(sensors, grid) @ per_sensor.T, dtype=np.float64)
+
+
+def _slow_weights(sensors: NDArray[np.integer], grid: tuple[int, int]) -> NDArray[np.float64]:
+    """Return weights (contrast, sensor) about 1 that change slowly from place to place.
+
+    Of one sample of a difference the sum may be small by chance while sensor points here and there have much. Added
+    to it with such weights they show; what is the same everywhere counts once, and no error more than sqrt(3) times.
+    """
+    index = np.asarray(sensors, dtype=np.int64)
+    place = np.stack([index % grid[0] / grid[0], index // grid[0] / grid[1]])
+    waves = np.random.default_rng(0).random((3, CONTRASTS))
+    phase = (waves[:2].T * 2 - 1) @ place + waves[2][:, None]  # at most a period over the grid
+    return np.asarray(1 + math.sqrt(2) * np.cos(2 * math.pi * phase), dtype=np.float64)
+
+
+def random_signs(keys: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Return (contrast, *shape of the keys) 1 or -1, independent for different keys, the same for the same key."""
+    bits = keys.astype(np.uint64) + np.uint64(0x9E3779B97F4A7C15)  # the mixing function of SplitMix64 (Steele 2014)
+    bits = (bits ^ (bits >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+    bits = (bits ^ (bits >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+    bits ^= bits >> np.uint64(31)
+    shifts = np.arange(CONTRASTS, dtype=np.uint64).reshape(-1, *(1,) * keys.ndim)
+    return np.asarray(((bits >> shifts) & np.uint64(1)) * 2.0 - 1.0, dtype=np.float64)
+
+
+def _unpaired(replicas: int) -> float:
+    """Return what contrasts are multiplied by where an odd replica is left without a partner."""
+    return math.sqrt(replicas / max(replicas // 2 * 2, 1))
+
+
+def _in_slots(sums: NDArray[np.float64], slots: range) -> Contrasts:
+    """Return sums (contrast, channel, own slot) in the slots of the result; those the histogram does not have are 0."""
+    result = no_contrasts(sums.shape[1], len(slots))
+    for place, slot in enumerate(slots):
+        if 0 <= slot < sums.shape[2]:
+            result[:, :, place] = sums[:, :, slot]
+    return result

@@ -1,0 +1,40 @@
+"""The second bounce, laser point straight to sensor point: one term per pair, exact; zero on a planar wall."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+from nlosrender.engine.launch.histogram import DeviceHistogram
+from nlosrender.engine.launch.launch_params import Transport
+from nlosrender.engine.path.laser_connections import connection_segment, delay_bin
+
+COINCIDENT = 1e-6  # engine units; a confocal pair has no path between its points
+
+
+@dr.syntax
+def deposit_second_bounce(transport: Transport, histogram: DeviceHistogram) -> None:
+    """Deposit, for every lane and each of its lasers, the light that goes from laser point to sensor point.
+
+    The histogram has one slot. Values are per J of pulse and (engine unit)^2, as in ``trace_paths``.
+    """
+    built, sensor = transport.built, transport.sensors.interaction
+    context = mi.BSDFContext()
+    lane = dr.arange(mi.UInt32, dr.width(transport.sensors.delay_bins))
+    laser = mi.UInt32(0)
+    while dr.hint(laser < transport.n_lasers, exclude=[transport, histogram, built]):
+        points = transport.lasers.gather(transport.first_laser + laser)
+        lit = points.interaction
+        to_laser = lit.p - sensor.p
+        distance = dr.norm(to_laser)
+        apart = distance > COINCIDENT
+        direction = to_laser / dr.maximum(distance, COINCIDENT)
+        received = built.wall_bsdf.eval(context, sensor, sensor.to_local(direction), apart)
+        emitted = built.wall_bsdf.eval(context, lit, lit.to_local(-direction), apart)
+        value = received * emitted / dr.square(dr.maximum(distance, COINCIDENT))
+        active = apart & dr.any(value > 0)
+        active &= ~built.scene.ray_test(
+            connection_segment(built, sensor, direction, lit), coherent=False, active=active
+        )
+        histogram.deposit(lane, laser, mi.UInt32(0), delay_bin(transport, points, distance), value, active)
+        laser += 1

@@ -1,0 +1,295 @@
+"""Hidden geometry sampling: points uniform by area on the hidden surfaces (Royo et al. 2022, section 4).
+
+Triangles of all meshes lie in one table, analytic shapes are entries beside them; one search in the integer
+cumulative distribution picks an entry and hands its remainder on, so that low-discrepancy numbers stay so.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+
+from nlosrender.engine.launch.device_arrays import on_device
+from nlosrender.engine.launch.morton import z_order
+from nlosrender.scene.build import WALL_ID, BuiltScene, wall_box
+from nlosrender.scene.pose import Float64
+
+SAMPLEABLE_PLUGINS = ("Rectangle", "Disk", "Sphere", "Cylinder")
+_FULL = 2.0**32
+MOST_GUIDE_BITS = 22  # 16 MB
+ANALYTIC = 0xFFFFFFFF  # primitive of a point that lies on no triangle
+
+
+@dataclass(eq=False)
+class SurfaceSample:
+    """A point on the hidden geometry, one per lane; not frozen, for it may be state of a loop."""
+
+    p: mi.Point3f
+    shape: mi.ShapePtr
+    n: mi.Normal3f  # geometric normal; on triangles not of unit length
+    primitive: mi.UInt32  # triangle within the shape; ANALYTIC for a shape without triangles
+    barycentric: mi.Point2f  # within the triangle
+
+
+class SurfaceSampler:
+    """Samples points of the hidden geometry uniformly by area.
+
+    Triangles that no point of the wall can see from their reflecting side are left out: they return no light.
+
+    Parameters
+    ----------
+    built
+        The scene. Shapes of other kinds than meshes, rectangles, disks, spheres and cylinders are not sampled.
+    """
+
+    def __init__(self, built: BuiltScene):
+        self._built = built
+        hidden = built.hidden_shapes
+        self._analytic = [shape for shape in hidden if not shape.is_mesh() and shape.class_name() in SAMPLEABLE_PLUGINS]
+        self.has_analytic = bool(self._analytic)
+        self.covers_everything = all(shape.is_mesh() or shape.class_name() in SAMPLEABLE_PLUGINS for shape in hidden)
+        # No surface reflects at points whose geometric normal points away. Shading normals may light a little there.
+        self.dark_behind = all(
+            _is_one_sided(shape) and not (shape.is_mesh() and shape.has_vertex_normals()) for shape in hidden
+        )
+
+    @cached_property
+    def _table(self) -> _Table:
+        """Made when it is needed: a gather alone has no use for it, and it takes a second per million triangles."""
+        return _Table.of(self._built)
+
+    def set_up(self) -> None:
+        """Make the table: what a recorded loop samples has to be there before."""
+        _ = self._table
+
+    @property
+    def n_triangles(self) -> int:
+        """Triangles that are sampled."""
+        return self._table.n_triangles
+
+    @property
+    def area(self) -> float:
+        """Area of all surfaces that are sampled [engine units squared]."""
+        return self._table.area
+
+    @property
+    def is_empty(self) -> bool:
+        """Whether there is nothing to sample."""
+        return self.area <= 0
+
+    def sample(self, bits: mi.UInt32, v: mi.Float, active: mi.Bool) -> SurfaceSample:
+        """Sample a point with density 1 / ``area`` over the sampled surfaces.
+
+        Parameters
+        ----------
+        bits
+            Uniform 32-bit integers: choose the entry, the remainder serves as first coordinate in it.
+        v
+            Uniform numbers in [0, 1): second coordinate.
+        active
+            Lanes that need a sample.
+        """
+        table, entry = self._table, self._entry(bits, active)
+        low = dr.gather(mi.UInt32, table.edges, entry, active)
+        high = dr.gather(mi.UInt32, table.edges, entry + 1, active)
+        u = dr.minimum(
+            (mi.Float(bits - low) + 0.5) / dr.maximum(mi.Float(high - low), 1.0), dr.one_minus_epsilon(mi.Float)
+        )
+        owner = dr.gather(mi.UInt32, table.owner, entry, active)
+        shape = dr.gather(mi.ShapePtr, self._built.scene.shapes_dr(), owner, active)
+        is_triangle = entry < self.n_triangles
+        point, normal, primitive = mi.Point3f(0), mi.Normal3f(0), mi.UInt32(ANALYTIC)
+        within = mi.Point2f(0)
+        if self.n_triangles:
+            on_triangle = active & is_triangle
+            a, b, c = (self._corner(k, entry, on_triangle) for k in range(3))
+            root = dr.sqrt(u)  # uniform on the triangle: (1 - sqrt u, sqrt u (1 - v), sqrt u v)
+            within = mi.Point2f(root * (1 - v), root * v)
+            point = a + (b - a) * within.x + (c - a) * within.y
+            normal = mi.Normal3f(dr.cross(b - a, c - a))
+            primitive = dr.select(on_triangle, dr.gather(mi.UInt32, table.primitive, entry, on_triangle), ANALYTIC)
+        if self.has_analytic:
+            on_analytic = active & ~is_triangle
+            at, facing = self._on_analytic(shape, entry, mi.Point2f(u, v), on_analytic)
+            point, normal = dr.select(on_analytic, at, point), dr.select(on_analytic, facing, normal)
+        return SurfaceSample(point, shape, normal, primitive, within)
+
+    @dr.syntax
+    def _entry(self, bits: mi.UInt32, active: mi.Bool) -> mi.UInt32:
+        """Return the entry that covers the integers ``bits``: few steps, for the guide says where it may be."""
+        table = self._table
+        part = bits >> (32 - table.guide_bits)
+        low = dr.gather(mi.UInt32, table.guide, part, active)
+        high = dr.gather(mi.UInt32, table.guide, part + 1, active)
+        while dr.hint(active & (low < high), exclude=[table, bits, active]):
+            middle = (low + high) >> 1
+            is_beyond = dr.gather(mi.UInt32, table.edges, middle + 1, active) <= bits
+            low = dr.select(is_beyond, middle + 1, low)
+            high = dr.select(is_beyond, high, middle)
+        return low
+
+    def surface(
+        self, sample: SurfaceSample, direction: mi.Vector3f, active: mi.Bool, only_normals_matter: bool = False
+    ) -> mi.SurfaceInteraction3f:
+        """Return the surface at sampled points of triangles as a ray in ``direction`` finds it; no ray is traced.
+
+        ``only_normals_matter``: its frame is any around the normal.
+        """
+        if only_normals_matter:
+            si = dr.zeros(mi.SurfaceInteraction3f)
+            si.n = dr.normalize(sample.n)
+            si.sh_frame = mi.Frame3f(si.n)
+            si.t, si.shape, si.p = mi.Float(1), sample.shape, sample.p
+            si.prim_index = sample.primitive
+            si.wi = si.to_local(-direction)
+            return si
+        hit = dr.zeros(mi.PreliminaryIntersection3f)
+        hit.t = mi.Float(1)
+        hit.prim_uv, hit.prim_index = sample.barycentric, sample.primitive
+        ray = mi.Ray3f(sample.p - direction, direction)
+        si = sample.shape.compute_surface_interaction(ray, hit, mi.RayFlags.All, active)
+        si.initialize_sh_frame()
+        si.t, si.shape, si.p = mi.Float(1), sample.shape, sample.p
+        si.wi = si.to_local(-direction)
+        return si
+
+    def reached(
+        self, si: mi.SurfaceInteraction3f, point: mi.Point3f, shape: mi.ShapePtr, primitive: mi.UInt32
+    ) -> mi.Bool:
+        """Return whether a ray sent to a sampled point arrived at it, instead of at something in front of it.
+
+        A straight line meets a triangle once, so there the primitive decides; a curved shape has a near side.
+        """
+        near = dr.squared_norm(si.p - point) < 1e-6 * (1e-6 + dr.square(si.t))
+        same = si.shape == shape
+        if not self.has_analytic:
+            return same & (si.prim_index == primitive)
+        return same & dr.select(primitive == ANALYTIC, near, si.prim_index == primitive)
+
+    def covers(self, si: mi.SurfaceInteraction3f, wall: mi.ShapePtr) -> mi.Bool:
+        """Return whether the density of ``sample`` at ``si`` is 1 / ``area`` (hidden, of a sampled kind)."""
+        hidden = si.is_valid() & (si.shape != wall)
+        if self.covers_everything:
+            return hidden
+        sampled = mi.Bool(False)
+        for name in ("Mesh", *SAMPLEABLE_PLUGINS):
+            sampled |= si.shape.shape_type() == int(getattr(mi.ShapeType, name))
+        return hidden & sampled
+
+    def _on_analytic(
+        self, shape: mi.ShapePtr, entry: mi.UInt32, uv: mi.Point2f, active: mi.Bool
+    ) -> tuple[mi.Point3f, mi.Normal3f]:
+        """Return points uniform by area on analytic shapes, and the normals there."""
+        if self.covers_everything:
+            sample = shape.sample_position(mi.Float(0), uv, active)
+            return sample.p, sample.n
+        # One by one: a call through the pointer is compiled for every shape of the scene, and kinds that cannot be
+        # sampled have no sample_position.
+        point, normal = mi.Point3f(0), mi.Normal3f(0)
+        for index, own in enumerate(self._analytic):
+            chosen = active & (entry == self.n_triangles + index)
+            sample = own.sample_position(mi.Float(0), uv, chosen)
+            point, normal = dr.select(chosen, sample.p, point), dr.select(chosen, sample.n, normal)
+        return point, normal
+
+    def _corner(self, k: int, entry: mi.UInt32, active: mi.Bool) -> mi.Point3f:
+        return mi.Point3f(*(dr.gather(mi.Float, self._table.corners[3 * k + j], entry, active) for j in range(3)))
+
+
+@dataclass(frozen=True, eq=False)
+class _Table:
+    """Entries of what is sampled: triangles, then analytic shapes; the arrays are made for entries only."""
+
+    n_triangles: int
+    area: float  # engine units squared
+    edges: mi.UInt32  # entry i covers the integers [edges[i], edges[i + 1]); the last one also takes 2^32 - 1
+    guide_bits: int
+    guide: mi.UInt32  # entry at the start of each of 2^guide_bits equal parts of the integers (Chen & Asau 1974)
+    owner: mi.UInt32  # shape of each entry
+    primitive: mi.UInt32  # of each triangle within its shape
+    corners: list[mi.Float]  # nine, of the triangles
+
+    @classmethod
+    def of(cls, built: BuiltScene) -> _Table:
+        """Return the table of a scene."""
+        corners = [np.zeros((0, 3, 3))]
+        owners, primitives, analytic_areas = [np.zeros(0, np.uint32)], [np.zeros(0, np.uint32)], [np.zeros(0)]
+        analytic_owners: list[int] = []
+        for index, shape in enumerate(built.scene.shapes()):
+            if shape.id() == WALL_ID:
+                continue
+            if shape.is_mesh():
+                triangles, kept = facing_triangles(built, shape)
+                # neighbours in the table are neighbours in space: so are points with near first coordinates
+                order = np.argsort(z_order(triangles.mean(axis=1)), kind="stable")
+                corners.append(triangles[order])
+                owners.append(np.full(len(kept), index, np.uint32))
+                primitives.append(kept[order])
+            elif shape.class_name() in SAMPLEABLE_PLUGINS:
+                analytic_owners.append(index)
+                analytic_areas.append(np.ravel(shape.surface_area())[:1].astype(np.float64))
+        triangles = np.concatenate(corners)
+        areas = np.linalg.norm(np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]), axis=-1)
+        areas = np.concatenate([areas / 2, *analytic_areas])
+        area = float(areas.sum())
+        cumulative = np.minimum(np.rint(np.cumsum(areas) / max(area, 1e-300) * _FULL), _FULL - 1)
+        guide_bits = min(max((len(areas) - 1).bit_length() + 1, 1), MOST_GUIDE_BITS)
+        parts = np.arange(2**guide_bits, dtype=np.uint64) << np.uint64(32 - guide_bits)
+        guide = np.append(np.searchsorted(cumulative[:-1], parts, side="right"), len(areas) - 1)
+        table = cls(
+            len(triangles),
+            area,
+            mi.UInt32(np.concatenate([[0], cumulative]).astype(np.uint32)),
+            guide_bits,
+            on_device(mi.UInt32, guide),
+            mi.UInt32(np.concatenate([*owners, np.array(analytic_owners, np.uint32)])),
+            mi.UInt32(np.concatenate(primitives)),
+            [mi.Float(triangles[:, i, j].astype(np.float32)) for i in range(3) for j in range(3)],
+        )
+        dr.eval(table.edges, table.owner)
+        return table
+
+
+def triangles_of(mesh: mi.Mesh) -> Float64:
+    """Return the corners (n, 3, 3) of a mesh's triangles [engine units]."""
+    parameters = mi.traverse(mesh)
+    vertices = np.asarray(parameters["vertex_positions"], dtype=np.float64).reshape(-1, 3)
+    return vertices[np.asarray(parameters["faces"]).reshape(-1, 3)]
+
+
+def _is_one_sided(shape: mi.Shape) -> bool:
+    return not bool(shape.bsdf().flags() & mi.BSDFFlags.BackSide)
+
+
+def _visible_from(
+    wall_corners: Float64, triangles: Float64, one_sided: bool, wall_is_planar: bool
+) -> NDArray[np.bool_]:
+    """Return which triangles some point of the box ``wall_corners`` (8, 3) may see on a side that reflects."""
+    normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+    visible = np.linalg.norm(normals, axis=-1) > 0
+    if wall_is_planar:
+        visible &= triangles[:, :, 2].max(axis=1) > 0  # nothing behind the wall's plane is lit or seen
+    if not one_sided:
+        return visible
+    # A plane has the whole box behind it when it has the box's corner farthest along its normal behind it.
+    low, high = wall_corners.min(axis=0), wall_corners.max(axis=0)
+    farthest = np.where(normals > 0, high, low) - triangles[:, 0]
+    return visible & (np.einsum("nx,nx->n", farthest, normals) > 0)
+
+
+def facing_triangles(built: BuiltScene, mesh: mi.Mesh) -> tuple[Float64, NDArray[np.uint32]]:
+    """Return the corners (n, 3, 3) [engine units] of the triangles that the wall may see lit, and their numbers (n,).
+
+    Those are left out that turn their dark side to all of the wall. Occlusion by other surfaces is not looked at.
+    """
+    triangles = triangles_of(mesh)
+    corners = wall_box(built.wall) / built.unit
+    # Shading normals may light a little of a geometric back side.
+    one_sided = _is_one_sided(mesh) and not mesh.has_vertex_normals()
+    kept = np.flatnonzero(_visible_from(corners, triangles, one_sided, built.wall.is_planar))
+    return triangles[kept], kept.astype(np.uint32)

@@ -1,0 +1,189 @@
+"""The two steps of every path: leave a vertex in a sampled direction, arrive at the next vertex.
+
+Directions come from the BSDF or, on the relay wall, lead to a point sampled on the hidden geometry. The two are
+combined as one mixture density (one-sample MIS with the balance heuristic, Veach 1997), with the density of the vertex
+that the ray really reached.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+from nlosrender.engine.launch.launch_params import HIGHEST_SURVIVAL, PathSettings, Transport
+from nlosrender.engine.launch.surface_sampler import SurfaceSample
+from nlosrender.engine.path.laser_connections import leg_to_tangent_plane, offset_origin
+from nlosrender.scene.build import BuiltScene
+
+
+@dataclass(eq=False)
+class Departure:
+    """A ray under way, and what the light is worth that comes along it; not frozen, for it is state of a loop."""
+
+    ray: mi.Ray3f
+    origin: mi.Point3f  # the vertex it left, without ray offset
+    value: mi.Spectrum  # BSDF times cosine of its direction, undivided by a density
+    bsdf_density: mi.Float  # share of BSDF sampling in the direction's density [1/sr]; 1 for delta lobes
+    hidden_density: mi.Float  # share of hidden geometry sampling, before the Jacobian [1/area]
+    is_delta: mi.Bool  # the direction comes from a delta lobe
+    has_target: mi.Bool  # it was sent to a sampled point of the hidden geometry: the next three
+    target: mi.Point3f
+    target_shape: mi.ShapePtr
+    target_primitive: mi.UInt32
+
+    @classmethod
+    def none(cls, built: BuiltScene) -> Departure:
+        """Return the state before the first path."""
+        ray, origin, shape = dr.zeros(mi.Ray3f), mi.Point3f(0), mi.ShapePtr(built.wall_shape)
+        zero, no = mi.Float(0), mi.Bool(False)
+        return cls(ray, origin, mi.Spectrum(0), zero, zero, no, no, mi.Point3f(0), shape, mi.UInt32(0))
+
+
+@dataclass(frozen=True, eq=False)
+class Arrival:
+    """Where a ray got to."""
+
+    si: mi.SurfaceInteraction3f
+    is_reached: mi.Bool  # a surface, and that of the sampled point if the ray was sent to one
+    on_wall: mi.Bool
+    leg: mi.Vector3f  # from the vertex before; finer than the difference of positions
+    distance: mi.Float
+    distance2: mi.Float
+    density: mi.Float  # of the direction, in solid angle
+
+
+@dataclass(frozen=True, eq=False)
+class DirectionNumbers:
+    """What a direction is sampled with: 32-bit integers for the first coordinate, a number in [0, 1) for the second."""
+
+    bits_u: mi.UInt32
+    v: mi.Float
+
+    @classmethod
+    def drawn(cls, generator: mi.PCG32, active: mi.Bool) -> DirectionNumbers:
+        """Draw them for the lanes that go on: what others drew would depend on how launches are cut."""
+        return cls(generator.next_uint32(active), unit_interval(generator.next_uint32(active)))
+
+
+def unit_interval(bits: mi.UInt32) -> mi.Float:
+    """Return numbers in [0, 1), exact in float32."""
+    return mi.Float(bits >> 8) * 2.0**-24
+
+
+def intersect(settings: PathSettings, built: BuiltScene, ray: mi.Ray3f, active: mi.Bool) -> mi.SurfaceInteraction3f:
+    """Return what a ray meets. Where only normals matter, any frame around them serves, and is quicker to get."""
+    if not settings.only_normals_matter:
+        return built.scene.ray_intersect(ray, mi.RayFlags.All, coherent=False, active=active)
+    si = built.scene.ray_intersect(ray, mi.RayFlags.Minimal, coherent=False, active=active)
+    si.sh_frame = mi.Frame3f(si.n)
+    si.wi = si.to_local(-ray.d)
+    return si
+
+
+def arrive(settings: PathSettings, transport: Transport, way: Departure, active: mi.Bool) -> Arrival:
+    """Trace a ray to the next vertex and say how dense its direction was sampled."""
+    built, sampler, q = transport.built, transport.sampler, settings.hidden_fraction
+    wall = mi.ShapePtr(built.wall_shape)
+    si = intersect(settings, built, way.ray, active)
+    is_reached = active & si.is_valid()
+    leg = dr.select(way.has_target, si.p - way.origin, leg_to_tangent_plane(built, si, way.origin, way.ray.d))
+    si.p = way.origin + leg
+    distance2 = dr.squared_norm(leg)
+    distance = dr.sqrt(distance2)
+    if q > 0:
+        # occluded: the ray met something in front of the sampled point
+        is_reached &= ~way.has_target | sampler.reached(si, way.target, way.target_shape, way.target_primitive)
+    on_wall = si.shape == wall
+    if built.wall.is_planar:
+        si.p.z = dr.select(on_wall, 0, si.p.z)  # exactly: rays that leave the wall there need no offset
+    density = mi.Float(way.bsdf_density)
+    if q > 0:
+        # not along the ray: its offset origin matters where hidden geometry comes close to the wall
+        cosine = dr.abs(dr.dot(si.n, leg)) / distance
+        jacobian = dr.select(sampler.covers(si, wall), distance2 / dr.maximum(cosine, 1e-9), 0)
+        density += way.hidden_density * jacobian
+    return Arrival(si, is_reached, on_wall, leg, distance, distance2, density)
+
+
+def leave(
+    settings: PathSettings,
+    transport: Transport,
+    generator: mi.PCG32,
+    vertex: mi.SurfaceInteraction3f,
+    on_wall: mi.Bool,
+    numbers: DirectionNumbers,
+    sample: SurfaceSample | None,
+    by_bsdf: mi.Bool,
+    has_target: mi.Bool,
+) -> tuple[Departure, mi.Float, mi.Float]:
+    """Sample the direction in which a path leaves a vertex.
+
+    Parameters
+    ----------
+    vertex, on_wall
+        The vertex, and whether it lies on the relay wall.
+    numbers, generator
+        Choose the direction, and the lobe of the BSDF.
+    sample
+        Points of the hidden geometry for the lanes ``has_target``; None where the technique is not used.
+    by_bsdf, has_target
+        Which of the two techniques a lane uses; lanes of neither have ended.
+
+    Returns
+    -------
+    tuple
+        The departure; what the roulette may let a path survive with, the albedo just met, 1 on the way to a target;
+        and what the refractive index along the ray is multiplied by.
+    """
+    built, q = transport.built, settings.hidden_fraction
+    context = mi.BSDFContext()
+    way = Departure.none(built)
+    wo, survival, eta = mi.Vector3f(0, 0, 1), mi.Float(1), mi.Float(1)
+    if q < 1 or settings.goes_on:
+        lobe = generator.next_float32(by_bsdf)
+        square = mi.Point2f(unit_interval(numbers.bits_u), numbers.v)
+        bs, weight = vertex.bsdf().sample(context, vertex, lobe, square, by_bsdf)
+        wo = bs.wo
+        weight = vertex.to_world_mueller(weight, -wo, vertex.wi)
+        way.is_delta = by_bsdf & mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
+        share = dr.select(on_wall, 1 - q, 1.0)
+        way.bsdf_density = dr.select(way.is_delta, share, share * bs.pdf)
+        way.value = dr.select(way.is_delta, weight, weight * bs.pdf)
+        survival = dr.select(by_bsdf, dr.minimum(dr.max(mi.unpolarized_spectrum(weight)), HIGHEST_SURVIVAL), 1)
+        if settings.has_transmission:
+            eta = dr.select(by_bsdf & (bs.eta > 0), bs.eta, 1)
+    if sample is not None:
+        way.has_target = mi.Bool(has_target)
+        way.target, way.target_shape, way.target_primitive = sample.p, sample.shape, sample.primitive
+        to_target = sample.p - vertex.p
+        local = vertex.to_local(to_target * dr.rsqrt(dr.squared_norm(to_target)))
+        f, pdf = built.wall_bsdf.eval_pdf(context, vertex, local, has_target)
+        f = vertex.to_world_mueller(f, -local, vertex.wi)
+        wo = dr.select(has_target, local, wo)
+        way.value = dr.select(has_target, f, way.value)
+        way.bsdf_density = dr.select(has_target, (1 - q) * pdf, way.bsdf_density)
+        way.hidden_density = dr.select(on_wall & ~way.is_delta, q / transport.sampler.area, 0)
+    world = vertex.to_world(wo)
+    way.origin = mi.Point3f(vertex.p)
+    ray_origin = offset_origin(built, vertex, world)
+    if sample is not None:
+        # from the offset origin: a parallel ray would land beside the target, in another triangle of a fine mesh
+        world = dr.select(has_target, dr.normalize(sample.p - ray_origin), world)
+    way.ray = mi.Ray3f(ray_origin, world)
+    return way, survival, eta
+
+
+def turns_away(transport: Transport, sample: SurfaceSample, origin: mi.Point3f) -> mi.Bool:
+    """Return whether a sampled point shows its dark side to ``origin``: such a path ends without a ray."""
+    if not transport.sampler.dark_behind:
+        return mi.Bool(False)
+    return dr.dot(sample.n, sample.p - origin) >= 0
+
+
+def misses_hidden(transport: Transport, ray: mi.Ray3f) -> mi.Bool:
+    """Return whether a ray from a planar wall passes the hidden geometry by: such a path ends without a ray."""
+    if transport.hidden_box is None:
+        return mi.Bool(False)
+    return transport.hidden_box.is_missed(ray)

@@ -1,0 +1,243 @@
+"""Triangles, quartered where a laser or sensor point is near: the units that patches and sites are made of."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from nlosrender.capture.grids import Capture, PointGrid
+from nlosrender.engine.launch.surface_sampler import facing_triangles
+from nlosrender.scene.build import BuiltScene
+from nlosrender.scene.pose import Float64
+
+NEAREST = 1e-3  # engine units: nothing is cut finer where the nearest laser or sensor point is in its plane
+LEAST = 1e-8  # engine units: nothing is cut any finer elsewhere
+ROUNDED = 1e-7  # engine units: float32 knows the height of a point over a tilted plane no better
+ROUNDING = 1e-9  # engine units: points that lie so near to those of a regular grid are that grid
+NEIGHBOURS = 8  # points asked for the nearest that is not in the plane of a cell
+IN_PLANE = 1e-5  # cosine below which a cell of the wall is in the plane of a point, and neither lights nor sees it
+
+
+@dataclass(frozen=True, eq=False)
+class Cells:
+    """Triangles, or quarters of quarters of them, no longer than their distance from any laser or sensor point."""
+
+    corners: Float64  # (n, 3, 3) [engine units]
+    weights: Float64  # (n, 3, 3) barycentric coordinates of the corners in the mesh's triangle
+    shading: Float64  # (n, 3, 3) shading normals at the corners, as the mesh interpolates them
+    shapes: NDArray[np.uint32]  # (n,) index into the scene's shapes
+    primitives: NDArray[np.uint32]  # (n,) triangle of the mesh
+    sizes: Float64  # (n,) longest edge
+    distances: Float64  # (n,) of the centre from the nearest laser or sensor point, at least LEAST
+
+    def at(self, chosen: NDArray[np.bool_]) -> Cells:
+        """Return the cells that are ``chosen``."""
+        if chosen.all():
+            return self
+        return Cells(*(values[chosen] for values in self._arrays()))
+
+    @property
+    def shading_normals(self) -> Float64:
+        """Unit shading normals (n, 3) at the middles."""
+        normals = middles(self.shading)
+        return normals / np.maximum(np.linalg.norm(normals, axis=1), 1e-300)[:, None]
+
+    @classmethod
+    def joined(cls, parts: list[Cells]) -> Cells:
+        """Return the cells of all parts."""
+        if len(parts) == 1:
+            return parts[0]
+        if not parts:
+            none, index = np.zeros((0, 3, 3)), np.zeros(0, np.uint32)
+            return cls(none, none, none, index, index, np.zeros(0), np.zeros(0))
+        return cls(*(np.concatenate(values) for values in zip(*(part._arrays() for part in parts), strict=True)))
+
+    def _arrays(self) -> tuple[NDArray, ...]:
+        return self.corners, self.weights, self.shading, self.shapes, self.primitives, self.sizes, self.distances
+
+
+@dataclass(frozen=True)
+class RegularPoints:
+    """A regular grid of points on the plane z = 0 [engine units]."""
+
+    first: tuple[float, float]
+    step: tuple[float, float]
+    count: tuple[int, int]  # columns, rows
+
+    @classmethod
+    def of(cls, grid: PointGrid, unit: float) -> RegularPoints:
+        x, y = grid.positions[0, :, 0] / unit, grid.positions[:, 0, 1] / unit
+        steps = tuple(float(axis[1] - axis[0]) if len(axis) > 1 else 1.0 for axis in (x, y))
+        return cls((float(x[0]), float(y[0])), (steps[0], steps[1]), (len(x), len(y)))
+
+    def squared_distance(self, points: Float64) -> Float64:
+        """Return the squared distance (n,) from ``points`` (n, 3) to the nearest point of the grid."""
+        squares = points[:, 2] ** 2
+        for axis in range(2):
+            along = (points[:, axis] - self.first[axis]) / self.step[axis]
+            nearest = np.clip(np.rint(along), 0, self.count[axis] - 1)
+            squares = squares + ((along - nearest) * self.step[axis]) ** 2
+        return squares
+
+
+class WallDistance:
+    """Distance from the nearest laser or sensor point of a capture.
+
+    Parameters
+    ----------
+    capture
+        Where the points are.
+    unit
+        Metres per engine unit.
+    """
+
+    def __init__(self, capture: Capture, unit: float):
+        grids = {id(grid): grid for grid in (capture.sensor_grid, capture.laser_grid)}
+        points = np.concatenate([grid.positions.reshape(-1, 3) / unit for grid in grids.values()])
+        self._points = points.astype(np.float32).astype(np.float64)  # as the device knows them: it matters close by
+        self._normals = np.concatenate([grid.normals.reshape(-1, 3) for grid in grids.values()])
+        self._regular: list[RegularPoints] = []
+        self._trees: list[cKDTree] = []
+        for grid in grids.values():
+            regular = RegularPoints.of(grid, unit)
+            positions = grid.positions.reshape(-1, 3) / unit
+            if regular.squared_distance(positions).max() < ROUNDING**2:
+                self._regular.append(regular)
+            else:
+                self._trees.append(cKDTree(positions))
+
+    @cached_property
+    def _tree(self) -> cKDTree:
+        return cKDTree(self._points)
+
+    def __call__(self, points: Float64) -> Float64:
+        """Return the distance (n,) of ``points`` (n, 3) [engine units]."""
+        squares = [grid.squared_distance(points) for grid in self._regular]
+        squares += [np.square(tree.query(points)[0]) for tree in self._trees]
+        return np.sqrt(np.min(squares, axis=0))
+
+    def of_planes(self, points: Float64, normals: Float64) -> Float64:
+        """Return the distance (n,) of planes, given by points and normals (n, 3), close to the wall.
+
+        At least ``NEAREST`` where the nearest laser or sensor point is in the plane as far as float32 knows: heights
+        over a plane that is parallel to a planar wall it knows exactly.
+        """
+        distances, nearest = self._tree.query(points)
+        heights = np.abs(np.einsum("nx,nx->n", points - self._points[nearest], normals))
+        tilts = np.linalg.norm(np.cross(normals, self._normals[nearest]), axis=1)
+        return np.maximum(distances, np.where(heights > LEAST + ROUNDED * tilts, LEAST, NEAREST))
+
+    def out_of_plane(self, points: Float64) -> Float64:
+        """Return the distance (n,) of points of the wall (n, 3) from the nearest one whose plane they are not in.
+
+        Where there is none among ``NEIGHBOURS``, the distance of the last of them: no other is nearer.
+        """
+        count = min(NEIGHBOURS, len(self._points))
+        distances, index = self._tree.query(points, k=np.arange(1, count + 1))
+        heights = np.einsum("nkx,nkx->nk", points[:, None] - self._points[index], self._normals[index])
+        apart = np.abs(heights) > IN_PLANE * distances
+        apart[:, -1] = True
+        return distances[np.arange(len(points)), apart.argmax(axis=1)]
+
+
+def triangles_of_mesh(built: BuiltScene, index: int, mesh: mi.Mesh) -> Cells:
+    """Return the triangles of shape ``index`` that the wall may see lit, one cell each, at no distance yet."""
+    corners, primitives = facing_triangles(built, mesh)
+    count = len(corners)
+    weights = np.broadcast_to(np.eye(3), corners.shape)
+    shapes = np.full(count, index, np.uint32)
+    shading = _shading_normals(mesh, corners, primitives)
+    return Cells(corners, weights, shading, shapes, primitives, longest_edges(corners), np.zeros(count))
+
+
+def parted(cells: Cells, distance: WallDistance, wall_index: int | None, least: float = 0.0) -> tuple[Cells, Cells]:
+    """Return the cells that ``quartered`` leaves as they are, with their distances, and those that it quarters."""
+    distances = _distances(cells, distance, wall_index)
+    large = cells.sizes > np.maximum(distances, least)
+    return replace(cells, distances=distances).at(~large), cells.at(large)
+
+
+def quartered(cells: Cells, distance: WallDistance, wall_index: int | None, least: float = 0.0) -> Cells:
+    """Quarter cells until none is longer than its distance from the nearest point.
+
+    Parameters
+    ----------
+    cells
+        Triangles or parts of them; their distances are not looked at.
+    distance
+        Tells them.
+    wall_index
+        Of the wall among the scene's shapes. The points lie on those of the wall: there only points in the planes of
+        other triangles count.
+    least
+        No cell is quartered that is not longer than this [engine units].
+    """
+    done: list[Cells] = []
+    while len(cells.sizes):
+        small, large = parted(cells, distance, wall_index, least)
+        done.append(small)
+        if not len(large.sizes):
+            break
+        corners = _quartered(large.corners)
+        cells = Cells(
+            corners,
+            _quartered(large.weights),
+            _quartered(large.shading),
+            np.tile(large.shapes, 4),
+            np.tile(large.primitives, 4),
+            longest_edges(corners),
+            np.zeros(len(corners)),
+        )
+    return Cells.joined(done)
+
+
+def _shading_normals(mesh: mi.Mesh, corners: Float64, primitives: NDArray[np.uint32]) -> Float64:
+    """Return the shading normals (n, 3, 3) at the corners of a mesh's triangles."""
+    if not mesh.has_vertex_normals():
+        return np.repeat(normals_and_areas(corners)[0][:, None], 3, axis=1)
+    parameters = mi.traverse(mesh)
+    at_vertices = np.asarray(parameters["vertex_normals"], dtype=np.float64).reshape(-1, 3)
+    return at_vertices[np.asarray(parameters["faces"]).reshape(-1, 3)[primitives]]
+
+
+def _distances(cells: Cells, distance: WallDistance, wall_index: int | None) -> Float64:
+    centres = middles(cells.corners)
+    distances = np.empty(len(centres))
+    on_wall = cells.shapes == (-1 if wall_index is None else wall_index)
+    distances[on_wall] = np.maximum(distance.out_of_plane(centres[on_wall]), NEAREST)
+    hidden = np.flatnonzero(~on_wall)
+    distances[hidden] = distance(centres[hidden])
+    close = hidden[distances[hidden] < NEAREST]
+    distances[close] = distance.of_planes(centres[close], normals_and_areas(cells.corners[close])[0])
+    return distances
+
+
+def normals_and_areas(triangles: Float64) -> tuple[Float64, Float64]:
+    """Return the unit normals (n, 3) and areas (n,) of triangles (n, 3, 3); the normal of no area is zero."""
+    normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+    lengths = np.linalg.norm(normals, axis=1)
+    return normals / np.maximum(lengths, 1e-300)[:, None], lengths / 2
+
+
+def longest_edges(triangles: Float64) -> Float64:
+    """Return the length (n,) of the longest edge of triangles (n, 3, 3)."""
+    squares = [np.square(triangles[:, k] - triangles[:, k - 1]).sum(axis=1) for k in range(3)]
+    return np.sqrt(np.maximum(np.maximum(*squares[:2]), squares[2]))
+
+
+def middles(triangles: Float64) -> Float64:
+    """Return the means (n, m) of the corners of triangles (n, 3, m); numpy's own mean takes five times as long."""
+    return (triangles[:, 0] + triangles[:, 1] + triangles[:, 2]) / 3
+
+
+def _quartered(triangles: Float64) -> Float64:
+    """Return the four similar parts (4 n, 3, 3) of every triangle."""
+    a, b, c = (triangles[:, k] for k in range(3))
+    ab, bc, ca = (a + b) / 2, (b + c) / 2, (c + a) / 2
+    parts = [(a, ab, ca), (ab, b, bc), (ca, bc, c), (bc, ca, ab)]
+    return np.concatenate([np.stack(part, axis=1) for part in parts])

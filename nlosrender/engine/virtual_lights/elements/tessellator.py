@@ -1,0 +1,165 @@
+"""Hidden surfaces, and a wall that sees itself -> patches, as fine as asked.
+
+A patch of size h at distance d from the nearest laser or sensor point has an error of order (h/d)^2 in its geometry
+and of h^2/(4 d w) bins in its delay, with w the bin width: within a triangle the delay is taken as linear. One number,
+``coarseness``, scales the size allowed by both, so that the error falls with its square.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from functools import cached_property, lru_cache
+
+import numpy as np
+
+from nlosrender.capture.grids import Capture
+from nlosrender.engine.virtual_lights.elements.patches import Patches
+from nlosrender.engine.virtual_lights.elements.round_shapes import RoundShape
+from nlosrender.engine.virtual_lights.elements.sensor_regions import regions_of
+from nlosrender.engine.virtual_lights.elements.size_field import GradedCells, Grading
+from nlosrender.engine.virtual_lights.elements.subdivision import Cells, WallDistance, quartered, triangles_of_mesh
+from nlosrender.scene.build import WALL_ID, BuiltScene
+from nlosrender.scene.round_surfaces import ROUND_PLUGINS
+
+MAX_PATCHES = 2_000_000  # of one gather; beyond it the path engine is the better choice
+MOST_KEPT = 200_000  # patches of one resolution that are kept for the next call
+MOST_AT_ONCE = 500_000  # patches of regions that are made together
+
+
+class Tessellator:
+    """Cuts the hidden geometry of one scene, and a wall that sees itself, into patches, as fine as asked.
+
+    Triangles are first quartered until none is longer than its distance from the nearest laser or sensor point
+    (the *cells*), then cut into equal parts, or merged where they are far smaller than need be.
+
+    Parameters
+    ----------
+    built
+        The scene: meshes, spheres and cylinders; ``can_tessellate`` tells beforehand.
+    capture
+        Where the laser and sensor points are.
+    bin_width
+        Bin width [engine units].
+    may_divide
+        Whether parts of the sensor grid may have patches of their own, where that is cheaper.
+    """
+
+    def __init__(self, built: BuiltScene, capture: Capture, bin_width: float, *, may_divide: bool = True):
+        self.built, self.capture = built, capture
+        self.distance = WallDistance(capture, built.unit)
+        self.reach = max(capture.sensor_grid.size) / (2 * built.unit)  # half the sensor grid's extent [engine units]
+        triangles: list[Cells] = []
+        self.round_shapes: list[RoundShape] = []
+        self.wall_index: int | None = None  # of the wall among the scene's shapes, where it is cut as well
+        for index, shape in enumerate(built.scene.shapes()):
+            if shape.id() == WALL_ID:
+                if not wall_sees_itself(built):
+                    continue
+                self.wall_index = index
+            if shape.is_mesh():
+                triangles.append(triangles_of_mesh(built, index, shape))
+            else:
+                self.round_shapes.append(RoundShape.of(index, shape))
+        light = capture.laser_grid.positions.reshape(-1, 3).mean(axis=0) / built.unit
+        self.grading = Grading(bin_width, self.wall_index, light)
+        joined = Cells.joined(triangles)
+        self.cells = quartered(joined, self.distance, self.wall_index)
+        whole = GradedCells(self.cells, self.grading)
+        self.regions = regions_of(capture, built.unit, self.distance, joined, whole) if may_divide else None
+        self.shared = whole if self.regions is None else self.regions.shared
+        self._is_hidden = whole.is_hidden
+        self._kept = lru_cache(maxsize=2)(self._make)
+
+    def set_up(self) -> None:
+        """Sum up the cells that are merged at any resolution, if there are any."""
+        for cells in (self.shared, *(self.regions.near if self.regions else ())):
+            cells.set_up()
+
+    def patches(self, coarseness: float) -> Patches:
+        """Return patches whose error is of order ``coarseness`` squared; those of the last calls are kept if few.
+
+        Where there are regions, these are the patches that all of them share.
+        """
+        if sum(self.shared.counts(coarseness)) > MOST_KEPT:
+            return self._make(coarseness)
+        return self._kept(coarseness)
+
+    def regional_patches(self, coarseness: float, wanted: Sequence[int]) -> Iterator[tuple[list[int], list[Patches]]]:
+        """Yield the ``wanted`` regions, and the patches close to the wall of each: as many as fit at once."""
+        if self.regions is None:
+            return
+        labels: list[int] = []
+        parts: list[Patches] = []
+        for label in wanted:
+            patches = Patches.joined(self.regions.near[label].patches(coarseness))
+            if parts and sum(map(len, parts)) + len(patches) > MOST_AT_ONCE:
+                yield labels, parts
+                labels, parts = [], []
+            labels.append(label)
+            parts.append(patches)
+        if parts:
+            yield labels, parts
+
+    def _make(self, coarseness: float) -> Patches:
+        on_round = [shape.patches(*self._allowed_on(shape, coarseness)) for shape in self.round_shapes]
+        return Patches.joined([*self.shared.patches(coarseness), *on_round])
+
+    def count(self, coarseness: float) -> int:
+        """Return about how many patches a sensor point would gather, on average; exactly where none merge."""
+        return sum(self.counts(coarseness))
+
+    def counts(self, coarseness: float) -> tuple[int, ...]:
+        """Return ``count`` of the hidden meshes, of a mesh wall that sees itself, and of each sphere and cylinder."""
+        on_round = (shape.count(*self._allowed_on(shape, coarseness)) for shape in self.round_shapes)
+        return (*(self.regions or self.shared).counts(coarseness), *on_round)
+
+    @property
+    def nearest(self) -> float:
+        """Distance from the points to the nearest hidden cell's centre, or round shape [engine units]."""
+        return min([float(self.cells.distances[self._is_hidden].min(initial=np.inf)), self.nearest_round])
+
+    @property
+    def nearest_round(self) -> float:
+        """Distance from the points to the nearest hidden round shape [engine units]; inf where there is none."""
+        on_round = (shape.nearest(self.distance) for shape in self.round_shapes if shape.index != self.wall_index)
+        return min(on_round, default=math.inf)
+
+    @cached_property
+    def nearest_to_laser(self) -> float:
+        """Distance from the laser points to the nearest hidden cell's centre, or round shape [engine units]."""
+        lasers = WallDistance(replace(self.capture, sensor_grid=self.capture.laser_grid), self.built.unit)
+        on_round = [shape.nearest(lasers) for shape in self.round_shapes if shape.index != self.wall_index]
+        centres = self.cells.corners[self._is_hidden].mean(axis=1)
+        return min([float(lasers(centres).min(initial=np.inf)) if len(centres) else math.inf, *on_round])
+
+    @property
+    def n_round_cells(self) -> int:
+        """Cells of all round shapes: a needle has as many as it is longer than it is wide."""
+        return sum(shape.count(*self._allowed_on(shape, 1.0)) for shape in self.round_shapes)
+
+    def round_cells(self) -> list[tuple[RoundShape, Patches]]:
+        """Return every round shape, and its cells, whose corners lie on it."""
+        return [(shape, shape.patches(*self._allowed_on(shape, 1.0), raised=False)) for shape in self.round_shapes]
+
+    def _allowed_on(self, shape: RoundShape, coarseness: float) -> tuple[float, float]:
+        """Return the size of patches across a round shape, and along the axis of a cylinder, which is straight."""
+        if shape.index == self.wall_index:
+            # cos cos / r^2 varies over the radius only, however near: 1 / (4 radius^2) between points of a sphere
+            nearest = abs(shape.radius)
+        else:
+            nearest = max(shape.nearest(self.distance), abs(shape.radius) / 8)
+        straight = float(self.grading.allowed_size(np.array([nearest]))[0])
+        return coarseness * min(straight, abs(shape.radius)), coarseness * straight
+
+
+def can_tessellate(built: BuiltScene) -> bool:
+    """Return whether every hidden shape is a mesh, a sphere or a cylinder."""
+    return all(shape.is_mesh() or shape.class_name() in ROUND_PLUGINS for shape in built.hidden_shapes)
+
+
+def wall_sees_itself(built: BuiltScene) -> bool:
+    """Return whether light may go from the wall to the wall: not on a plane, nor outside a sphere or cylinder."""
+    wall = built.wall_shape
+    return not built.wall.is_planar and (wall.is_mesh() or wall.has_flipped_normals())

@@ -1,0 +1,141 @@
+"""A patch's light over the bins it covers: no noise, exact for a delay that is linear over the patch.
+
+The light per delay over a triangle rises and then falls, linearly; over a parallelogram it is constant in between. Let
+the delays (in bins) at which it begins, is at its height, leaves it and ends be t0 <= t1 <= t2 <= t3. The part of the
+area with a delay below t is
+
+    (t - t0)^2 / ((t1 - t0) s)                 for t0 <= t <= t1
+    (2 t - t0 - t1) / s                        for t1 <= t <= t2
+    1 - (t3 - t)^2 / ((t3 - t2) s)             for t2 <= t <= t3
+
+with s = t3 + t2 - t1 - t0, and the share of a bin is the difference of this function at the bin's edges. Cf.
+Iseringhausen & Hullin 2020; Tsai et al. 2019.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+import drjit as dr
+import mitsuba as mi
+
+from nlosrender.engine.virtual_lights.gather.block_histogram import BLOCK, BlockHistogram
+
+NARROWEST = 1e-3  # bins: below it a patch's delay counts as one number
+LEAST = 1e-6  # bins, of the rise and the fall: keeps quotients finite
+
+
+@dataclass(eq=False)  # not frozen: the state of a loop
+class Delays:
+    """The delays that a patch covers [bins], ascending."""
+
+    t0: mi.Float
+    t1: mi.Float
+    t2: mi.Float | None  # None: no patch is a parallelogram, t2 = t1
+    t3: mi.Float
+
+    @classmethod
+    def of_triangle(cls, a: mi.Float, b: mi.Float, c: mi.Float) -> Delays:
+        """Return what a triangle covers; parameters are the delays of its corners."""
+        middle = dr.maximum(dr.minimum(a, b), dr.minimum(dr.maximum(a, b), c))
+        return cls(dr.minimum(a, dr.minimum(b, c)), middle, None, dr.maximum(a, dr.maximum(b, c)))
+
+    @classmethod
+    def of_parallelogram(cls, a: mi.Float, b: mi.Float, c: mi.Float, d: mi.Float) -> Delays:
+        """Return what a parallelogram covers; parameters are the delays of its corners, one after the other.
+
+        The best linear function through four corners is their mean in the middle.
+        """
+        one, other = dr.abs(b - a + c - d) / 2, dr.abs(d - a + c - b) / 2
+        short, long = dr.minimum(one, other), dr.maximum(one, other)
+        t0 = (a + b + c + d) / 4 - (short + long) / 2
+        return cls(t0, t0 + short, t0 + long, t0 + short + long)
+
+    @classmethod
+    def of_either(cls, is_parallelogram: mi.Bool, delays: mi.Vector4f) -> Delays:
+        """Return what parallelograms cover, and the triangles of the first three corners where patches are none."""
+        a, b, c, d = delays
+        triangle, whole = cls.of_triangle(a, b, c), cls.of_parallelogram(a, b, c, d)
+        return cls(
+            dr.select(is_parallelogram, whole.t0, triangle.t0),
+            dr.select(is_parallelogram, whole.t1, triangle.t1),
+            dr.select(is_parallelogram, whole.t2, triangle.t1),
+            dr.select(is_parallelogram, whole.t3, triangle.t3),
+        )
+
+    def later(self, delay: mi.Float | int) -> Delays:
+        """Return the delays that begin so much later."""
+        t2 = None if self.t2 is None else self.t2 + delay
+        return Delays(self.t0 + delay, self.t1 + delay, t2, self.t3 + delay)
+
+
+class _Shares:
+    """Shares of the bins that a patch covers."""
+
+    def __init__(self, delays: Delays):
+        t0, t1, t3 = delays.t0, delays.t1, delays.t3
+        t2 = t1 if delays.t2 is None else delays.t2
+        self.delays = delays
+        self.height = dr.rcp(dr.maximum((t3 - t0) + (t2 - t1), NARROWEST))
+        self.rising = self.height * dr.rcp(dr.maximum(t1 - t0, LEAST))
+        self.falling = self.height * dr.rcp(dr.maximum(t3 - t2, LEAST))
+
+    def below(self, delay: mi.Float | int) -> mi.Float:
+        """Return the share of the area with a smaller delay."""
+        t0, t1, t2, t3 = self.delays.t0, self.delays.t1, self.delays.t2, self.delays.t3
+        up = dr.square(dr.maximum(delay - t0, 0)) * self.rising
+        down = 1 - dr.square(dr.maximum(t3 - delay, 0)) * self.falling
+        if t2 is not None:
+            down = dr.select(delay < t2, ((delay - t0) + (delay - t1)) * self.height, down)
+        return dr.select(delay < t1, up, down)
+
+    def of_block(self, below: mi.Float) -> tuple[list[mi.Float], mi.Float]:
+        """Return the shares of the bins of a block that begins at 0, and of all up to its end; ``below`` lie before."""
+        edges = [below, *(self.below(edge) for edge in range(1, BLOCK + 1))]
+        return [right - left for left, right in pairwise(edges)], edges[-1]
+
+
+@dr.syntax
+def spread_patch(
+    histogram: BlockHistogram,
+    lane: mi.UInt32,
+    laser: mi.UInt32,
+    delays: Delays,
+    whole: mi.Int32,
+    value: mi.Spectrum,
+    active: mi.Bool,
+) -> None:
+    """Deposit ``value`` over the bins that a patch covers.
+
+    Parameters
+    ----------
+    histogram, lane, laser
+        Which row.
+    delays, whole
+        Delays that it covers [bins], and whole bins to add to all of them.
+    value, active
+        What is deposited, and where anything is.
+    """
+    base = dr.floor(delays.t0)
+    first = mi.Int32(base) + whole
+    last = first + mi.Int32(delays.t3 - base)
+    block = dr.maximum(first, 0) // BLOCK
+    # delays are counted from the block's left edge
+    covered = delays.later(mi.Float(first - block * BLOCK) - base)
+    below = mi.Float(0)  # share of the area with a delay below the block
+    early, late = first < 0, last >= histogram.shape.n_bins
+    spilled = active & (early | late)
+    if dr.hint(spilled, exclude=[histogram, value, lane, laser]):
+        shares = _Shares(covered)
+        end = mi.Float(histogram.shape.n_bins - block * BLOCK)
+        below = dr.select(early, shares.below(mi.Float(0)), 0)
+        beyond = dr.select(late, 1 - shares.below(end), 0)
+        histogram.deposit_outside(lane, laser, value * (below + beyond), spilled)
+    more = active & (last >= 0) & (block < histogram.n_blocks)
+    while dr.hint(more, exclude=[histogram, value, lane, laser]):
+        of_bins, below = _Shares(covered).of_block(below)
+        histogram.deposit(lane, laser, block, of_bins, value, more)
+        block += 1
+        more = (covered.t3 > BLOCK) & (block < histogram.n_blocks)
+        covered = covered.later(-BLOCK)

@@ -1,0 +1,207 @@
+"""The gather: every sensor point looks at every patch; each patch's light is spread over the bins it covers.
+
+One lane per sensor point walks over all patches, so that a lane owns its rows of the histogram (``spread``). The lanes
+of a packet are neighbouring sensor points that look at one point of the same patch: packets of rays stay together.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+from nlosrender.engine.launch.device_arrays import WallPoints
+from nlosrender.engine.launch.launch_params import Transport
+from nlosrender.engine.virtual_lights.gather.block_histogram import BlockHistogram
+from nlosrender.engine.virtual_lights.gather.delay_distribution import Delays, spread_patch
+from nlosrender.engine.virtual_lights.gather.lighting import ROWS, GatherSettings, Lights, four_corners, is_visible
+
+
+@dr.syntax
+def gather_third_bounce(
+    settings: GatherSettings,
+    transport: Transport,
+    lights: Lights,
+    histogram: BlockHistogram,
+    lane: mi.UInt32,
+    part: mi.UInt32,
+    tile: mi.UInt64,
+    skipped: mi.UInt32,
+    most: mi.UInt32,
+) -> None:
+    """Deposit the third bounce: lane by lane over ``most`` patches of its part, after the first ``skipped`` ones.
+
+    Several lanes may share the patches of one sensor point, each into rows of its own.
+
+    Parameters
+    ----------
+    settings, transport, lights
+        What is gathered, and by whom.
+    histogram, lane
+        Where to, and the row of each lane of ``transport``.
+    part
+        The part of ``lights`` that each lane gathers.
+    tile
+        The bit of the tile that its sensor point lies in, see ``Outlook``.
+    skipped, most
+        Opaque.
+    """
+    built, sensors = transport.built, transport.sensors
+    sensor, wall_bsdf = sensors.interaction, built.wall_bsdf
+    context = mi.BSDFContext()
+    n_lasers, count = transport.n_lasers, lights.count
+    own_laser = transport.lasers.gather(transport.first_laser)
+
+    end = dr.gather(mi.UInt32, lights.first, part + 1)
+
+    # ---- State ---------------------------------------------------------------------------------------------------
+    patch = dr.gather(mi.UInt32, lights.first, part) + skipped
+    end = dr.minimum(end, patch + most)
+
+    while dr.hint(
+        patch < end,
+        exclude=[
+            end,
+            settings,
+            transport,
+            lights,
+            histogram,
+            built,
+            sensors,
+            sensor,
+            wall_bsdf,
+            own_laser,
+            tile,
+        ],
+    ):
+        # ---- The patch as the sensor point sees it -----------------------------------------------------------------
+        rows = [dr.gather(mi.Vector4f, lights.packed, patch * ROWS + k) for k in range(ROWS)]
+        a, b, c, centre, shown, offset = (mi.Point3f(row.x, row.y, row.z) for row in rows)
+        from_sensor = centre - sensor.p
+        areas = mi.Vector3f(rows[0].w, rows[1].w, rows[2].w)
+        to_patch = from_sensor
+        if dr.hint(lights.remainder is not None, mode="scalar"):
+            to_patch = from_sensor + _remainder(lights, patch)
+        distance2 = dr.squared_norm(to_patch)
+        direction = to_patch * dr.rsqrt(distance2)
+        received = wall_bsdf.eval(context, sensor, sensor.to_local(direction))
+        weight = received * (dr.abs(dr.dot(areas, direction)) / distance2)
+        active = dr.any(weight > 0)
+        cosine = mi.Float(0)
+        if dr.hint(settings.is_diffuse, mode="scalar"):
+            cosine = -dr.dot(dr.gather(mi.Normal3f, lights.shading, patch), direction)
+            active &= cosine > 0
+
+        is_cluster = None
+        if dr.hint(lights.has_clusters, mode="scalar"):
+            is_cluster = rows[3].w > 0
+
+        # ---- Visibility --------------------------------------------------------------------------------------------
+        if dr.hint(settings.needs_visibility, mode="scalar"):
+            # in front of the plane through the point that is looked at, not through the centre
+            way = from_sensor + shown
+            clearance = dr.select(dr.dot(areas, way) < 0, dr.gather(mi.UInt64, lights.clearance, patch), 0)
+            active = is_visible(built, sensor, way, mi.Vector3f(offset), active, clearance, tile)
+
+        # ---- Reflect towards the lasers and deposit ----------------------------------------------------------------
+        scale = transport.bins_per_unit
+        delays = mi.Vector4f(
+            *(dr.norm(end - sensor.p) * scale + sensors.delay_fraction for end in four_corners(a, b, c))
+        )
+        if dr.hint(settings.is_confocal, mode="scalar"):
+            lit = own_laser.interaction
+            value = weight * wall_bsdf.eval(context, lit, lit.to_local(direction)) / distance2
+            if dr.hint(settings.is_diffuse, mode="scalar"):
+                value *= dr.gather(mi.Spectrum, lights.reflectance, patch) * cosine
+            else:
+                value *= _reflected(lights, patch, direction, -direction, active)
+            delays = 2 * delays + (own_laser.delay_fraction - sensors.delay_fraction)
+            whole = own_laser.delay_bins + sensors.delay_bins
+            _spread(histogram, lane, mi.UInt32(0), delays, whole, value, is_cluster, active)
+        elif dr.hint(transport.lasers_per_lane == 1, mode="scalar"):
+            seen = _SeenPatch(patch, weight, delays, is_cluster, direction, active)
+            _deposit(settings, lights, histogram, sensors, own_laser, lane, mi.UInt32(0), patch, seen)
+        else:
+            laser = mi.UInt32(0)
+            while dr.hint(
+                laser < n_lasers,
+                exclude=[settings, transport, lights, histogram, sensors, weight, delays, direction, patch, count],
+            ):
+                points = transport.lasers.gather(laser)
+                seen = _SeenPatch(patch, weight, delays, is_cluster, direction, active)
+                _deposit(settings, lights, histogram, sensors, points, lane, laser, laser * count + patch, seen)
+                laser += 1
+        patch += 1
+
+
+@dataclass(frozen=True, eq=False)
+class _SeenPatch:
+    """A patch as the lane's sensor point sees it."""
+
+    patch: mi.UInt32
+    weight: mi.Spectrum  # wall's BSDF and the geometry between; of patches that are not Lambertian without their BSDF
+    delays: mi.Vector4f  # from the corners [bins]
+    is_cluster: mi.Bool | None  # None: no patch is
+    direction: mi.Vector3f  # towards it
+    active: mi.Bool
+
+
+def _deposit(
+    settings: GatherSettings,
+    lights: Lights,
+    histogram: BlockHistogram,
+    sensors: WallPoints,
+    laser_points: WallPoints,
+    lane: mi.UInt32,
+    laser: mi.UInt32,
+    entry: mi.UInt32,
+    seen: _SeenPatch,
+) -> None:
+    """Deposit what a patch sends on from one laser; ``entry`` is the pair of patch and laser."""
+    value = seen.weight * dr.gather(mi.Spectrum, lights.arriving, entry)
+    lit = seen.active & dr.any(value > 0)
+    if not settings.is_diffuse:
+        centre = dr.gather(mi.Point3f, lights.interaction.p, seen.patch)
+        to_laser = laser_points.interaction.p - centre
+        if lights.remainder is not None:
+            to_laser -= _remainder(lights, seen.patch)
+        to_laser = dr.normalize(to_laser)
+        value *= _reflected(lights, seen.patch, seen.direction, to_laser, lit)
+        lit &= dr.any(value > 0)
+    legs = dr.gather(mi.Vector4f, lights.delays, entry)
+    delays = seen.delays + legs + laser_points.delay_fraction
+    _spread(histogram, lane, laser, delays, laser_points.delay_bins + sensors.delay_bins, value, seen.is_cluster, lit)
+
+
+def _spread(
+    histogram: BlockHistogram,
+    lane: mi.UInt32,
+    laser: mi.UInt32,
+    delays: mi.Vector4f,
+    whole: mi.Int32,
+    value: mi.Spectrum,
+    is_cluster: mi.Bool | None,
+    active: mi.Bool,
+) -> None:
+    """Deposit a patch: a triangle, or a cluster's parallelogram."""
+    if is_cluster is None:
+        covered = Delays.of_triangle(delays.x, delays.y, delays.z)
+    else:
+        covered = Delays.of_either(is_cluster, delays)
+    spread_patch(histogram, lane, laser, covered, whole, value, active)
+
+
+def _remainder(lights: Lights, patch: mi.UInt32) -> mi.Vector3f:
+    """Return what float32 rounds off a patch's centre."""
+    row = dr.gather(mi.Vector4f, lights.remainder, patch)
+    return mi.Vector3f(row.x, row.y, row.z)
+
+
+def _reflected(
+    lights: Lights, patch: mi.UInt32, direction: mi.Vector3f, to_laser: mi.Vector3f, active: mi.Bool
+) -> mi.Spectrum:
+    """Return BSDF times the cosine towards the laser, of patches that are not Lambertian."""
+    si = dr.gather(mi.SurfaceInteraction3f, lights.interaction, patch)
+    si.wi = si.to_local(-direction)
+    return si.bsdf().eval(mi.BSDFContext(), si, si.to_local(to_laser), active)

@@ -1,0 +1,276 @@
+"""Virtual lights: what the lasers make of patches, and what of it sensor points read."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from nlosrender.engine.launch.device_arrays import on_device
+from nlosrender.engine.launch.launch_params import Transport
+from nlosrender.engine.path.laser_connections import off_the_wall
+from nlosrender.engine.virtual_lights.gather.device_patches import DevicePatches
+from nlosrender.engine.virtual_lights.visibility.masks import Clearances, Outlook
+from nlosrender.scene.build import BuiltScene
+
+ROWS = 6  # of four numbers each: what the gather reads of a patch
+LASER_RAYS = 4  # shadow rays from the only laser to points spread over a patch
+
+
+@dataclass(frozen=True)
+class GatherSettings:
+    """What the gather's kernel does; part of the compiled kernel."""
+
+    is_confocal: bool
+    is_diffuse: bool  # every hidden BSDF is Lambertian: reflectance and a cosine are all there is
+    needs_visibility: bool  # something may lie between wall and patches
+    has_one_laser: bool  # in the whole capture, however it is cut
+
+    @property
+    def lights_once(self) -> bool:
+        """Whether the patches of all batches send on the same light."""
+        return self.has_one_laser or self.is_confocal
+
+
+@dataclass(frozen=True, eq=False)
+class Lights:
+    """What the gather's loop reads: patches that are lit, packed so that one load brings four numbers."""
+
+    # 24 a patch: three corners, each with one component of normal times area; the centre, and 1 for a cluster; from it
+    # to the point of the surface that shadow rays ask for, and 0; the ray offset along the normal there, and 0
+    packed: mi.Float
+    clearance: mi.UInt64  # there, see ``Clearances.of``
+    remainder: mi.Float | None  # four a patch: what float32 rounds off the centre; None where that does not count
+    shading: mi.Normal3f  # shading normals
+    interaction: mi.SurfaceInteraction3f  # at the centres; not read for Lambertian patches
+    reflectance: mi.Spectrum  # confocal Lambertian patches: reflectance / pi
+    arriving: mi.Spectrum  # index = laser * count + patch: light that arrives, per area perpendicular to it;
+    # of Lambertian patches the light that leaves; empty for confocal captures
+    delays: mi.Float  # four an index: from the laser point to each corner [bins]
+    has_clusters: bool
+    count: mi.UInt32  # of lit patches, opaque
+    first: mi.UInt32  # of part k: its patches are first[k] to first[k + 1]
+
+
+@dataclass(frozen=True, eq=False)
+class Clearing:
+    """What it takes to leave visibility rays out."""
+
+    clearances: Clearances
+    outlook: Outlook  # a rectangle per region of the patches
+
+    @property
+    def is_worthwhile(self) -> bool:
+        """Whether enough points look."""
+        return self.clearances.are_worthwhile(self.outlook.n_points)
+
+    def of(self, patches: DevicePatches, seen_at: mi.Vector3f, active: mi.Bool) -> mi.UInt64:
+        """Return the clearance of patches where rays end, see ``Clearances.of``."""
+        where = on_device(mi.UInt32, patches.places.regions)
+        return self.clearances.of(patches.surface(seen_at), self.outlook, where, active)
+
+
+@dataclass(frozen=True, eq=False)
+class Illuminated:
+    """Patches and what the lasers of a batch send them; those of confocal captures are lit as they are gathered."""
+
+    patches: DevicePatches
+    arriving: mi.Spectrum  # index = laser * n_patches + patch; see ``Lights``
+    is_lit: mi.Bool  # by any of the lasers
+    seen_at: mi.Vector3f  # from the centres to where sensor points look at them
+    clearance: mi.UInt64  # there, see ``Clearances.of``
+    is_cleared: bool  # it has been asked for: enough points look
+
+    def cleared(self, clearing: Clearing) -> Illuminated:
+        """Return the same with clearances, if enough points look."""
+        if not clearing.is_worthwhile:
+            return self
+        return replace(self, clearance=clearing.of(self.patches, self.seen_at, self.is_lit), is_cleared=True)
+
+
+def illuminate(
+    settings: GatherSettings, transport: Transport, patches: DevicePatches, clearing: Clearing, n_lasers: int
+) -> Illuminated:
+    """Light patches.
+
+    Parameters
+    ----------
+    settings, transport
+        What the gather does and reads.
+    patches
+        All patches of a resolution.
+    clearing
+        Tells which visibility rays may be left out.
+    n_lasers
+        Lasers of the batch.
+    """
+    count = dr.width(patches.areas)
+    seen_at, all_lit = patches.points(patches.number), dr.full(mi.Bool, True, count)
+    dr.eval(seen_at)
+    lit = Illuminated(patches, mi.Spectrum(0), all_lit, seen_at, dr.zeros(mi.UInt64, count), is_cleared=False)
+    if settings.needs_visibility and not settings.has_one_laser:
+        lit = lit.cleared(clearing)
+    if not settings.is_confocal:
+        lit = _illuminate(settings, transport, lit, clearing, n_lasers)
+    if settings.needs_visibility and settings.has_one_laser:
+        lit = lit.cleared(clearing)
+    return lit
+
+
+def lights_of(
+    settings: GatherSettings, transport: Transport, illuminated: Illuminated, slices: int, n_lasers: int
+) -> Lights:
+    """Return what the gather reads: the patches that are lit, in as many parts per region as there are ``slices``."""
+    patches, arriving, delays = illuminated.patches, illuminated.arriving, mi.Float(0)
+    count = dr.width(patches.areas)
+    lit = dr.compress(illuminated.is_lit)
+    if not dr.width(lit):
+        lit = mi.UInt32(0)  # all is dark: one dark patch, since arrays of no length cannot be read
+    lit, first = (on_device(mi.UInt32, values) for values in patches.places.in_parts(np.array(lit.numpy()), slices))
+    if not settings.is_confocal:
+        index = dr.arange(mi.UInt32, dr.width(lit) * n_lasers)
+        n_lit = dr.opaque(mi.UInt32, dr.width(lit))  # as a constant it would be part of the kernel
+        laser, patch = index // n_lit, dr.gather(mi.UInt32, lit, index % n_lit)
+        arriving = dr.gather(mi.Spectrum, arriving, laser * dr.opaque(mi.UInt32, count) + patch)
+        points = dr.gather(mi.Point3f, transport.lasers.interaction.p, laser)
+        ends = four_corners(*_corners(patches, patch))
+        delays = dr.ravel(mi.Vector4f(*(dr.norm(end - points) * transport.bins_per_unit for end in ends)))
+    a, b, c = _corners(patches, lit)
+    areas, interaction = (
+        dr.gather(mi.Vector3f, patches.areas, lit),
+        dr.gather(mi.SurfaceInteraction3f, patches.interaction, lit),
+    )
+    is_cluster = dr.gather(mi.Vector4f, patches.members, lit).w
+    shown = dr.gather(mi.Vector3f, illuminated.seen_at, lit)
+    clearance = dr.gather(mi.UInt64, illuminated.clearance, lit)
+    offset = dr.gather(mi.Vector3f, patches.offset_at(illuminated.seen_at), lit)
+    rows = [(a, areas.x), (b, areas.y), (c, areas.z), (interaction.p, is_cluster), (shown, 0), (offset, 0)]
+    packed = dr.zeros(mi.Float, 4 * ROWS * dr.width(lit))
+    lane = dr.arange(mi.UInt32, dr.width(lit))
+    for k, (point, fourth) in enumerate(rows):
+        dr.scatter(packed, mi.Vector4f(*point, fourth), lane * ROWS + k)
+    remainder = None
+    if patches.is_near:
+        rest = dr.gather(mi.Vector3f, patches.remainder, lit)
+        remainder = dr.ravel(mi.Vector4f(rest.x, rest.y, rest.z, 0))
+    reflectance = dr.gather(mi.Spectrum, patches.reflectance, lit) * dr.inv_pi
+    dr.eval(packed, clearance, remainder, arriving, delays, interaction, reflectance)
+    return Lights(
+        packed,
+        clearance,
+        remainder,
+        interaction.sh_frame.n,
+        interaction,
+        reflectance,
+        arriving,
+        delays,
+        patches.has_clusters,
+        dr.opaque(mi.UInt32, dr.width(lit)),
+        first,
+    )
+
+
+def _illuminate(
+    settings: GatherSettings, transport: Transport, dark: Illuminated, clearing: Clearing, n_lasers: int
+) -> Illuminated:
+    """Light every patch by every laser: emission, distance, and the share of the patch that is not in shadow.
+
+    Sensor points look where they did, or at a point that the only laser lights. Lambertian patches send light on.
+    """
+    patches, seen_at, clearance = dark.patches, dark.seen_at, dark.clearance
+    built = transport.built
+    n_patches = dr.width(patches.areas)
+    index = dr.arange(mi.UInt32, n_patches * n_lasers)
+    divisor = dr.opaque(mi.UInt32, n_patches)
+    patch, laser = index % divisor, index // divisor
+    points = transport.lasers.gather(laser)
+    lit = points.interaction
+    to_rounded = dr.gather(mi.Point3f, patches.interaction.p, patch) - lit.p
+    to_patch = to_rounded + dr.gather(mi.Vector3f, patches.remainder, patch)
+    distance2 = dr.squared_norm(to_patch)
+    direction = to_patch * dr.rsqrt(distance2)
+    arriving = built.wall_bsdf.eval(mi.BSDFContext(), lit, lit.to_local(direction)) / distance2
+    cosine = -dr.dot(dr.gather(mi.Normal3f, patches.interaction.sh_frame.n, patch), direction)
+    active = dr.any(arriving > 0)
+    if settings.is_diffuse:
+        arriving *= dr.maximum(cosine, 0) * dr.gather(mi.Spectrum, patches.reflectance, patch) * dr.inv_pi
+        active &= dr.any(arriving > 0)
+    else:
+        flags = dr.gather(mi.SurfaceInteraction3f, patches.interaction, patch).bsdf().flags()
+        active &= (cosine > 0) | mi.has_flag(flags, mi.BSDFFlags.BackSide)
+    seen = mi.Float(1)
+    if settings.needs_visibility and settings.has_one_laser:
+        seen, seen_at = _share_in_light(built, patches, lit, to_rounded, active)
+    elif settings.needs_visibility:
+        # the very point that sensor points look at: what hides a part of a patch from both hides the same part
+        way = to_rounded + dr.gather(mi.Vector3f, seen_at, patch)
+        offset = dr.gather(mi.Vector3f, patches.offset_at(seen_at), patch)
+        tile = clearing.outlook.tile_bit(mi.UInt32(0), lit.p)
+        is_before = dr.dot(dr.gather(mi.Vector3f, patches.areas, patch), way) < 0  # the plane through that point
+        clear = dr.select(is_before, dr.gather(mi.UInt64, clearance, patch), 0)
+        seen = dr.select(is_visible(built, lit, way, offset, active, clear, tile), mi.Float(1), 0)
+    arriving = dr.select(active, arriving * seen, 0)
+    brightest = dr.zeros(mi.Float, n_patches)
+    dr.scatter_reduce(dr.ReduceOp.Max, brightest, dr.max(arriving), patch)
+    is_lit = brightest > 0
+    dr.eval(arriving, is_lit, seen_at)
+    return replace(dark, arriving=arriving, is_lit=is_lit, seen_at=seen_at)
+
+
+def _share_in_light(
+    built: BuiltScene,
+    patches: DevicePatches,
+    laser: mi.SurfaceInteraction3f,
+    to_rounded: mi.Vector3f,
+    active: mi.Bool,
+) -> tuple[mi.Float, mi.Vector3f]:
+    """Return the share of each patch that the only laser lights, and a point in light for sensor points to look at.
+
+    Shares of a patch that laser and sensor point see are not independent where one edge throws both shadows. A point
+    drawn among those in light makes their product right on average.
+    """
+    n_seen, chosen = mi.UInt32(0), mi.Vector3f(0)
+    for k in range(LASER_RAYS):
+        index = patches.number * LASER_RAYS + k
+        point = patches.points(index)
+        is_lit = is_visible(built, laser, to_rounded + point, patches.offset_at(point), active)
+        n_seen += dr.select(is_lit, mi.UInt32(1), 0)
+        # the n-th point in light takes the place of the one before with a chance of 1 / n
+        takes = is_lit & (mi.sample_tea_float32(index, patches.start.x) * mi.Float(n_seen) < 1)
+        chosen = dr.select(takes, point, chosen)
+    return mi.Float(n_seen) / LASER_RAYS, chosen
+
+
+def is_visible(
+    built: BuiltScene,
+    wall_point: mi.SurfaceInteraction3f,
+    way: mi.Vector3f,
+    offset: mi.Vector3f,
+    active: mi.Bool,
+    clearance: mi.UInt64 | None = None,
+    tile: mi.UInt64 | None = None,
+) -> mi.Bool:
+    """Return whether nothing lies on the way from a point of the wall to a point of a hidden surface.
+
+    The shadow ray ends at the latter moved by ``offset``, the ray offset along the surface's normal, to the side that
+    faces the wall point. ``clearance`` is that of the surface point, and ``tile`` the bit of the tile the wall point
+    lies in.
+    """
+    origin = off_the_wall(built, wall_point)
+    direction = way - (origin - wall_point.p)
+    direction -= offset * dr.sign(dr.dot(offset, direction))
+    asked = active if clearance is None else active & ((clearance & tile) == 0)
+    ray = mi.Ray3f(origin, direction, mi.Float(1), mi.Float(0), [])
+    return active & ~(asked & built.scene.ray_test(ray, coherent=False, active=asked))
+
+
+def four_corners(a: mi.Point3f, b: mi.Point3f, c: mi.Point3f) -> tuple[mi.Point3f, ...]:
+    """Return a triangle's corners and the fourth that makes it a parallelogram."""
+    return a, b, c, a + (c - b)
+
+
+def _corners(patches: DevicePatches, index: mi.UInt32) -> list[mi.Point3f]:
+    centre = dr.gather(mi.Point3f, patches.interaction.p, index)
+    return [centre + dr.gather(mi.Vector3f, corner, index) for corner in patches.corners]

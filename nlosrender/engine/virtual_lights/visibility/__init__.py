@@ -1,0 +1,1 @@
+"""Visibility masks: from which tiles of the wall nothing can hide a surface point."""

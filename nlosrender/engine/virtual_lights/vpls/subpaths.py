@@ -1,0 +1,344 @@
+"""Walks: the light of bounces 4 and up that leaves a site of the hidden geometry, as a list of impulses.
+
+Sensor points see light that leaves sites; where that light came from is found by walking on from the site, away from
+the sensor points, until a vertex is connected to the lasers (Royo et al. 2022, section 4, read backwards; the sites
+are the virtual point lights of Keller 1997). Every sensor point looks at every site, so a walk is cheap beside the
+gather of what it brings: many are made, and few impulses are kept, with a probability in proportion to the light they
+bring, so that all carry the same (resampled importance sampling, Talbot et al. 2005). What can only arrive after the
+time window counts for little there, and few walks go on to it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+
+from nlosrender.capture.bounces import FIRST_BOUNCE
+from nlosrender.engine.launch.device_arrays import WallPoints, on_device
+from nlosrender.engine.launch.launch_params import HIGHEST_SURVIVAL, LaneRandomness, Transport
+from nlosrender.engine.launch.time_gate import LATE_SURVIVAL, Deadline, Horizon, thinned_out
+from nlosrender.engine.path.laser_connections import connection_segment, offset_origin
+from nlosrender.engine.virtual_lights.gather.device_patches import normal_reflectance, surface_at
+from nlosrender.engine.virtual_lights.vpls.sampler import Sites
+from nlosrender.scene.build import BuiltScene
+from nlosrender.scene.pose import Float64
+
+# Share of the average laser's light that a vertex is taken to receive from the lasers it was not tried with.
+UNTRIED_SHARE = 0.2
+
+
+@dataclass(frozen=True, eq=False)
+class TriedLasers:
+    """Laser points by which the vertices of walks are judged, the same for every batch of a capture."""
+
+    points: WallPoints
+    count: int
+    are_all: bool  # whether the capture has no others; otherwise every vertex is given a chance
+
+
+@dataclass(frozen=True, eq=False)
+class WalkEnds:
+    """One vertex of every walk, chosen in proportion to the light it is expected to bring; one lane per walk."""
+
+    position: mi.Point3f
+    normal: mi.Normal3f  # geometric
+    shading: mi.Normal3f
+    shape: mi.ShapePtr
+    carried: mi.Spectrum  # of the walk up to the vertex, its reflectance / pi included
+    opl: mi.Float  # from the site [engine units]
+    bounce: mi.UInt32  # of a connection to the laser
+    expected: mi.Float  # light expected of the vertex chosen
+    total: mi.Float  # light expected of all vertices of the walk
+
+
+@dataclass(frozen=True, eq=False)
+class Impulses:
+    """Light that leaves sites at known delays; those of one site lie together.
+
+    ``values`` and ``delays`` have index laser * count + impulse. Of confocal captures, whose sensor points each have a
+    laser of their own, they leave out the way from the laser to the end of the walk.
+    """
+
+    count: int
+    sites: NDArray[np.int64]  # (count,) the site each leaves, ascending
+    bounces: mi.UInt32  # (count,)
+    values: mi.Spectrum  # radiance towards the sensor points, for the site's area
+    delays: mi.Float  # from the laser point to the site [bins]
+    ends: mi.Point3f  # (count,) where the laser's light meets the walk
+    shading: mi.Normal3f  # (count,) shading normals there
+    offset: mi.Vector3f  # (count,) ray offset there, along the geometric normal
+
+
+@dr.syntax
+def trace_walks(
+    built: BuiltScene,
+    sites: mi.SurfaceInteraction3f,
+    reflectance: mi.Spectrum,
+    tried: TriedLasers,
+    max_bounces: int | None,
+    deadline: Deadline | None,
+    randomness: LaneRandomness,
+) -> WalkEnds:
+    """Walk on from sites until roulette, an escape or ``max_bounces`` ends it.
+
+    Parameters
+    ----------
+    built
+        The scene.
+    sites, reflectance
+        Where the walks begin, one lane per walk.
+    tried
+        Lasers by which vertices are judged.
+    max_bounces
+        Highest bounce; None for no limit.
+    deadline
+        After which light comes too late, per walk; None: none does.
+    randomness
+        One generator per walk.
+    """
+    scene, wall, context = built.scene, mi.ShapePtr(built.wall_shape), mi.BSDFContext()
+    generator = mi.PCG32(randomness.generator)
+    square = mi.Point2f(mi.Float(randomness.sequence[0] >> 8), mi.Float(randomness.sequence[1] >> 8)) * 2.0**-24
+
+    # ---- State -------------------------------------------------------------------------------------------------
+    throughput = mi.Spectrum(reflectance)
+    direction = sites.sh_frame.to_world(mi.warp.square_to_cosine_hemisphere(square))
+    ray = mi.Ray3f(offset_origin(built, sites, direction), direction)
+    alive = dr.any(throughput > 0) & (dr.dot(direction, sites.n) > 0)
+    origin = mi.Point3f(sites.p)
+    opl = mi.Float(0)  # optical path length from the site [engine units]
+    bounce = mi.UInt32(FIRST_BOUNCE + 1)  # of a connection from the last vertex
+    position, normal, shading, shape = mi.Point3f(0), mi.Normal3f(0), mi.Normal3f(0), mi.ShapePtr(wall)
+    carried, chosen_opl, chosen_bounce = mi.Spectrum(0), mi.Float(0), mi.UInt32(0)
+    expected, total = mi.Float(0), mi.Float(0)
+    is_thinned = mi.Bool(False)  # the walk can only find light that comes too late, and has survived that roulette
+
+    while dr.hint(alive, exclude=[built, scene, tried, sites, deadline]):
+        # ---- Intersect -------------------------------------------------------------------------------------------
+        si = scene.ray_intersect(ray, mi.RayFlags.All, coherent=False, active=alive)
+        alive = alive & si.is_valid()
+        opl += dr.norm(si.p - origin)
+        bounce += 1
+
+        # ---- Thin out what comes after the window, once a walk -------------------------------------------------------
+        alive, is_thinned, throughput = thinned_out(
+            deadline, generator, alive, is_thinned, opl, si.p, si.shape == wall, throughput
+        )
+
+        # ---- What the lasers would bring, were nothing between; a plane is dark to its own laser points -------------
+        bsdf = si.bsdf()
+        hidden = alive & (mi.Frame3f.cos_theta(si.wi) > 0)
+        if dr.hint(built.wall.is_planar, mode="scalar"):
+            hidden &= si.shape != wall
+        upright = mi.SurfaceInteraction3f(si)
+        upright.wi = mi.Vector3f(0, 0, 1)
+        leaving = throughput * bsdf.eval(context, upright, mi.Vector3f(0, 0, 1), hidden)
+        lit = mi.Float(0)
+        for k in range(tried.count):
+            point = tried.points.gather(mi.UInt32(k))
+            lit += dr.mean(leaving * arriving(built, point, si.p, si.sh_frame.n)) / tried.count
+        if dr.hint(not tried.are_all, mode="scalar"):
+            away = dr.squared_norm(si.p - tried.points.gather(mi.UInt32(0)).interaction.p)
+            lit += UNTRIED_SHARE * dr.mean(leaving) / away
+        if dr.hint(deadline is not None, mode="scalar"):
+            lit = dr.select(is_thinned, lit * LATE_SURVIVAL, lit)
+        lit = dr.select(hidden, lit, 0)
+        total += lit
+        pick = (lit > 0) & (generator.next_float32(alive) * total < lit)
+        position, normal = dr.select(pick, si.p, position), dr.select(pick, si.n, normal)
+        shading, shape = dr.select(pick, si.sh_frame.n, shading), dr.select(pick, si.shape, shape)
+        carried = dr.select(pick, leaving, carried)
+        chosen_opl, chosen_bounce = dr.select(pick, opl, chosen_opl), dr.select(pick, bounce, chosen_bounce)
+        expected = dr.select(pick, lit, expected)
+
+        # ---- Sample the next direction -----------------------------------------------------------------------------
+        if dr.hint(max_bounces is not None, mode="scalar"):
+            alive &= bounce < max_bounces
+        lobe = generator.next_float32(alive)
+        at = mi.Point2f(generator.next_float32(alive), generator.next_float32(alive))
+        bs, weight = bsdf.sample(context, si, lobe, at, alive)
+        survival = dr.minimum(dr.max(weight), HIGHEST_SURVIVAL)
+        alive &= generator.next_float32(alive) < survival
+        throughput *= weight / dr.maximum(survival, 1e-9)
+        direction = si.to_world(bs.wo)
+        origin = mi.Point3f(si.p)
+        ray = mi.Ray3f(offset_origin(built, si, direction), direction)
+
+    return WalkEnds(position, normal, shading, shape, carried, chosen_opl, chosen_bounce, expected, total)
+
+
+def arriving(built: BuiltScene, laser: WallPoints, point: mi.Point3f, shading: mi.Normal3f) -> mi.Spectrum:
+    """Return the irradiance at a point from a laser point that it sees [1 / (engine unit)^2 per J]."""
+    to_point = point - laser.interaction.p
+    distance2 = dr.squared_norm(to_point)
+    direction = to_point * dr.rsqrt(distance2)
+    emitted = built.wall_bsdf.eval(mi.BSDFContext(), laser.interaction, laser.interaction.to_local(direction))
+    return emitted * (dr.maximum(-dr.dot(shading, direction), 0) / distance2)
+
+
+@dataclass(frozen=True, eq=False)
+class WalkPlan:
+    """How many walks are made for a capture, and what of them is kept."""
+
+    replicas: int  # independent sets of sites
+    sites: int  # per round and replica
+    walks: int  # per site
+    impulses: int  # kept per site, on average
+    max_bounces: int | None
+    is_confocal: bool
+    horizon: Horizon | None  # beyond which light comes too late; None: none does
+
+
+def walk_back(plan: WalkPlan, transport: Transport, sites: Sites, tried: TriedLasers, seed: int) -> Impulses:
+    """Walk on from ``sites`` and return what the lasers of the batch send back along the walks.
+
+    Parameters
+    ----------
+    plan
+        Numbers of walks and impulses.
+    transport
+        Scene and lasers.
+    sites
+        Where the walks begin: of one replica after the other.
+    tried
+        Lasers by which vertices are judged.
+    seed
+        Of the walks' random numbers.
+    """
+    built = transport.built
+    surface = surface_at(built, sites.positions, sites.normals, sites.shapes, sites.primitives, sites.barycentric)
+    reflectance = normal_reflectance(surface)
+    dr.eval(surface, reflectance)
+    owner = dr.arange(mi.UInt32, len(sites) * plan.walks) // plan.walks
+    deadline = None
+    if plan.horizon is not None:
+        deadline = plan.horizon.deadline_from(np.repeat(sites.positions, plan.walks, axis=0))
+    ends = trace_walks(
+        built,
+        dr.gather(mi.SurfaceInteraction3f, surface, owner),
+        dr.gather(mi.Spectrum, reflectance, owner),
+        tried,
+        plan.max_bounces,
+        deadline,
+        LaneRandomness.seeded(seed, dr.arange(mi.UInt32, dr.width(owner))),
+    )
+    dr.eval(ends)
+    walk, copies, share = _resample(ends, sites, plan, np.random.default_rng(seed))
+    if not len(walk):
+        return no_impulses()
+    if plan.is_confocal:
+        values, delays, lit = _unconnected(transport, ends, walk, copies * share)
+        n_lasers = 1
+    else:
+        values, delays, lit = _connect(transport, ends, walk, copies * share)
+        n_lasers = transport.lasers_per_lane
+    kept = dr.compress(lit)
+    n_kept = dr.width(kept)
+    if not n_kept:
+        return no_impulses()
+    index = dr.arange(mi.UInt32, n_kept * n_lasers)
+    # opaque: no two rounds keep as many, and each number would be a kernel to compile
+    per_laser, found = dr.opaque(mi.UInt32, n_kept), dr.opaque(mi.UInt32, len(walk))
+    entry = index // per_laser * found + dr.gather(mi.UInt32, kept, index % per_laser)
+    chosen = walk[np.asarray(kept.numpy())]
+    end = on_device(mi.UInt32, chosen)
+    impulses = Impulses(
+        n_kept,
+        chosen // plan.walks,
+        dr.gather(mi.UInt32, ends.bounce, end),
+        dr.gather(mi.Spectrum, values, entry),
+        dr.gather(mi.Float, delays, entry),
+        dr.gather(mi.Point3f, ends.position, end),
+        dr.gather(mi.Normal3f, ends.shading, end),
+        _ray_offset(built, ends, end),
+    )
+    dr.eval(impulses.bounces, impulses.values, impulses.delays, impulses.ends, impulses.shading, impulses.offset)
+    return impulses
+
+
+def no_impulses() -> Impulses:
+    """Return what comes back when no walk finds light."""
+    nothing = mi.UInt32(), mi.Spectrum(0), mi.Float(), mi.Point3f(), mi.Normal3f(), mi.Vector3f()
+    return Impulses(0, np.zeros(0, np.int64), *nothing)
+
+
+def _ray_offset(built: BuiltScene, ends: WalkEnds, index: mi.UInt32) -> mi.Vector3f:
+    """Return the ray offset of the ends of walks, on the side of their shading normals."""
+    si = dr.zeros(mi.SurfaceInteraction3f, dr.width(index))
+    si.p, si.n = dr.gather(mi.Point3f, ends.position, index), dr.gather(mi.Normal3f, ends.normal, index)
+    si.shape = dr.gather(mi.ShapePtr, ends.shape, index)
+    return mi.Vector3f(offset_origin(built, si, dr.gather(mi.Normal3f, ends.shading, index)) - si.p)
+
+
+def _resample(
+    ends: WalkEnds, sites: Sites, plan: WalkPlan, generator: np.random.Generator
+) -> tuple[NDArray[np.int64], Float64, Float64]:
+    """Choose walks in proportion to what they bring to the sensor points, evenly along the sites.
+
+    Returns
+    -------
+    tuple
+        Walks (n,) ascending, how often each was chosen, and the value of one choice: radiance per expected light.
+    """
+    importance = np.repeat(sites.importance, plan.walks)
+    weights = ends.total.numpy().astype(np.float64) * importance
+    per_replica, count = plan.sites * plan.walks, plan.impulses * plan.sites
+    walks, copies, shares = [np.zeros(0, np.int64)], [np.zeros(0)], [np.zeros(0)]
+    for replica in range(plan.replicas):
+        cumulative = np.cumsum(weights[replica * per_replica : (replica + 1) * per_replica])
+        total = cumulative[-1]
+        if not total > 0:
+            continue
+        at = (np.arange(count) + generator.random()) * (total / count)
+        # never one without weight: the first whose cumulative weight exceeds the number
+        chosen = np.minimum(np.searchsorted(cumulative, at, side="right"), np.searchsorted(cumulative, total))
+        walk, repeats = np.unique(chosen + replica * per_replica, return_counts=True)
+        walks.append(walk)
+        copies.append(repeats.astype(np.float64))
+        shares.append(total / (count * plan.walks * importance[walk]))
+    return np.concatenate(walks), np.concatenate(copies), np.concatenate(shares)
+
+
+def _unconnected(
+    transport: Transport, ends: WalkEnds, walk: NDArray[np.int64], scale: Float64
+) -> tuple[mi.Spectrum, mi.Float, mi.Bool]:
+    """Return what chosen ends pass on of the light that will meet them there, its delay, and which pass on any."""
+    end = on_device(mi.UInt32, walk)
+    values = dr.gather(mi.Spectrum, ends.carried, end) / dr.gather(mi.Float, ends.expected, end)
+    values *= on_device(mi.Float, scale)
+    delays = dr.gather(mi.Float, ends.opl, end) * transport.bins_per_unit
+    dr.eval(values, delays)
+    return values, delays, dr.any(values > 0)
+
+
+def _connect(
+    transport: Transport, ends: WalkEnds, walk: NDArray[np.int64], scale: Float64
+) -> tuple[mi.Spectrum, mi.Float, mi.Bool]:
+    """Connect chosen ends to every laser; return values and delays (laser * n + walk), and which bring any light."""
+    built, n = transport.built, len(walk)
+    index = dr.arange(mi.UInt32, n * transport.lasers_per_lane)
+    per_laser = dr.opaque(mi.UInt32, n)
+    at = index % per_laser
+    end = dr.gather(mi.UInt32, on_device(mi.UInt32, walk), at)
+    lasers = transport.lasers.gather(index // per_laser)
+    position = dr.gather(mi.Point3f, ends.position, end)
+    si = dr.zeros(mi.SurfaceInteraction3f, dr.width(index))
+    si.p, si.n, si.shape = position, dr.gather(mi.Normal3f, ends.normal, end), dr.gather(mi.ShapePtr, ends.shape, end)
+    to_laser = lasers.interaction.p - position
+    distance = dr.norm(to_laser)
+    value = dr.gather(mi.Spectrum, ends.carried, end) / dr.gather(mi.Float, ends.expected, end)
+    value *= arriving(built, lasers, position, dr.gather(mi.Normal3f, ends.shading, end))
+    value *= dr.gather(mi.Float, on_device(mi.Float, scale), at)
+    active = dr.any(value > 0)
+    segment = connection_segment(built, si, to_laser / distance, lasers.interaction)
+    active &= ~built.scene.ray_test(segment, coherent=False, active=active)
+    value = dr.select(active, value, 0)
+    delays = (dr.gather(mi.Float, ends.opl, end) + distance) * transport.bins_per_unit
+    lit = dr.zeros(mi.UInt32, n)
+    dr.scatter(lit, mi.UInt32(1), at, active)  # of several lasers, all write the same; a reduction would know ``n``
+    dr.eval(value, delays, lit)
+    return value, delays, lit > 0
