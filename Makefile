@@ -1,5 +1,5 @@
 # Two commands do everything on a fresh machine: `make render` and `make test`.
-PYTHON ?= $(shell command -v python3.11 || command -v python3)
+PYTHON ?= $(shell command -v python3.11 || command -v python3.12 || command -v python3.13 || command -v python3)
 VENV := .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
@@ -15,8 +15,8 @@ help: ## Show this list.
 install: $(VENV)/.installed ## Make .venv/bin/nlosrender, with an LLVM when the system has no usable one.
 
 $(VENV)/.installed: pyproject.toml .constraints.txt
-	@test -n "$(PYTHON)" || { echo "need Python 3.11 or newer (set PYTHON=...)"; exit 1; }
-	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { echo "need Python 3.11 or newer; $(PYTHON) is older (set PYTHON=...)"; exit 1; }
+	@test -n "$(PYTHON)" || { echo "need Python 3.11, 3.12 or 3.13 (set PYTHON=...)"; exit 1; }
+	@$(PYTHON) -c 'import sys; sys.exit(not (3, 11) <= sys.version_info < (3, 14))' || { echo "need Python 3.11, 3.12 or 3.13; $(PYTHON) is another version (set PYTHON=...)"; exit 1; }
 	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV) || { echo "python venv is missing: on Debian and Ubuntu, apt-get install python3-venv"; exit 1; }
 	$(PIP) install $(PINS) --editable .
 	@$(BIN)/python -c 'import sys; from nlosrender.engine.backend.llvm import choose_library; found = choose_library(); sys.exit(found is None or not found.is_proven)' \
