@@ -11,7 +11,7 @@ from __future__ import annotations
 import itertools
 import math
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from typing import TYPE_CHECKING
 
@@ -21,17 +21,22 @@ from numpy.typing import NDArray
 from nlosrender.analysis.comparison.blocks import Block
 from nlosrender.analysis.comparison.z_test import ErrorModel, ZTest
 from nlosrender.capture.bounces import FILE_BOUNCES, BounceAxis
+from nlosrender.capture.plan import replicas_for
 from nlosrender.capture.relative_error import relative_l2_error
-from nlosrender.errors import NlosError
+from nlosrender.config.document import Config
+from nlosrender.errors import NlosError, OptionError
+from nlosrender.rendering.outcome import missing_light
+from nlosrender.rendering.set_up import bounce_axis, describe_capture, load_scene, prepare, started_backend
 
 if TYPE_CHECKING:
     from nlosrender.engine.engines import Engine
     from nlosrender.engine.launch.pilot_points import Pilot
     from nlosrender.engine.launch.sample_schedule import Budget
+    from nlosrender.engine.preflight.unsampled_paths import UnsampledPaths
 
 Float64 = NDArray[np.float64]
 GATHER_SHARE = 0.1  # of the target error: an error that may have one sign everywhere adds up over bins and points
-MOST_REPLICAS = 32  # per sensor point: enough to know a variance by
+MAX_REPLICAS = 32  # per sensor point: enough to know a variance by
 
 
 @dataclass(frozen=True)
@@ -141,6 +146,62 @@ class EngineCheck:
 def finite(value: float) -> float | None:
     """Return a number as JSON can hold it."""
     return value if math.isfinite(value) else None
+
+
+def check_engines(
+    config: Config,
+    *,
+    points_per_axis: int,
+    target_error: float,
+    time_limit_s: float,
+    significance: float,
+    progress: Callable[[str], None] = lambda technique: None,
+) -> EngineCheck:
+    """Render a few sensor points by every technique that can, and say how far these are apart; no file is written.
+
+    Parameters
+    ----------
+    config
+        A validated configuration; its own goal of samples, error or time is not used.
+    points_per_axis
+        Sensor points along each side of the grid, spread over it; of exhaustive captures 3 x 3 laser points.
+    target_error, time_limit_s
+        When a technique stops: relative L2 error of H, or seconds.
+    significance
+        Chance of a false alarm.
+    progress
+        Told the name of each technique before it starts.
+
+    Raises
+    ------
+    ConfigError, BackendError, RenderError
+        As ``render_capture``.
+    OptionError
+        A line-of-sight capture, which one technique renders.
+    """
+    if config.capture.is_line_of_sight:
+        raise OptionError("check-engines: one technique renders line_of_sight captures; there is nothing to compare.")
+    backend = started_backend(config)
+    from nlosrender.engine.launch.pilot_points import pilot_of
+    from nlosrender.engine.path.engine import Budget
+
+    built = load_scene(config)
+    capture, time_axis = describe_capture(config, built.wall, built)
+    pilot = pilot_of(capture, points_per_axis)
+    replicas = min(replicas_for(backend.lanes, pilot.sensors.size), MAX_REPLICAS)
+    budget, trials = Budget(target_error=target_error, time_limit_s=time_limit_s), []
+    missing: tuple[UnsampledPaths, ...] = ()
+    for technique in TECHNIQUES:
+        progress(technique.name)
+        changes = {"spp": None, "temporal_kernel_opl": 0.0, **technique.changes}
+        changed = config.model_copy(update={"render": config.render.model_copy(update=changes)})
+        _, engine = prepare(changed, backend, built, capture, time_axis, replicas=replicas)
+        missing = missing or missing_light(engine)
+        trials.append(try_technique(technique, engine, pilot, budget))
+    pairs = compare_trials(trials, bounce_axis(config), pilot, significance)
+    unsampled = tuple(paths.summary for paths in missing)
+    n_lasers = 1 if capture.scan_type == "confocal" else pilot.lasers.size
+    return EngineCheck(pilot.sensors.size, n_lasers, tuple(trials), tuple(pairs), unsampled)
 
 
 def try_technique(technique: Technique, engine: Engine, pilot: Pilot, budget: Budget) -> Trial:

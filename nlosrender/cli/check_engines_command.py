@@ -52,7 +52,7 @@ def check_engines(
 
     Light that no technique samples, and a scene that is read wrongly, are the same for all of them: not tested.
     """
-    from nlosrender import pipeline
+    from nlosrender.analysis import engine_check
     from nlosrender.config.load import load_config
     from nlosrender.config.places import with_places
     from nlosrender.errors import (
@@ -67,7 +67,7 @@ def check_engines(
     changes = list(overrides or [])
     loaded = load_config(config, changes)
     try:
-        check = pipeline.check_engines(
+        check = engine_check.check_engines(
             loaded,
             points_per_axis=points,
             target_error=target_error,

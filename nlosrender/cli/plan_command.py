@@ -13,7 +13,7 @@ from nlosrender.cli.json_output import OUTPUT
 from nlosrender.constants import readable_duration
 
 if TYPE_CHECKING:
-    from nlosrender.analysis.forecast import Forecast
+    from nlosrender.analysis.render_plan import RenderPlan
 
 NOTABLE_BYTES = 50e6  # of a scene's triangles
 KEEP_SECONDS = 30.0  # units that take longer are kept on the way, see ``rendering.unit_in_flight``
@@ -38,12 +38,12 @@ def plan(
     as_json: Annotated[bool, typer.Option("--json", help="Print the plan as one JSON object.")] = False,
 ) -> None:
     """Say what a render will do, what it skips and why, and what it costs; a short pilot measures the speed."""
+    from nlosrender.analysis.render_plan import plan_render
     from nlosrender.cli.sweep_command import plan_all
     from nlosrender.config.load import load_config
     from nlosrender.config.places import with_places
     from nlosrender.config.sweep_load import load_sweep
     from nlosrender.errors import ConfigError
-    from nlosrender.pipeline import forecast_capture
 
     changes = list(overrides or [])
     sweep = load_sweep(config, changes)
@@ -52,7 +52,7 @@ def plan(
         return
     loaded = load_config(config, changes)
     try:
-        forecast = forecast_capture(loaded)
+        forecast = plan_render(loaded)
     except ConfigError as error:
         raise with_places(error, config, changes) from error
     if as_json:
@@ -64,7 +64,7 @@ def plan(
         typer.echo(f"warning: {warning}", err=True)
 
 
-def _lines(forecast: Forecast) -> Iterator[str]:
+def _lines(forecast: RenderPlan) -> Iterator[str]:
     from nlosrender.scene.mesh_report import mesh_lines
 
     yield f"engine   {forecast.engine}: {forecast.reason} ({forecast.variant})"
@@ -97,7 +97,7 @@ def _lines(forecast: Forecast) -> Iterator[str]:
         yield _units(forecast)
 
 
-def _units(forecast: Forecast) -> str:
+def _units(forecast: RenderPlan) -> str:
     seconds = forecast.seconds_per_unit or 0.0
     count = "1 unit" if forecast.units == 1 else f"{forecast.units} units"
     if seconds < KEEP_SECONDS:
@@ -107,7 +107,7 @@ def _units(forecast: Forecast) -> str:
     return f"units    {count} of about {readable_duration(seconds)} each: {kept}"
 
 
-def _scan(forecast: Forecast) -> str:
+def _scan(forecast: RenderPlan) -> str:
     points = "pixels" if forecast.scan_type == LINE_OF_SIGHT else "sensor points"
     sensors = "{} x {} ".format(*forecast.sensor_grid) + points
     if forecast.scan_type != "exhaustive":

@@ -12,7 +12,7 @@ from nlosrender.cli.json_output import OUTPUT
 from nlosrender.constants import readable_duration
 
 if TYPE_CHECKING:
-    from nlosrender.analysis.forecast import Forecast
+    from nlosrender.analysis.render_plan import RenderPlan
     from nlosrender.config.document import Config
     from nlosrender.config.sweep_load import Sweep
     from nlosrender.rendering.dask_cluster import Cluster
@@ -75,16 +75,16 @@ def plan_all(sweep: Sweep, overrides: Sequence[str], as_json: bool) -> None:
     Raises
     ------
     ConfigError, BackendError, RenderError
-        As ``pipeline.forecast_capture``.
+        As ``analysis.render_plan.plan_render``.
     """
+    from nlosrender.analysis.render_plan import plan_render
     from nlosrender.cli.plan_command import readable_size
     from nlosrender.config.places import with_places
     from nlosrender.errors import ConfigError
-    from nlosrender.pipeline import forecast_capture
 
     indices = pilot_captures(len(sweep))
     try:
-        forecasts = [forecast_capture(sweep.config(index)) for index in indices]
+        forecasts = [plan_render(sweep.config(index)) for index in indices]
     except ConfigError as error:
         raise with_places(error, Path(sweep.source), overrides) from error
     total = _total(sweep, indices, forecasts)
@@ -110,7 +110,7 @@ def pilot_captures(n_captures: int) -> list[int]:
     return sorted({round(last * step / max(PILOTS - 1, 1)) for step in range(PILOTS)})
 
 
-def _total(sweep: Sweep, indices: Sequence[int], forecasts: Sequence[Forecast]) -> dict[str, Any]:
+def _total(sweep: Sweep, indices: Sequence[int], forecasts: Sequence[RenderPlan]) -> dict[str, Any]:
     """Return the sums over all captures, by the mean of those that were looked at."""
     share = len(sweep) / len(forecasts)
     seconds = [forecast.seconds_estimate for forecast in forecasts if forecast.seconds_estimate is not None]

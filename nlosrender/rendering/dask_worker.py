@@ -7,29 +7,27 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any
 
 from nlosrender.capture.part import Selection
-from nlosrender.capture.plan import Plan, Unit, replicas_for
+from nlosrender.capture.plan import Unit, replicas_for
 from nlosrender.config.canonical import tree_hash
 from nlosrender.config.document import Config
 from nlosrender.config.load import config_to_dict
 from nlosrender.engine.backend.start import Backend, BackendName, limit_threads, start_backend
 from nlosrender.errors import BackendError, ConfigError, NlosError, Problem
-from nlosrender.files.capture_file import CaptureHeader
 from nlosrender.files.identity import capture_identity, differences
 from nlosrender.files.pieces import Cutter, PackedChunk
 from nlosrender.files.sums import Sums
 from nlosrender.rendering.local import rendered
 from nlosrender.rendering.report import Stopwatch
+from nlosrender.rendering.set_up import set_up_engine
 from nlosrender.rendering.sharing import Sharing
 
 if TYPE_CHECKING:
     from nlosrender.rendering.units import Engine
-
-    SetUp: TypeAlias = Callable[[Config, Backend, Selection, Sharing], tuple[Plan, Engine, CaptureHeader]]
 
 
 @dataclass(frozen=True)
@@ -41,7 +39,6 @@ class Job:
     identity: Mapping[str, Any]  # what the worker's own view of the capture has to agree with
     backend: BackendName
     sharing: Sharing
-    set_up: SetUp  # a function of a module, which is found by its name
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,7 +84,7 @@ class _Desk:
         if key != self.key or self.engine is None or self.cutter is None:
             self.key, self.engine, self.cutter = "", None, None  # only one fits the memory
             _refuse_other_capture(job, backend)
-            _, self.engine, header = job.set_up(job.config, backend, job.selection, job.sharing)
+            _, self.engine, header = set_up_engine(job.config, backend, job.selection, job.sharing)
             self.cutter = Cutter(header, job.config.output.compression)
             self.key = key
         return self.engine, self.cutter

@@ -96,9 +96,9 @@ def test_what_no_technique_samples_is_said(tmp_path):
 
 def test_a_difference_ends_with_exit_code_4(tmp_path, monkeypatch):
     """A technique that is a fifth too bright is named, with bounce and points."""
-    from nlosrender import pipeline
+    from nlosrender.analysis import engine_check
 
-    really = pipeline.try_technique
+    really = engine_check.try_technique
     seen = []
 
     def tampered(technique, engine, pilot, budget):
@@ -108,7 +108,7 @@ def test_a_difference_ends_with_exit_code_4(tmp_path, monkeypatch):
             result.mean[...] *= 1.2
         return result
 
-    monkeypatch.setattr(pipeline, "try_technique", tampered)
+    monkeypatch.setattr(engine_check, "try_technique", tampered)
     (tmp_path / "plate.yaml").write_text(PLATE.replace("HIDDEN", ""))
     done = run(tmp_path, "check-engines", "plate.yaml", "--points", 2, "--target-error", 0.03)
     assert done.returncode == EXIT_COMPARISON_EXCEEDED

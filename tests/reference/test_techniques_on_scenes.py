@@ -8,8 +8,8 @@ import pytest
 import yaml
 from reference import scenes
 
+from nlosrender.analysis.engine_check import check_engines
 from nlosrender.config.load import load_config
-from nlosrender.pipeline import check_engines
 
 pytestmark = pytest.mark.slow
 WHITE, BLACK = ({"type": "diffuse", "reflectance": rho} for rho in (1.0, 0.0))

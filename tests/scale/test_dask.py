@@ -27,7 +27,6 @@ from nlosrender.errors import BackendError
 from nlosrender.files.identity import capture_identity
 from nlosrender.files.journal import read_records
 from nlosrender.files.unit_log import UnfinishedRender
-from nlosrender.pipeline import set_up_engine
 from nlosrender.rendering import dask_cluster
 from nlosrender.rendering.dask_cluster import joined_cluster
 from nlosrender.rendering.dask_worker import Job, Refusal, render_remotely
@@ -294,7 +293,7 @@ def test_a_worker_refuses_what_it_would_render_otherwise(folder: Path) -> None:
     there["config"]["scene"]["hidden_geometry"][1]["filename"] = "sha256:0"
     there["versions"]["drjit"] = "0.1"
     with joined_cluster(workers=1) as cluster:
-        job = Job(config, WHOLE, there, "llvm", cluster.sharing, set_up_engine)
+        job = Job(config, WHOLE, there, "llvm", cluster.sharing)
         everything = Unit(Tile(0, 3, 0, 5), Tile(0, 1, 0, 1), ())
         future = cluster.client.submit(render_remotely, job, everything, {}, False, None, pure=False)
         refusal = future.result(timeout=60)

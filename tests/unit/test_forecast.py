@@ -11,6 +11,7 @@ import pytest
 from rendering import configured, flat_wall
 
 from nlosrender import pipeline
+from nlosrender.analysis.render_plan import plan_render
 from nlosrender.capture.bounces import BounceAxis
 from nlosrender.capture.limits import refuse_impossible_grids, refuse_impossible_samples
 from nlosrender.capture.part import Part, Tiling
@@ -78,13 +79,13 @@ def test_packing_costs_what_is_lit():
 
 def test_what_the_pilot_saw_tightens_the_size_and_never_loosens_it():
     """Boxes bound the light of every bounce; the share of bins a pilot lit replaces a bound that is larger."""
-    from nlosrender.analysis.forecast import forecast_file
+    from nlosrender.rendering.render_warnings import expected_file_size
 
     config = configured(flat_wall(PLATE, BALL, sensors=(50, 30), max_bounces=5))
     _, _, engine = prepared(config)
     header = pipeline.describe_file(config, engine.built, engine.capture, engine.time_axis)
     bound, dark, loose = (
-        forecast_file(config, header, engine, lit).disk_bytes_estimate
+        expected_file_size(config, header, engine, lit).disk_bytes_estimate
         for lit in (None, (0.0, None, 0.0, 0.0), (1.0, None, 1.0, 1.0))
     )
     assert dark < bound / 2
@@ -129,7 +130,7 @@ def test_impossible_sizes_are_refused_before_anything_is_allocated(overrides, ma
     tracemalloc.start()
     try:
         with pytest.raises(ConfigError, match=match):
-            pipeline.forecast_capture(config)
+            plan_render(config)
         assert tracemalloc.get_traced_memory()[1] < 400e6  # 600 x 600 points have 230 MB of their own
     finally:
         tracemalloc.stop()

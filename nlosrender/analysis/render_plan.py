@@ -1,30 +1,32 @@
-"""What a render will do, cost and leave behind, told before it starts."""
+"""``nlosrender plan``: what a render will do, cost and write; measured by a pilot, without rendering it."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import time
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from nlosrender.capture.arrivals import filled_shares
-from nlosrender.capture.plan import Plan
 from nlosrender.config.document import Config
+from nlosrender.config.warnings import config_warnings
 from nlosrender.constants import readable_duration
-from nlosrender.engine.backend.start import Backend, scene_memory
-from nlosrender.files.capture_file import CaptureHeader
-from nlosrender.files.size import FileSize, forecast_size
+from nlosrender.engine.backend.start import scene_memory
+from nlosrender.files.size import FileSize
+from nlosrender.rendering.outcome import missing_light
+from nlosrender.rendering.render_warnings import expected_file_size, render_warnings
+from nlosrender.rendering.report import Warnings
+from nlosrender.rendering.set_up import set_up_engine, started_backend
 from nlosrender.scene.mesh_report import MeshReport
 
 if TYPE_CHECKING:
-    from nlosrender.engine.engines import Engine
     from nlosrender.engine.preflight.omitted_work import Skipped
 
-LONGEST_WAIT = 30 * 86_400.0  # s
+MAX_WAIT = 30 * 86_400.0  # s
 
 
 @dataclass(frozen=True)
-class Forecast:
+class RenderPlan:
     """The answer of ``nlosrender plan``."""
 
     engine: str
@@ -57,46 +59,37 @@ class Forecast:
         return asdict(self) | {"output": str(self.output)}
 
 
-def forecast_render(
-    config: Config,
-    backend: Backend,
-    plan: Plan,
-    engine: Engine,
-    header: CaptureHeader,
-    warnings: tuple[str, ...],
-    seconds_before: float,
-    unsampled: tuple[str, ...] = (),
-) -> Forecast:
-    """Run the pilot and put together what is known of a render.
-
-    Parameters
-    ----------
-    config, backend, plan, engine
-        As set up for the render.
-    header, warnings
-        What the file will say; what has been said already.
-    seconds_before
-        What it took to get here from the configuration [s].
-    unsampled
-        Classes of paths that no technique samples.
+def plan_render(config: Config) -> RenderPlan:
+    """Return what ``pipeline.render_capture`` will do and cost; a pilot renders a part of it, no file is written.
 
     Raises
     ------
-    RenderError
-        A batch cannot be rendered.
+    ConfigError, BackendError, RenderError
+        As ``render_capture``.
     """
     from nlosrender.engine.path.engine import Budget
     from nlosrender.engine.preflight.batch_memory import batch_bytes
     from nlosrender.engine.preflight.omitted_work import skipped_work
     from nlosrender.engine.preflight.time_estimate import estimate_render_time
 
+    begun = time.perf_counter()
+    warnings = Warnings(lambda text: None)
+    warnings.say(config_warnings(config))
+    backend = started_backend(config)
+    plan, engine, header = set_up_engine(config, backend)
+    unsampled = missing_light(engine)
+    warnings.say(paths.warning for paths in unsampled)
+    warnings.say(render_warnings(config, backend, plan, engine, header))
+    set_up_seconds = time.perf_counter() - begun
+
     render, capture, time_axis = config.render, engine.capture, engine.time_axis
     n_bytes = batch_bytes(engine, plan)  # refuses what is too large before the pilot allocates a part of it
     budget = Budget(render.spp, render.target_error, render.time_limit_s)
     rendering = estimate_render_time(engine, plan, budget, backend.lanes)
-    size = forecast_file(config, header, engine, rendering.lit_shares)
-    seconds = None if rendering.seconds is None else rendering.seconds + seconds_before + size.write_seconds
-    return Forecast(
+    size = expected_file_size(config, header, engine, rendering.lit_shares)
+    seconds = None if rendering.seconds is None else rendering.seconds + set_up_seconds + size.write_seconds
+    warnings.say(duration_warnings(config, seconds))
+    return RenderPlan(
         engine=engine.name,
         reason=engine.reason,
         variant=backend.variant,
@@ -118,56 +111,17 @@ def forecast_render(
         units=len(plan.units),
         seconds_per_unit=None if rendering.seconds is None else rendering.seconds / len(plan.units),
         estimate_basis=rendering.basis,
-        warnings=(*warnings, *duration_warnings(config, seconds)),
+        warnings=tuple(warnings.said),
         meshes=engine.built.meshes,
-        unsampled_paths=unsampled,
+        unsampled_paths=tuple(paths.summary for paths in unsampled),
     )
 
 
 def duration_warnings(config: Config, seconds: float | None) -> Iterator[str]:
-    """Yield what to do about a render that takes longer than anybody waits.
-
-    Parameters
-    ----------
-    config
-        What is rendered.
-    seconds
-        It takes [s]; None: not known.
-    """
-    if seconds is not None and seconds > LONGEST_WAIT:
+    """Yield a warning about a render of ``seconds`` (None: not known) that takes longer than anybody waits."""
+    if seconds is not None and seconds > MAX_WAIT:
         goal = "a larger render.target_error" if config.render.spp is None else "a lower render.spp"
         yield (
             f"this takes about {readable_duration(seconds)} on this machine: ask for {goal}, fewer points or bins, or "
             "set render.time_limit_s."
         )
-
-
-def forecast_file(
-    config: Config,
-    header: CaptureHeader,
-    engine: Engine,
-    lit_shares: Sequence[float | None] | None = None,
-) -> FileSize:
-    """Return how large the file of a render will be.
-
-    Parameters
-    ----------
-    config, header, engine
-        As set up for the render.
-    lit_shares
-        For each bounce slot the share of bins that held light in a pilot; None where there was none. The boxes
-        around the scene, which bound the light of every bounce, are far from tight above the third.
-    """
-    wall, bounds = engine.built.wall, header.hidden_bounds
-    filled = filled_shares(engine.capture, wall, bounds, engine.time_axis, engine.options.bounces)
-    if lit_shares is not None:
-        filled = tuple(most if lit is None else min(most, lit) for most, lit in zip(filled, lit_shares, strict=True))
-    compression, variance = config.output.compression, config.output.variance
-    return forecast_size(
-        header.sizes,
-        header.confocal,
-        filled,
-        compression=compression,
-        variance=variance,
-        line_of_sight=config.capture.is_line_of_sight,
-    )
