@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from nlosrender.capture.part import WHOLE, Selection
-from nlosrender.capture.plan import remaining_units, replicas_for
+from nlosrender.capture.plan import remaining_items, replicas_for
 from nlosrender.config.document import Config
 from nlosrender.config.load import config_hash, config_to_dict
 from nlosrender.config.warnings import config_warnings
@@ -136,7 +136,7 @@ def render_capture(
             partial.open(header, provenance | identity_attributes(identity), output.compression, output.variance)
             warnings.say(partial.damage)
             earlier = len(partial.tally.units)
-            units = remaining_units(plan, header.confocal, partial.tally.units)
+            units = remaining_items(plan, header.confocal, partial.tally.units)
             if cluster is None:
                 render = functools.partial(render_units, units, engine, budget, partial, stop)
             else:

@@ -22,7 +22,7 @@ MOST_SUMS = 2**32 - 1  # of a batch: Dr.Jit indexes with 32 bits
 # unit before, which is being written (8)
 BYTES_OF_STATISTICS = 64
 BYTES_OF_ASSEMBLY = 24  # mean and variance of a unit that is put together from batches, and its float32 copies
-UNIT_SAMPLES = 2**26  # of a unit at most, whatever the memory: what an interruption can cost stays bounded
+MAX_ITEM_SAMPLES = 2**26  # of a unit at most, whatever the memory: what an interruption can cost stays bounded
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ class Batch:
 
 
 @dataclass(frozen=True)
-class Unit:
+class WorkItem:
     """What is written at once: whole storage tiles (as far as the part has them) for ``lasers``.
 
     It is one batch, unless a single storage tile with a single laser takes more memory than there is.
@@ -52,7 +52,7 @@ class Unit:
 class Plan:
     """How a capture, or a part of it, is cut into units."""
 
-    units: tuple[Unit, ...]
+    work_items: tuple[WorkItem, ...]
     replicas: int  # independent copies of every sensor point's estimate, >= 2
     bytes_per_batch: int  # of the largest batch
     tiling: Tiling
@@ -61,7 +61,7 @@ class Plan:
     @property
     def batches(self) -> tuple[Batch, ...]:
         """The batches of all units."""
-        return tuple(batch for unit in self.units for batch in unit.batches)
+        return tuple(batch for unit in self.work_items for batch in unit.batches)
 
 
 def plan_capture(
@@ -73,8 +73,8 @@ def plan_capture(
     memory_limit: int,
     storage_tile: tuple[int, int] = (1, 1),
     selection: Selection = WHOLE,
-    unit_samples: int = UNIT_SAMPLES,
-    least_units: int = 1,
+    max_item_samples: int = MAX_ITEM_SAMPLES,
+    min_items: int = 1,
 ) -> Plan:
     """Cut a capture into units.
 
@@ -94,9 +94,9 @@ def plan_capture(
         Rows and columns of sensor points that share a chunk of the file.
     selection
         The part that is rendered.
-    unit_samples
+    max_item_samples
         Samples of a unit at most.
-    least_units
+    min_items
         Cut into so many units; but a unit is at least a storage tile with one laser.
 
     Raises
@@ -122,14 +122,14 @@ def plan_capture(
         )
         raise ConfigError(Problem("", "render.memory_limit", message))
     confocal = capture.scan_type == "confocal"
-    enough = unit_samples // row
+    enough = max_item_samples // row
     everything = tiling.everything(capture.n_lasers if capture.scan_type == "exhaustive" else 1)
     of_part = round(capture.n_sensors * (1 if confocal else capture.n_lasers) * part.share_of(everything))
-    if least_units > 1:  # the share is not exact: of one unit it would cut a crumb
-        enough = min(enough, of_part // least_units)
-    units = tuple(_units(capture, tiling, part, pairs, max(1, enough), math.ceil(lanes / replicas)))
-    largest = max(b.sensors.size * (1 if confocal else b.lasers.size) for unit in units for b in unit.batches)
-    return Plan(units, replicas, largest * pair, tiling, part)
+    if min_items > 1:  # the share is not exact: of one unit it would cut a crumb
+        enough = min(enough, of_part // min_items)
+    work_items = tuple(_work_items(capture, tiling, part, pairs, max(1, enough), math.ceil(lanes / replicas)))
+    largest = max(b.sensors.size * (1 if confocal else b.lasers.size) for unit in work_items for b in unit.batches)
+    return Plan(work_items, replicas, largest * pair, tiling, part)
 
 
 def replicas_for(lanes: int, n_sensors: int) -> int:
@@ -141,7 +141,9 @@ def replicas_for(lanes: int, n_sensors: int) -> int:
     return replicas + replicas % 2
 
 
-def _units(capture: Capture, tiling: Tiling, part: Part, fitting: int, enough: int, busy: int) -> Iterator[Unit]:
+def _work_items(
+    capture: Capture, tiling: Tiling, part: Part, fitting: int, enough: int, busy: int
+) -> Iterator[WorkItem]:
     """Yield the units: first sensor points to keep ``busy`` lanes, then lasers, then more sensor points.
 
     ``fitting`` pairs of a sensor and a laser point fit the memory; more than ``enough`` are not asked for.
@@ -149,11 +151,11 @@ def _units(capture: Capture, tiling: Tiling, part: Part, fitting: int, enough: i
     pairs, n_lasers = min(fitting, enough), part.lasers[1] - part.lasers[0]
     for sensors in joined(tiling.cells(part.strips), max(pairs // n_lasers, min(busy, pairs))):
         if capture.scan_type == "confocal":
-            yield Unit(sensors, sensors, tuple(Batch(tile, tile) for tile in _cut(sensors, fitting)))
+            yield WorkItem(sensors, sensors, tuple(Batch(tile, tile) for tile in _cut(sensors, fitting)))
             continue
         for lasers in runs(*part.lasers, capture.laser_grid.nx, max(1, pairs // sensors.size)):
             pieces = _cut(sensors, fitting // lasers.size)
-            yield Unit(sensors, lasers, tuple(Batch(tile, lasers) for tile in pieces))
+            yield WorkItem(sensors, lasers, tuple(Batch(tile, lasers) for tile in pieces))
 
 
 def _cut(sensors: Tile, most: int) -> Iterator[Tile]:
@@ -168,15 +170,15 @@ def tiles(ny: int, nx: int, most: int) -> Iterator[Tile]:
     return runs(0, ny * nx, nx, most)
 
 
-def remaining_units(plan: Plan, confocal: bool, finished: Iterable[tuple[Tile, Tile]]) -> list[Unit]:
+def remaining_items(plan: Plan, confocal: bool, finished: Iterable[tuple[Tile, Tile]]) -> list[WorkItem]:
     """Return what is left to do when the (sensors, lasers) of ``finished`` are done.
 
     The units of an earlier run may have been cut otherwise, for another memory; a unit that is done in part is taken
     apart into storage tiles and single lasers, which never are.
     """
     done = set(finished)
-    left: list[Unit] = []
-    for unit in plan.units:
+    left: list[WorkItem] = []
+    for unit in plan.work_items:
         if (unit.sensors, unit.lasers) in done:
             continue
         touching = [pair for pair in done if pair[0].overlaps(unit.sensors) and pair[1].overlaps(unit.lasers)]
@@ -189,7 +191,7 @@ def remaining_units(plan: Plan, confocal: bool, finished: Iterable[tuple[Tile, T
     return left
 
 
-def _apart(plan: Plan, unit: Unit, confocal: bool) -> Iterator[Unit]:
+def _apart(plan: Plan, unit: WorkItem, confocal: bool) -> Iterator[WorkItem]:
     """Yield a unit's storage tiles with one laser each."""
     most = max(batch.sensors.size for batch in unit.batches)
     for cell in plan.tiling.cells(plan.part.strips):
@@ -198,4 +200,4 @@ def _apart(plan: Plan, unit: Unit, confocal: bool) -> Iterator[Unit]:
         y_range, x_range = range(unit.lasers.y0, unit.lasers.y1), range(unit.lasers.x0, unit.lasers.x1)
         for laser in [cell] if confocal else [Tile(y, y + 1, x, x + 1) for y in y_range for x in x_range]:
             pieces = _cut(cell, most)
-            yield Unit(cell, laser, tuple(Batch(tile, tile if confocal else laser) for tile in pieces))
+            yield WorkItem(cell, laser, tuple(Batch(tile, tile if confocal else laser) for tile in pieces))

@@ -14,7 +14,7 @@ from dataclasses import asdict, replace
 from itertools import islice
 from typing import TYPE_CHECKING
 
-from nlosrender.capture.plan import Unit
+from nlosrender.capture.plan import WorkItem
 from nlosrender.errors import BackendError, IncompleteRender, InterruptedRender, RenderError
 from nlosrender.files.partial_capture import PartialCapture
 from nlosrender.interruption import StopRequest
@@ -36,7 +36,7 @@ WORKER_LOOK_SECONDS = 5.0  # between two looks at whether there are workers at a
 
 
 def render_on_cluster(
-    units: Sequence[Unit],
+    units: Sequence[WorkItem],
     job: Job,
     budget: Budget,
     partial: PartialCapture,
@@ -114,7 +114,7 @@ def render_on_cluster(
 class _Flight:
     """The units on their way to the workers and back: never more than ``PER_WORKER`` for each."""
 
-    def __init__(self, units: Sequence[Unit], job: Job, budget: Budget, store_variance: bool, cluster: Cluster):
+    def __init__(self, units: Sequence[WorkItem], job: Job, budget: Budget, store_variance: bool, cluster: Cluster):
         self._left, self._client = iter(units), cluster.client
         self._arguments = (asdict(budget), store_variance, cluster.threads)
         self._job = job

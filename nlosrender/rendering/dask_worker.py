@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from nlosrender.capture.part import Selection
-from nlosrender.capture.plan import Unit, replicas_for
+from nlosrender.capture.plan import WorkItem, replicas_for
 from nlosrender.config.canonical import tree_hash
 from nlosrender.config.document import Config
 from nlosrender.config.load import config_to_dict
@@ -45,7 +45,7 @@ class Job:
 class PackedUnit:
     """A unit as it travels: chunks ready to be written."""
 
-    unit: Unit
+    unit: WorkItem
     packed: tuple[PackedChunk, ...]
     sums: Sums
     seconds: dict[str, float]  # per stage, spent on it in the worker
@@ -94,7 +94,7 @@ _DESK = _Desk()
 
 
 def render_remotely(
-    job: Job, unit: Unit, budget: Mapping[str, Any], store_variance: bool, threads: int | None
+    job: Job, unit: WorkItem, budget: Mapping[str, Any], store_variance: bool, threads: int | None
 ) -> PackedUnit | Refusal:
     """Render a unit in a worker process.
 

@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from nlosrender.capture.plan import Unit
+from nlosrender.capture.plan import WorkItem
 from nlosrender.engine.launch.passes import Passes
 from nlosrender.errors import FileError, IncompleteRender, InterruptedRender, RenderError
 from nlosrender.files.partial_capture import PartialCapture
@@ -49,7 +49,7 @@ def resumable(partial: PartialCapture) -> Iterator[StopRequest]:
 
 
 def render_units(
-    units: Sequence[Unit],
+    units: Sequence[WorkItem],
     engine: Engine,
     budget: Budget,
     partial: PartialCapture,
@@ -129,7 +129,7 @@ def render_units(
 
 def rendered(
     engine: Engine,
-    unit: Unit,
+    unit: WorkItem,
     budget: Budget,
     store_variance: bool,
     stopwatch: Stopwatch,

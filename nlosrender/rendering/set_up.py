@@ -140,8 +140,8 @@ def prepare(
         memory_limit=memory,
         storage_tile=(storage_tile[0], storage_tile[1]),
         selection=selection,
-        unit_samples=sharing.unit_samples,
-        least_units=sharing.least_units,
+        max_item_samples=sharing.max_item_samples,
+        min_items=sharing.min_items,
     )
     options = PathOptions(
         bounces=bounces,

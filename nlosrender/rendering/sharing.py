@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 
-from nlosrender.capture.plan import UNIT_SAMPLES
+from nlosrender.capture.plan import MAX_ITEM_SAMPLES
 from nlosrender.engine.backend.start import PROCESS_BYTES, physical_memory
 from nlosrender.errors import ConfigError, Problem
 
@@ -71,12 +71,12 @@ class Sharing:
             ) from error
 
     @property
-    def unit_samples(self) -> int:
+    def max_item_samples(self) -> int:
         """Samples of a unit at most."""
-        return SHIPPED_SAMPLES if self.workers else UNIT_SAMPLES
+        return SHIPPED_SAMPLES if self.workers else MAX_ITEM_SAMPLES
 
     @property
-    def least_units(self) -> int:
+    def min_items(self) -> int:
         """Units a capture is cut into, where it can be."""
         return max(1, UNITS_PER_WORKER * self.workers)
 

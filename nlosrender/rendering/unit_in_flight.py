@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
-from nlosrender.capture.plan import Unit
+from nlosrender.capture.plan import WorkItem
 from nlosrender.engine.launch.passes import Kept, Passes, Snapshot
 from nlosrender.errors import FileError
 from nlosrender.files.partial_capture import PartialCapture
@@ -43,7 +43,7 @@ class UnitInFlight:
     def __init__(
         self,
         partial: PartialCapture,
-        unit: Unit,
+        unit: WorkItem,
         budget: Budget,
         stop: StopRequest,
         progress: Progress,

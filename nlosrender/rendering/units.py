@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from nlosrender.capture.plan import Unit
+from nlosrender.capture.plan import WorkItem
 from nlosrender.engine.launch.passes import Passes, Snapshot
 from nlosrender.files import layout
 from nlosrender.files.partial_capture import PartialCapture
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from nlosrender.engine.path.engine import Budget
 
 
-def render_unit(engine: Engine, unit: Unit, budget: Budget, passes: Passes) -> Histogram:
+def render_unit(engine: Engine, unit: WorkItem, budget: Budget, passes: Passes) -> Histogram:
     """Render one unit: everything that is needed to do so in another process.
 
     Parameters
@@ -77,7 +77,7 @@ def _histogram(kept: Snapshot) -> Histogram:
     return Histogram(arrays["mean"], arrays["variance"], arrays["outside"], samples, arrays["contrasts"])
 
 
-def joined_histogram(unit: Unit, pieces: list[Histogram]) -> Histogram:
+def joined_histogram(unit: WorkItem, pieces: list[Histogram]) -> Histogram:
     """Put the histograms of a unit's batches together, sensor points row by row."""
     from nlosrender.engine.launch.histogram import Histogram
 
@@ -108,7 +108,7 @@ def joined_histogram(unit: Unit, pieces: list[Histogram]) -> Histogram:
 class RenderedUnit:
     """A unit on its way to the file."""
 
-    unit: Unit
+    unit: WorkItem
     laser_at: tuple[int, int]  # row and column of its first laser in the file
     samples: dict[str, NDArray[np.float32]]  # per dataset (channel, bounce, laser_y, laser_x, sensor_y, sensor_x, bin)
     sums: Sums
@@ -120,7 +120,7 @@ class RenderedUnit:
 
 
 def finished_unit(
-    unit: Unit, histogram: Histogram, *, confocal: bool, store_variance: bool, seconds: float
+    unit: WorkItem, histogram: Histogram, *, confocal: bool, store_variance: bool, seconds: float
 ) -> RenderedUnit:
     """Sum up a unit in float64 and take what is stored of it.
 
@@ -152,7 +152,7 @@ class Storable(Protocol):
     """A unit that can be stored, whoever packs its chunks: a ``RenderedUnit``, or one that came from elsewhere."""
 
     @property
-    def unit(self) -> Unit:
+    def unit(self) -> WorkItem:
         """Its sensors and lasers."""
 
     @property

@@ -13,7 +13,7 @@ from rendering import configured, flat_wall
 from views import view_config
 
 from nlosrender import pipeline
-from nlosrender.capture.plan import Batch, Unit
+from nlosrender.capture.plan import Batch, WorkItem
 from nlosrender.capture.tile import Tile
 from nlosrender.engine.backend.start import start_backend
 from nlosrender.engine.launch.passes import Kept, Passes, Snapshot
@@ -71,10 +71,10 @@ def prepared(scene: dict[str, Any]) -> Callable[[Passes], Any]:
         plan, engine, _ = pipeline.set_up_engine(config, backend)
         budget = pipeline.settled_budget(config, engine)
         assert isinstance(budget, Budget)
-        (unit,) = plan.units
+        (unit,) = plan.work_items
         if scene is SCENES["two batches"]:
             upper, lower = Tile(0, 1, 0, 5), Tile(1, 3, 0, 5)
-            unit = Unit(unit.sensors, unit.lasers, (Batch(upper, unit.lasers), Batch(lower, unit.lasers)))
+            unit = WorkItem(unit.sensors, unit.lasers, (Batch(upper, unit.lasers), Batch(lower, unit.lasers)))
         return render_unit(engine, unit, budget, passes)
 
     return render

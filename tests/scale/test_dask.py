@@ -20,7 +20,7 @@ import pytest
 from commands import run
 
 from nlosrender.capture.part import WHOLE
-from nlosrender.capture.plan import Unit
+from nlosrender.capture.plan import WorkItem
 from nlosrender.capture.tile import Tile
 from nlosrender.config.load import config_to_dict, load_config
 from nlosrender.errors import BackendError
@@ -294,7 +294,7 @@ def test_a_worker_refuses_what_it_would_render_otherwise(folder: Path) -> None:
     there["versions"]["drjit"] = "0.1"
     with joined_cluster(workers=1) as cluster:
         job = Job(config, WHOLE, there, "llvm", cluster.sharing)
-        everything = Unit(Tile(0, 3, 0, 5), Tile(0, 1, 0, 1), ())
+        everything = WorkItem(Tile(0, 3, 0, 5), Tile(0, 1, 0, 1), ())
         future = cluster.client.submit(render_remotely, job, everything, {}, False, None, pure=False)
         refusal = future.result(timeout=60)
     assert isinstance(refusal, Refusal)

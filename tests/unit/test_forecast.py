@@ -15,7 +15,7 @@ from nlosrender.analysis.render_plan import plan_render
 from nlosrender.capture.bounces import BounceAxis
 from nlosrender.capture.limits import refuse_impossible_grids, refuse_impossible_samples
 from nlosrender.capture.part import Part, Tiling
-from nlosrender.capture.plan import Batch, Plan, Tile, Unit
+from nlosrender.capture.plan import Batch, Plan, Tile, WorkItem
 from nlosrender.engine.backend.start import start_backend
 from nlosrender.errors import ConfigError
 from nlosrender.files.size import FileSize, disk_warnings, forecast_size
@@ -29,7 +29,7 @@ ROOM = {"type": "room", "size": [2.0, 1.6, 1.5]}
 
 def plan_of(batches: tuple[Batch, ...], replicas: int, bytes_per_batch: int) -> Plan:
     """A plan whose units are single batches."""
-    units = tuple(Unit(batch.sensors, batch.lasers, (batch,)) for batch in batches)
+    units = tuple(WorkItem(batch.sensors, batch.lasers, (batch,)) for batch in batches)
     return Plan(units, replicas, bytes_per_batch, Tiling(3, 5, 1, 1), Part((0, 1), (0, 15)))
 
 

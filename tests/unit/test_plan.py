@@ -14,7 +14,7 @@ from nlosrender.capture.plan import (
     MOST_SUMS,
     Plan,
     plan_capture,
-    remaining_units,
+    remaining_items,
     tiles,
 )
 from nlosrender.capture.tile import Tile, joined, runs
@@ -110,7 +110,7 @@ def test_units_are_whole_storage_tiles(scan_type, pairs, shard):
     plan = planned(scan_type, pairs, Selection(shard=shard))
     cells = list(plan.tiling.cells(plan.part.strips))
     covered = [0] * len(cells)
-    for unit in plan.units:
+    for unit in plan.work_items:
         inside = [cell for cell in cells if unit.sensors.contains(cell)]
         assert sum(cell.size for cell in inside) == unit.sensors.size
         for cell in inside:
@@ -132,8 +132,8 @@ def test_lanes_come_before_lasers():
     """
     plan = planned("exhaustive", 28, lanes=12)
     assert plan.replicas == 2
-    assert {unit.sensors.size for unit in plan.units} == {6, 4, 5}
-    assert {unit.lasers.size for unit in plan.units if unit.sensors.size == 6} == {4, 3}
+    assert {unit.sensors.size for unit in plan.work_items} == {6, 4, 5}
+    assert {unit.lasers.size for unit in plan.work_items if unit.sensors.size == 6} == {4, 3}
 
 
 @pytest.mark.parametrize("scan_type", ["confocal", "exhaustive"])
@@ -142,10 +142,10 @@ def test_lanes_come_before_lasers():
 def test_what_is_left_after_other_units(scan_type, first, then):
     """Whatever the memory was and is, nothing that is finished is done again and nothing is left out."""
     before, now = planned(scan_type, first), planned(scan_type, then)
-    everything = set().union(*(pairs_of(unit) for unit in now.units))
-    for n_finished in range(0, len(before.units) + 1, max(1, len(before.units) // 5)):
-        finished = before.units[:n_finished]
-        left = remaining_units(now, scan_type == "confocal", [(unit.sensors, unit.lasers) for unit in finished])
+    everything = set().union(*(pairs_of(unit) for unit in now.work_items))
+    for n_finished in range(0, len(before.work_items) + 1, max(1, len(before.work_items) // 5)):
+        finished = before.work_items[:n_finished]
+        left = remaining_items(now, scan_type == "confocal", [(unit.sensors, unit.lasers) for unit in finished])
         done = set().union(*(pairs_of(unit) for unit in finished)) if finished else set()
         todo = [pair for unit in left for pair in pairs_of(unit)]
         assert len(todo) == len(set(todo))
@@ -162,8 +162,8 @@ def test_what_is_left_after_other_units(scan_type, first, then):
 def test_an_unchanged_plan_goes_on_where_it_stopped():
     """With the same memory the units that are left are those of the plan, in their order."""
     plan = planned("exhaustive", 9)
-    finished = [(unit.sensors, unit.lasers) for unit in plan.units[:7]]
-    assert remaining_units(plan, False, finished) == list(plan.units[7:])
+    finished = [(unit.sensors, unit.lasers) for unit in plan.work_items[:7]]
+    assert remaining_items(plan, False, finished) == list(plan.work_items[7:])
 
 
 @pytest.mark.parametrize(("first", "last", "most"), [(0, 14, 100), (3, 12, 100), (3, 12, 4), (8, 9, 1), (6, 14, 7)])
