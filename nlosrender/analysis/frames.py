@@ -18,6 +18,7 @@ from nlosrender.files.kinds import GIF, PICTURES
 from nlosrender.files.layout import STOKES
 from nlosrender.files.reader import StoredCapture, open_capture
 from nlosrender.files.replacement import check_writable, explained_write, replacing
+from nlosrender.readable import readable_size
 
 Float32 = NDArray[np.float32]
 
@@ -167,7 +168,7 @@ def _frame_ranges(capture: StoredCapture, options: FrameOptions) -> list[slice]:
     n_bytes = count * 4 * header.sizes["channel"] * header.sizes["sensor_y"] * header.sizes["sensor_x"]
     if count > MOST_FRAMES or n_bytes > MOST_BYTES:
         raise OptionError(
-            f"--every: {count} pictures of {n_bytes / 1e9:.3g} GB together are too many; use more bins each"
+            f"--every: {count} pictures of {readable_size(n_bytes)} together are too many; use more bins each"
         )
     return [slice(start, min(start + every, last + 1)) for start in range(first, last + 1, every)]
 

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING
 
 from nlosrender.config.document import Config
 from nlosrender.config.warnings import config_warnings
-from nlosrender.constants import readable_duration
 from nlosrender.engine.backend.start import scene_memory
 from nlosrender.files.size import FileSize
+from nlosrender.readable import readable_duration
 from nlosrender.rendering.outcome import missing_light
 from nlosrender.rendering.render_warnings import expected_file_size, render_warnings
 from nlosrender.rendering.report import Warnings

@@ -3,28 +3,30 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 from nlosrender.capture.bounces import LINE_OF_SIGHT
 from nlosrender.cli.stated_error import energies_by_bounce, errors_by_bounce
+from nlosrender.readable import readable_size
 
 SHOWN_LENGTH = 160  # characters of one value in the table; --json has all of it
 _LONGEST = {"mesh": 600}  # names of materials
 
 
-def summary_table(summary: dict[str, object]) -> str:
+def summary_table(summary: dict[str, Any]) -> str:
     """Return the summary of a capture (``analysis.summary.summarise``) as lines of label and text."""
     rows = [(label, printable(text, _LONGEST.get(label, SHOWN_LENGTH))) for label, text in _rows(summary) if text]
     width = max(len(label) for label, _ in rows)
     return "\n".join(f"{label:<{width}}  {text}" for label, text in rows)
 
 
-def _rows(summary: dict[str, object]) -> list[tuple[str, str]]:
+def _rows(summary: dict[str, Any]) -> list[tuple[str, str]]:
     """Return label and text of every line; an empty text means that the file does not say."""
     legs = {True: "included in time", False: "NOT included in time"}
     is_view = summary["scan_type"] == LINE_OF_SIGHT
     differences = _sequence(summary.get("deviations") or [])
     return [
-        ("file", f"{summary['file']} ({_bytes(summary['size_on_disk'])})"),
+        ("file", f"{summary['file']} ({readable_size(summary['size_on_disk'])})"),
         ("PART ONLY", _part(summary["part"])),
         ("scan type", _text(summary["scan_type"])),
         ("pixels" if is_view else "sensor points", _grid(summary["sensor_grid"], summary["sensor_grid_size"])),
@@ -32,7 +34,7 @@ def _rows(summary: dict[str, object]) -> list[tuple[str, str]]:
         ("camera at" if is_view else "sensor at", _lengths(summary["sensor_position"])),
         ("laser at", "" if is_view else _lengths(summary["laser_position"])),
         ("time axis", _time_axis(summary)),
-        ("first and last legs", legs.get(summary["account_first_and_last_bounces"], "")),  # type: ignore[call-overload]
+        ("first and last legs", legs.get(summary["account_first_and_last_bounces"], "")),
         ("interactions" if is_view else "bounces", _bounces(summary)),
         ("channels", _text(summary["channels"])),
         ("frame", _text(summary["frame"])),
@@ -58,7 +60,7 @@ def _rows(summary: dict[str, object]) -> list[tuple[str, str]]:
     ]
 
 
-def _verdict(summary: dict[str, object]) -> str:
+def _verdict(summary: dict[str, Any]) -> str:
     """Return the outcome of a check in words; empty without one."""
     if "violations" not in summary:
         return ""
@@ -78,13 +80,13 @@ def _part(part: object) -> str:
     return f"lasers {':'.join(str(bound) for bound in lasers)}, sensor {shown}; nlosrender merge puts parts together"
 
 
-def _time_axis(summary: dict[str, object]) -> str:
+def _time_axis(summary: dict[str, Any]) -> str:
     window = f"{_text(summary['start_opl'])} to {_text(summary['end_opl'])} m of optical path"
     bins = f"{_text(summary['bin_width_opl'])} m ({_text(summary['bin_width_ps'])} ps)"
     return f"{summary['n_bins']} bins of {bins}, {window}"
 
 
-def _bounces(summary: dict[str, object]) -> str:
+def _bounces(summary: dict[str, Any]) -> str:
     if isinstance(summary["bounces"], list):
         listed = ", ".join(str(bounce) for bounce in summary["bounces"])
     else:
@@ -93,17 +95,17 @@ def _bounces(summary: dict[str, object]) -> str:
     return listed + (f" (highest rendered: {limit})" if listed and limit else "")
 
 
-def _hidden_volume(summary: dict[str, object]) -> str:
+def _hidden_volume(summary: dict[str, Any]) -> str:
     edges, center = summary["hidden_volume_size"], summary["hidden_volume_position"]
     if not isinstance(edges, list) or not any(edges):
         return ""
     return f"{' x '.join(_text(edge) for edge in edges)} m, centre {_lengths(center)}"
 
 
-def _storage(summary: dict[str, object]) -> str:
+def _storage(summary: dict[str, Any]) -> str:
     shape = " x ".join(str(length) for length in _sequence(summary["data_shape"]))
     variance = ", with variance" if summary["has_variance"] else ""
-    size = _bytes(summary["size_of_samples"])
+    size = readable_size(summary["size_of_samples"])
     return f"{shape} {summary['dtype']} ({size}), compression {summary['compression']}{variance}"
 
 
@@ -141,7 +143,7 @@ def _object(value: object) -> dict[str, object]:
     return value if isinstance(value, dict) else {}
 
 
-def _error(summary: dict[str, object]) -> str:
+def _error(summary: dict[str, Any]) -> str:
     if summary["error_estimate"] is None and summary["unsampled_paths"]:
         return "unknown: light is missing"
     if summary["error_estimate"] is None and summary["zero_because"]:
@@ -151,13 +153,6 @@ def _error(summary: dict[str, object]) -> str:
 
 def _percent(value: object) -> str:
     return f"{100 * value:.3g} % (relative L2)" if isinstance(value, (int, float)) else _text(value)
-
-
-def _bytes(size: object) -> str:
-    amount, units = float(size) if isinstance(size, (int, float)) else 0.0, ["B", "KiB", "MiB", "GiB", "TiB"]
-    while amount >= 1024 and len(units) > 1:
-        amount, units = amount / 1024, units[1:]
-    return f"{amount:.4g} {units[0]}"
 
 
 def _text(value: object) -> str:

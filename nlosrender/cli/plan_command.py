@@ -10,7 +10,7 @@ import typer
 
 from nlosrender.capture.bounces import LINE_OF_SIGHT
 from nlosrender.cli.json_output import OUTPUT
-from nlosrender.constants import readable_duration
+from nlosrender.readable import readable_duration, readable_size
 
 if TYPE_CHECKING:
     from nlosrender.analysis.render_plan import RenderPlan
@@ -113,13 +113,3 @@ def _scan(forecast: RenderPlan) -> str:
     if forecast.scan_type != "exhaustive":
         return f"{forecast.scan_type}, {sensors}"
     return "exhaustive, {}, {} x {} laser points".format(sensors, *forecast.laser_grid)
-
-
-def readable_size(n_bytes: int) -> str:
-    """Return a number of bytes with three digits and a unit: "1.25 GB"."""
-    size = float(n_bytes)
-    for unit in ("B", "kB", "MB", "GB"):
-        if size < 999.5:
-            return f"{size:.3g} {unit}"
-        size /= 1000
-    return f"{size:.3g} TB"

@@ -10,7 +10,7 @@ from collections.abc import Callable
 from types import TracebackType
 from typing import TYPE_CHECKING, Self
 
-from nlosrender.constants import readable_duration
+from nlosrender.readable import readable_duration
 
 if TYPE_CHECKING:
     from nlosrender.rendering.report import Standing

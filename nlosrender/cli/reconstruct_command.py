@@ -10,7 +10,7 @@ import typer
 from nlosrender.cli.file_commands import CaptureFile
 from nlosrender.cli.json_output import OUTPUT
 from nlosrender.cli.progress import progress_bar
-from nlosrender.constants import readable_duration
+from nlosrender.readable import readable_duration
 
 if TYPE_CHECKING:
     from nlosrender.analysis.reconstruction.reconstruct import Reconstruction

@@ -12,7 +12,7 @@ import typer
 
 from nlosrender.capture.bounces import LINE_OF_SIGHT
 from nlosrender.cli.json_output import OUTPUT
-from nlosrender.constants import readable_duration
+from nlosrender.readable import readable_duration
 
 if TYPE_CHECKING:
     from nlosrender.capture.part import Selection

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import typer
 
 from nlosrender.cli.json_output import OUTPUT
-from nlosrender.constants import readable_duration
+from nlosrender.readable import readable_duration, readable_size
 
 if TYPE_CHECKING:
     from nlosrender.analysis.render_plan import RenderPlan
@@ -78,7 +78,6 @@ def plan_all(sweep: Sweep, overrides: Sequence[str], as_json: bool) -> None:
         As ``analysis.render_plan.plan_render``.
     """
     from nlosrender.analysis.render_plan import plan_render
-    from nlosrender.cli.plan_command import readable_size
     from nlosrender.config.places import with_places
     from nlosrender.errors import ConfigError
 

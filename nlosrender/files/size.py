@@ -12,6 +12,7 @@ import numpy as np
 
 from nlosrender.files import layout
 from nlosrender.files.chunks import chunk_shape
+from nlosrender.readable import readable_size
 
 SAMPLE_BYTES = 4  # float32
 HEADER_BYTES = 60_000  # attributes, the configuration among them, and HDF5's own tables of a small file
@@ -90,8 +91,8 @@ def disk_warnings(path: Path, size: FileSize) -> Iterator[str]:
     free = shutil.disk_usage(folder).free
     if size.disk_bytes_estimate > free:
         yield (
-            f"output.path: up to {size.disk_bytes_estimate / 1e9:.3g} GB may be written, but {folder} has "
-            f"{free / 1e9:.3g} GB left."
+            f"output.path: up to {readable_size(size.disk_bytes_estimate)} may be written, but {folder} has "
+            f"{readable_size(free)} left."
         )
 
 

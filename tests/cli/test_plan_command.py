@@ -11,7 +11,6 @@ import pytest
 from typer.testing import CliRunner
 
 from nlosrender.cli.app import app
-from nlosrender.cli.plan_command import readable_size
 from nlosrender.errors import EXIT_BAD_INPUT, ConfigError
 
 SCENE = """
@@ -232,11 +231,3 @@ def test_help_ends_with_an_example():
     text = " ".join(run("plan", "--help").stdout.split())
     assert text.rindex("Example: nlosrender plan configs/z-letter.yaml") > text.rindex("--json")
     assert "writes nothing" in text
-
-
-@pytest.mark.parametrize(
-    ("n_bytes", "text"), [(7, "7 B"), (999, "999 B"), (1_250_000, "1.25 MB"), (999_999_999, "1 GB"), (2**40, "1.1 TB")]
-)
-def test_sizes_are_readable(n_bytes, text):
-    """Three digits and a unit of powers of ten, as disks are sold."""
-    assert readable_size(n_bytes) == text

@@ -15,7 +15,7 @@ from commands import run
 
 from nlosrender.cli import progress, progress_log
 from nlosrender.cli.progress_log import LEAST_SECONDS, MOST_SECONDS, ProgressLog
-from nlosrender.constants import readable_duration
+from nlosrender.readable import readable_duration
 from nlosrender.rendering.report import Standing
 
 SCENE = """\
@@ -86,25 +86,6 @@ def test_a_line_tells_units_error_time_and_host() -> None:
     assert line == f"render: 12 of 48 units, 50 %, error so far 3.4 %, about 3.3 min left, on {socket.gethostname()}"
     ((_, line),) = logged([0.5], 100.0, Standing("captures", 1, 4), Standing("units", 3, 9, float("nan")))
     assert line.startswith("render: 1 of 4 captures, 3 of 9 units, 50 %, error so far unknown, about ")
-
-
-@pytest.mark.parametrize(
-    ("seconds", "text"),
-    [
-        (0.0123, "0.012 s"),
-        (3.25, "3.2 s"),
-        (99.4, "99 s"),
-        (250.0, "4.2 min"),
-        (5999.0, "100 min"),
-        (7300.0, "2.0 h"),
-        (172_800.0, "2.0 days"),
-        (6.4e7, "2.0 years"),
-        (5.2e20, "1.6e+13 years"),
-    ],
-)
-def test_durations_have_the_unit_a_person_would_take(seconds: float, text: str) -> None:
-    """Two digits and a unit."""
-    assert readable_duration(seconds) == text
 
 
 @pytest.fixture

@@ -97,7 +97,7 @@ def test_a_full_disk_and_a_missing_folder_are_said(tmp_path):
     small, huge = FileSize(1, 1, 0.0, ""), FileSize(10**18, 10**18, 0.0, "")
     assert list(disk_warnings(tmp_path / "x.hdf5", small)) == []
     (warning,) = disk_warnings(tmp_path / "x.hdf5", huge)
-    assert "1e+09 GB may be written" in warning
+    assert "1e+06 TB may be written" in warning
     (warning,) = disk_warnings(tmp_path / "no" / "x.hdf5", small)
     assert "there is no folder" in warning
 
