@@ -1,4 +1,4 @@
-"""Shared by all tests; being here also puts ``rendering``, ``quadrature`` and ``agreement`` on the import path."""
+"""Fixtures that several folders of tests share; helper functions are in ``support/``."""
 
 from __future__ import annotations
 

@@ -10,9 +10,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from agreement import assert_agrees, t_limit
-from quadrature import Array, Setup, binned, grid_points, sphere_cells, third_bounces
-from rendering import flat_wall, render
+from support.agreement import assert_agrees, t_limit
+from support.quadrature import Array, Setup, binned, grid_points, sphere_cells, third_bounces
+from support.rendering import flat_wall, render
 
 RADIUS, ALBEDO = 0.7, 0.6
 REPLICAS = 16

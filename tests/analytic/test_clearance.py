@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from rendering import flat_wall
-from triangle_soup import hits, mesh_of, triangles_of, unit_normals
-from varied_scenes import Stage
+from support.rendering import flat_wall
+from support.triangle_soup import hits, mesh_of, triangles_of, unit_normals
+from support.varied_scenes import Stage
 
 from nlosrender.engine.backend.start import start_backend
 

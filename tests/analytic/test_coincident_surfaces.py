@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from quadrature import Setup, rectangle_cells, third_bounce
-from rendering import configured, flat_wall, render
+from support.quadrature import Setup, rectangle_cells, third_bounce
+from support.rendering import configured, flat_wall, render
 
 from nlosrender import pipeline
 from nlosrender.engine.backend.start import start_backend

@@ -11,8 +11,8 @@ import sys
 
 import numpy as np
 import pytest
-from quadrature import Array, Frame
-from rendering import Rendering, flat_wall, render
+from support.quadrature import Array, Frame
+from support.rendering import Rendering, flat_wall, render
 
 from nlosrender.capture.plan import BYTES_OF_STATISTICS, BYTES_PER_SUM
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from views import see, view_config
+from support.views import see, view_config
 
 from nlosrender.config.load import load_config
 from nlosrender.errors import ConfigError

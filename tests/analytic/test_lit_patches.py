@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from rendering import flat_wall
-from varied_scenes import Stage
+from support.rendering import flat_wall
+from support.varied_scenes import Stage
 
 from nlosrender.capture.plan import Batch, Tile
 from nlosrender.engine.backend.start import start_backend

@@ -8,9 +8,19 @@ from typing import Any
 
 import numpy as np
 import pytest
-from agreement import assert_agrees
-from quadrature import Array, Cells, Frame, Setup, grid_points, midpoints, rectangle_cells, third_bounce, third_bounces
-from rendering import flat_wall, render
+from support.agreement import assert_agrees
+from support.quadrature import (
+    Array,
+    Cells,
+    Frame,
+    Setup,
+    grid_points,
+    midpoints,
+    rectangle_cells,
+    third_bounce,
+    third_bounces,
+)
+from support.rendering import flat_wall, render
 
 from nlosrender.engine.backend.start import start_backend
 

@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from agreement import relative_l2
 from numpy.typing import NDArray
-from rendering import flat_wall
-from varied_scenes import Stage
+from support.agreement import relative_l2
+from support.rendering import flat_wall
+from support.varied_scenes import Stage
 
 from nlosrender.bench.meshes import grid_faces, write_ply
 from nlosrender.engine.backend.start import start_backend

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from quadrature import Setup, box_cells, grid_points, rectangle_cells, third_bounces
-from rendering import flat_wall, render
+from support.quadrature import Setup, box_cells, grid_points, rectangle_cells, third_bounces
+from support.rendering import flat_wall, render
 
 from nlosrender.engine.backend.start import start_backend
 
@@ -53,7 +53,7 @@ def test_a_concave_polygon_reflects_once(tmp_path: Path) -> None:
 def test_warnings_go_by_the_normals_that_light_goes_by(tmp_path: Path, normal: int, faces: str, is_lit: bool) -> None:
     """A plate whose normals contradict its faces' order is lit by its normals, and told to be dark by them."""
     start_backend("llvm")
-    from rendering import configured
+    from support.rendering import configured
 
     from nlosrender.capture.part import WHOLE
     from nlosrender.engine.preflight.scene_warnings import scene_warnings

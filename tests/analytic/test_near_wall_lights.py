@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from agreement import relative_l2
 from numpy.typing import NDArray
-from rendering import Rendering, configured, flat_wall, render
+from support.agreement import relative_l2
+from support.rendering import Rendering, configured, flat_wall, render
 
 from nlosrender import pipeline
 from nlosrender.engine.backend.start import start_backend

@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from agreement import assert_agrees
-from quadrature import Setup, box_cells, grid_points, third_bounces
-from rendering import Rendering, flat_wall, render
+from support.agreement import assert_agrees
+from support.quadrature import Setup, box_cells, grid_points, third_bounces
+from support.rendering import Rendering, flat_wall, render
 
 REPLICAS = 16
 BINS = (0.9, 0.05, 60)

@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from rendering import configured, flat_wall
-from views import view_config
+from support.rendering import configured, flat_wall
+from support.views import view_config
 
 from nlosrender import pipeline
 from nlosrender.capture.plan import Batch, WorkItem

@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
-from quadrature import Setup, binned, contributions, rectangle_cells, sphere_cells
-from rendering import Rendering, flat_wall, render
+from support.quadrature import Setup, binned, contributions, rectangle_cells, sphere_cells
+from support.rendering import Rendering, flat_wall, render
 
 FAST = {"engine": "virtual_lights", "spp": None}
 

@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import ArrayLike
-from quadrature import Array, Frame, Setup, grid_points, rectangle_cells, third_bounces
-from rendering import configured, flat_wall, render
-from views import view_config
+from support.quadrature import Array, Frame, Setup, grid_points, rectangle_cells, third_bounces
+from support.rendering import configured, flat_wall, render
+from support.views import view_config
 
 from nlosrender import pipeline
 from nlosrender.engine.backend.start import start_backend

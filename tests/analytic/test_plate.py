@@ -6,8 +6,8 @@ import functools
 
 import numpy as np
 import pytest
-from agreement import assert_agrees
-from quadrature import (
+from support.agreement import assert_agrees
+from support.quadrature import (
     Setup,
     box_cells,
     clear_of_rectangle,
@@ -18,7 +18,7 @@ from quadrature import (
     third_bounce,
     third_bounces,
 )
-from rendering import flat_wall, render
+from support.rendering import flat_wall, render
 
 REPLICAS = 32
 # 400 x 400 cells of 2 mm, each put whole into the bin of its midpoint: an iso-delay strip of a 4 cm bin is about 10

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from point_captures import Array, cells, point_light, points_header, write_light, write_points
+from support.point_captures import Array, cells, point_light, points_header, write_light, write_points
 
 from nlosrender.analysis.reconstruction import phasor
 from nlosrender.analysis.reconstruction.backprojection import backproject
@@ -233,7 +233,7 @@ def test_bounces_are_chosen(tmp_path: Path) -> None:
 @pytest.mark.parametrize("scan_type", ["single", "confocal"])
 def test_a_rendered_letter_is_recovered(tmp_path: Path, scan_type: str) -> None:
     """The letter of configs/z-letter.yaml comes back: 90 % of the union of true and found pixels are in both."""
-    from rendering import configured
+    from support.rendering import configured
 
     from nlosrender import pipeline
     from nlosrender.analysis.reconstruction.score import score_front_view

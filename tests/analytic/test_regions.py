@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from rendering import configured, flat_wall
+from support.rendering import configured, flat_wall
 
 from nlosrender import pipeline
 from nlosrender.capture.plan import Batch, Tile

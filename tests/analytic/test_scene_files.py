@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from rendering import configured, flat_wall
-from views import View, see, view_config
+from support.rendering import configured, flat_wall
+from support.views import View, see, view_config
 
 from nlosrender import pipeline
 from nlosrender.config.bsdf_table import MEDIA, METALS

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from quadrature import Array, Frame, grid_points, unit
-from rendering import flat_wall, render
+from support.quadrature import Array, Frame, grid_points, unit
+from support.rendering import flat_wall, render
 
 SIZE = 0.004  # m
 # (a) Points within float32 rounding, about 1e-7, of the patch's edges are missed: 4 * 1e-7 / 0.002 engine units = 2e-4,

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from rendering import Scene, configured, flat_wall, render
+from support.rendering import Scene, configured, flat_wall, render
 
 from nlosrender import pipeline
 from nlosrender.engine.backend.start import start_backend

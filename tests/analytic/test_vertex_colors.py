@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from quadrature import Array, Setup, grid_points, rectangle_cells, third_bounces
-from rendering import configured, flat_wall, render
-from views import view_config
+from support.quadrature import Array, Setup, grid_points, rectangle_cells, third_bounces
+from support.rendering import configured, flat_wall, render
+from support.views import view_config
 
 from nlosrender import pipeline
 from nlosrender.engine.backend.start import start_backend

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from agreement import assert_agrees, relative_l2
 from numpy.typing import NDArray
-from quadrature import (
+from support.agreement import assert_agrees, relative_l2
+from support.quadrature import (
     Setup,
     clear_of_rectangle,
     confocal_third_bounces,
@@ -16,7 +16,7 @@ from quadrature import (
     sphere_cells,
     third_bounces,
 )
-from rendering import Rendering, configured, flat_wall, render
+from support.rendering import Rendering, configured, flat_wall, render
 
 from nlosrender import pipeline
 from nlosrender.engine.backend.start import start_backend

@@ -6,7 +6,7 @@ import json
 
 import numpy as np
 import pytest
-from commands import run
+from support.commands import run
 
 from nlosrender.analysis.engine_check import Trial, compare_trials
 from nlosrender.capture.bounces import BounceAxis

@@ -7,10 +7,10 @@ import subprocess
 import sys
 from pathlib import Path
 
-import commands
 import numpy as np
 import pytest
-from commands import Done
+from support import commands
+from support.commands import Done
 from typer.testing import CliRunner
 
 from nlosrender.cli.app import app

@@ -11,10 +11,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from commands import run
-from partial_captures import write_part
-from point_captures import cells, point_light, points_header, write_points
-from rendering import flat_wall
+from support.commands import run
+from support.partial_captures import write_part
+from support.point_captures import cells, point_light, points_header, write_points
+from support.rendering import flat_wall
 
 from nlosrender.capture.part import Selection
 from nlosrender.config.load import load_config

@@ -13,8 +13,8 @@ from types import ModuleType, SimpleNamespace
 import h5py
 import numpy as np
 import pytest
-from partial_captures import write_part
-from point_captures import cells, point_light, points_header, write_points
+from support.partial_captures import write_part
+from support.point_captures import cells, point_light, points_header, write_points
 
 from nlosrender.capture.part import Selection
 from nlosrender.cli.progress import progress_bar

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from point_captures import cells, points_header, write_points
+from support.point_captures import cells, points_header, write_points
 
 from nlosrender.cli import app
 from nlosrender.cli.json_output import OUTPUT, problem_as_json

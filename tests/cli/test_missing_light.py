@@ -9,8 +9,8 @@ from pathlib import Path
 import h5py
 import pytest
 import yaml
-from commands import run
-from rendering import Scene, flat_wall
+from support.commands import run
+from support.rendering import Scene, flat_wall
 
 from nlosrender.errors import EXIT_BAD_INPUT
 

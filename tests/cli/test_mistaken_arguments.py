@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from commands import run
-from point_captures import cells, points_header, write_points
+from support.commands import run
+from support.point_captures import cells, points_header, write_points
 
 from nlosrender.cli.app import app
 from nlosrender.errors import EXIT_BAD_INPUT, EXIT_OK, EXIT_USAGE

@@ -11,9 +11,9 @@ from typing import get_args, get_type_hints
 
 import pytest
 import yaml
-from commands import run
-from point_captures import cells, points_header, write_points
-from rendering import flat_wall
+from support.commands import run
+from support.point_captures import cells, points_header, write_points
+from support.rendering import flat_wall
 
 from nlosrender.cli.app import app
 from nlosrender.errors import EXIT_BAD_INPUT, EXIT_ENVIRONMENT, EXIT_OK, EXIT_USAGE

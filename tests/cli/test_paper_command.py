@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from commands import run
+from support.commands import run
 
 from nlosrender.bench.paper.figure import Check, PaperFigure, Picture, Table
 from nlosrender.bench.paper.page import write_page

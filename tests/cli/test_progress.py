@@ -11,7 +11,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from commands import run
+from support.commands import run
 
 from nlosrender.cli import progress, progress_log
 from nlosrender.cli.progress_log import LEAST_SECONDS, MOST_SECONDS, ProgressLog

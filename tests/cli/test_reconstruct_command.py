@@ -8,8 +8,8 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-from point_captures import cells, points_header, write_points
-from rendering import configured
+from support.point_captures import cells, points_header, write_points
+from support.rendering import configured
 from typer.testing import CliRunner
 
 from nlosrender.cli.app import app

@@ -14,7 +14,7 @@ from typing import Any
 import h5py
 import numpy as np
 import pytest
-from commands import run
+from support.commands import run
 
 from nlosrender.config.load import config_hash
 from nlosrender.config.sweep_load import load_sweep

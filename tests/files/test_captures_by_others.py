@@ -9,7 +9,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-from point_captures import cells, point_light, points_header, write_light
+from support.point_captures import cells, point_light, points_header, write_light
 from typer.testing import CliRunner
 
 from nlosrender.analysis.comparison.captures import Tolerances, compare_captures

@@ -9,7 +9,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-from partial_captures import CONFIG, Stopped, write_part
+from support.partial_captures import CONFIG, Stopped, write_part
 
 from nlosrender.files.journal import Journal, read_records
 from nlosrender.files.partial_capture import PartialCapture

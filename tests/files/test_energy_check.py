@@ -8,7 +8,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-from partial_captures import write_part
+from support.partial_captures import write_part
 
 from nlosrender.files.validation import validate_file
 

@@ -11,9 +11,9 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-from point_captures import LASER_POINT, cells, point_light, points_header, write_light, write_points
 from scipy.io import loadmat
 from scipy.io.matlab import matfile_version
+from support.point_captures import LASER_POINT, cells, point_light, points_header, write_light, write_points
 from typer.testing import CliRunner
 
 from nlosrender.cli.app import app

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from rendering import configured
-from views import view_config
+from support.rendering import configured
+from support.views import view_config
 
 from nlosrender import pipeline
 from nlosrender.analysis.frames import FrameOptions, write_frames

@@ -11,7 +11,7 @@ import h5py
 import matplotlib.image
 import numpy as np
 import pytest
-from point_captures import cells, points_header, write_points
+from support.point_captures import cells, points_header, write_points
 
 from nlosrender.analysis import laser_view as views
 from nlosrender.analysis.plots import plot_capture

@@ -10,7 +10,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-from partial_captures import CONFIG, part_of, write_part
+from support.partial_captures import CONFIG, part_of, write_part
 
 from nlosrender.capture.part import WHOLE, Part, Selection
 from nlosrender.errors import FileError, OptionError
@@ -90,7 +90,7 @@ def test_a_shard_says_what_it_holds(tmp_path: Path, header_of: Callable, block_o
 
 def test_strips_are_dealt_tile_after_tile(header_of: Callable) -> None:
     """Ranges of strips of a 4 x 5 grid in tiles of 2 x 3 name the rows they mean."""
-    from partial_captures import tiling_of
+    from support.partial_captures import tiling_of
 
     tiling = tiling_of(header_of("single"))
     assert (tiling.rows, tiling.columns, tiling.n_strips) == (2, 3, 8)

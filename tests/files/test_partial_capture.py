@@ -12,7 +12,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-from partial_captures import CONFIG, Stopped, part_of, units_of, write_part
+from support.partial_captures import CONFIG, Stopped, part_of, units_of, write_part
 
 from nlosrender.capture.part import WHOLE, Selection
 from nlosrender.errors import FileError

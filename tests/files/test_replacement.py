@@ -11,8 +11,8 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-from partial_captures import CONFIG, Stopped, write_part
-from point_captures import cells, points_header, write_points
+from support.partial_captures import CONFIG, Stopped, write_part
+from support.point_captures import cells, points_header, write_points
 
 from nlosrender.analysis.frames import FrameOptions, write_frames
 from nlosrender.analysis.plots import plot_capture

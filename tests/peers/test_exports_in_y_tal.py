@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from point_captures import cells, point_light, points_header, write_points
+from support.point_captures import cells, point_light, points_header, write_points
 
 from nlosrender.files.exports import export_capture
 

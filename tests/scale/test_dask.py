@@ -17,7 +17,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-from commands import run
+from support.commands import run
 
 from nlosrender.capture.part import WHOLE
 from nlosrender.capture.plan import WorkItem

@@ -9,7 +9,7 @@ from typing import Any
 import h5py
 import numpy as np
 import pytest
-from rendering import configured, flat_wall
+from support.rendering import configured, flat_wall
 
 from nlosrender.capture.part import WHOLE, Selection
 from nlosrender.errors import FileError, InterruptedRender, RenderError

@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from agreement import relative_l2
-from engine_sums import assert_alike, energies, group_sums
-from rendering import flat_wall, render
-from varied_scenes import Stage, ball, diffuse, plate
-from wall_meshes import flat, globe, sheet, wavy, write_ply
+from support.agreement import relative_l2
+from support.engine_sums import assert_alike, energies, group_sums
+from support.rendering import flat_wall, render
+from support.varied_scenes import Stage, ball, diffuse, plate
+from support.wall_meshes import flat, globe, sheet, wavy, write_ply
 
 from nlosrender.engine.backend.start import start_backend
 

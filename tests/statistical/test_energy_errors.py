@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from rendering import Scene, configured, flat_wall
+from support.rendering import Scene, configured, flat_wall
 
 from nlosrender import pipeline
 

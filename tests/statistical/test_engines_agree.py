@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from engine_sums import assert_alike, energies, group_sums
-from rendering import flat_wall, render
-from varied_scenes import SIDE, SLANTED, TRAPS, Item, Stage, ball
+from support.engine_sums import assert_alike, energies, group_sums
+from support.rendering import flat_wall, render
+from support.varied_scenes import SIDE, SLANTED, TRAPS, Item, Stage, ball
 
 from nlosrender.engine.backend.start import start_backend
 

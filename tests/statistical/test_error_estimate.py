@@ -6,8 +6,8 @@ import functools
 
 import numpy as np
 import pytest
-from agreement import relative_l2
-from rendering import Rendering, flat_wall, render
+from support.agreement import relative_l2
+from support.rendering import Rendering, flat_wall, render
 
 PLATE = {"type": "rectangle", "width": 0.8, "height": 0.6, "center": [0.15, -0.1, 0.6], "normal": [0.2, -0.1, -1.0]}
 SIDE = {"type": "rectangle", "width": 0.8, "height": 0.6, "center": [-0.6, 0.0, 0.55], "normal": [1.0, 0.1, -0.2]}

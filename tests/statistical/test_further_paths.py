@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from agreement import assert_agrees
-from rendering import Rendering, configured, flat_wall, render
+from support.agreement import assert_agrees
+from support.rendering import Rendering, configured, flat_wall, render
 
 from nlosrender import pipeline
 from nlosrender.engine.backend.start import start_backend

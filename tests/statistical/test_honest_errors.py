@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from varied_scenes import SIDE, SLANTED, TRAPS, Item, Stage, Trap, ball, diffuse, plate, room
+from support.varied_scenes import SIDE, SLANTED, TRAPS, Item, Stage, Trap, ball, diffuse, plate, room
 
 from nlosrender.engine.backend.start import start_backend
 

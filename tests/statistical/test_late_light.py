@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from agreement import grouped
-from engine_sums import SHARE, Sums, assert_alike
 from numpy.typing import NDArray
-from rendering import configured, flat_wall, render
-from varied_scenes import GREY_WALL, LEGS, SIDE, SLANTED, Item, Stage, room
+from support.agreement import grouped
+from support.engine_sums import SHARE, Sums, assert_alike
+from support.rendering import configured, flat_wall, render
+from support.varied_scenes import GREY_WALL, LEGS, SIDE, SLANTED, Item, Stage, room
 
 from nlosrender.engine.backend.start import start_backend
 

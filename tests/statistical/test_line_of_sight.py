@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from agreement import t_limit, worst_t
-from views import REPLICAS, View, see, steady_reference, view_config
+from support.agreement import t_limit, worst_t
+from support.views import REPLICAS, View, see, steady_reference, view_config
 
 from nlosrender.config.load import load_config
 

@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from agreement import assert_agrees, t_limit, worst_t
-from rendering import configured, flat_wall, render
+from support.agreement import assert_agrees, t_limit, worst_t
+from support.rendering import configured, flat_wall, render
 
 from nlosrender import pipeline
 from nlosrender.errors import ConfigError

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from agreement import t_limit, worst_t
-from views import REPLICAS, View, see, steady_reference, view_config
+from support.agreement import t_limit, worst_t
+from support.views import REPLICAS, View, see, steady_reference, view_config
 
 from nlosrender.config.load import load_config
 

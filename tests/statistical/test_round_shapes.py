@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from agreement import assert_agrees
-from quadrature import Array, Cells, Setup, cylinder_cells, grid_points, sphere_cells, third_bounces
-from rendering import flat_wall, render
+from support.agreement import assert_agrees
+from support.quadrature import Array, Cells, Setup, cylinder_cells, grid_points, sphere_cells, third_bounces
+from support.rendering import flat_wall, render
 
 REPLICAS = 32
 BINS = (0.7, 0.05, 40)

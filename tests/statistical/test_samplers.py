@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from agreement import FALSE_ALARM
-from rendering import configured, flat_wall
 from scipy import stats
+from support.agreement import FALSE_ALARM
+from support.rendering import configured, flat_wall
 
 from nlosrender import pipeline
 from nlosrender.engine.backend.start import start_backend

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from agreement import t_limit
-from rendering import flat_wall
-from varied_scenes import Stage
+from support.agreement import t_limit
+from support.rendering import flat_wall
+from support.varied_scenes import Stage
 
 PLATE = {"type": "rectangle", "width": 0.8, "height": 0.8, "center": [0, 0, 0.9], "normal": [0.1, 0, -1]}
 SCREEN = {"type": "rectangle", "width": 0.31, "height": 0.23, "center": [0.07, 0.04, 0.5], "normal": [0, 0, 1]}

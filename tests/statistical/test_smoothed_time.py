@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from rendering import flat_wall, render
 from scipy.ndimage import convolve1d
+from support.rendering import flat_wall, render
 
 from nlosrender.engine.backend.start import start_backend
 

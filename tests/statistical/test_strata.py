@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from agreement import assert_agrees
-from rendering import configured, flat_wall, render
+from support.agreement import assert_agrees
+from support.rendering import configured, flat_wall, render
 
 from nlosrender.engine.backend.start import start_backend
 

@@ -7,8 +7,8 @@ import itertools
 
 import numpy as np
 import pytest
-from agreement import assert_agrees
-from rendering import Rendering, flat_wall, render
+from support.agreement import assert_agrees
+from support.rendering import Rendering, flat_wall, render
 
 REPLICAS = 32
 PLATE = {

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from rendering import Rendering, flat_wall, render
+from support.rendering import Rendering, flat_wall, render
 
 Array = NDArray[np.float64]
 

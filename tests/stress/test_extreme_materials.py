@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from conftest import Ledger
-from rendering import render
 from stressed import BOTH, PLATE, noise_of, relative_difference, rendered, scene
+from support.rendering import render
 
 
 def diffuse(reflectance: object) -> dict:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from conftest import Ledger
-from rendering import render
 from stressed import BOTH, ENGINES, PLATE, relative_difference, scene
+from support.rendering import render
 
 from nlosrender.engine.backend.start import start_backend
 

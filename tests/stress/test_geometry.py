@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from conftest import Ledger
-from rendering import Rendering, configured, render
 from stressed import BOTH, Array, noise_of, relative_difference, scene
+from support.rendering import Rendering, configured, render
 
 from nlosrender import pipeline
 from nlosrender.errors import ConfigError

@@ -12,7 +12,7 @@ import yaml
 from conftest import Ledger
 from containment import Containment
 from damage import damaged
-from rendering import flat_wall
+from support.rendering import flat_wall
 
 from nlosrender.analysis.summary import summarise
 from nlosrender.errors import FileError

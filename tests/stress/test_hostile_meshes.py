@@ -11,7 +11,7 @@ import pytest
 from conftest import Ledger
 from containment import Containment
 from damage import damaged
-from rendering import configured, flat_wall, render
+from support.rendering import configured, flat_wall, render
 
 from nlosrender.errors import ConfigError
 from nlosrender.scene.mesh_file import read_mesh

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from rendering import configured, flat_wall
+from support.rendering import configured, flat_wall
 
 from nlosrender.errors import ConfigError
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from conftest import Ledger
-from rendering import render
 from stressed import BOTH, PLATE, WITH_LEGS, Array, placed, relative_difference, scene
+from support.rendering import render
 
 SIDE = {"type": "rectangle", "width": 1.0, "height": 1.0, "center": [-0.5, 0.0, 0.5], "normal": [1.0, 0.2, -0.1]}
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from conftest import Ledger
-from rendering import Rendering
 from stressed import relative_difference, rendered
+from support.rendering import Rendering
 
 TWO_SIDED = {"type": "twosided", "inner": {"type": "diffuse", "reflectance": 1.0}}
 UNIT = {"type": "rectangle", "width": 1.0, "height": 1.0}

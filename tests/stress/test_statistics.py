@@ -8,9 +8,9 @@ import itertools
 import numpy as np
 import pytest
 from conftest import Ledger
-from quadrature import Setup, grid_points, rectangle_cells, third_bounces
-from rendering import render
 from stressed import ENGINES, PLATE, scene
+from support.quadrature import Setup, grid_points, rectangle_cells, third_bounces
+from support.rendering import render
 
 BINS = (0.9, 0.04, 60)
 CELLS = rectangle_cells(PLATE["width"], PLATE["height"], PLATE["center"], PLATE["normal"], n=800)

@@ -8,7 +8,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from rendering import configured, flat_wall
+from support.rendering import configured, flat_wall
 
 from nlosrender import pipeline
 from nlosrender.analysis.render_plan import plan_render

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from rendering import configured, flat_wall
+from support.rendering import configured, flat_wall
 
 from nlosrender.bench.meshes import grid_faces, write_ply
 from nlosrender.bench.paper.room_meshes import block, ellipsoid, write_furniture, write_statue

@@ -8,8 +8,8 @@ from typing import Any
 
 import pytest
 import yaml
-from rendering import configured, flat_wall
-from views import view_config
+from support.rendering import configured, flat_wall
+from support.views import view_config
 
 from nlosrender.config.load import config_to_dict, load_config
 from nlosrender.config.mitsuba_xml import is_colored_xml, read_mitsuba_xml

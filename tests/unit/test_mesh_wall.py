@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from rendering import configured, flat_wall
-from wall_meshes import flat, globe, sheet, wavy, write_obj, write_ply
+from support.rendering import configured, flat_wall
+from support.wall_meshes import flat, globe, sheet, wavy, write_obj, write_ply
 
 from nlosrender.capture.grids import build_capture
 from nlosrender.errors import ConfigError

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from triangle_soup import mesh_of
+from support.triangle_soup import mesh_of
 
 from nlosrender.engine.backend.start import start_backend
 

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from point_captures import POSE, cells, points_header, write_points
-from rendering import configured
+from support.point_captures import POSE, cells, points_header, write_points
+from support.rendering import configured
 
 from nlosrender.analysis.reconstruction.lattice import Axis, lattice_of
 from nlosrender.analysis.reconstruction.propagation import Propagator

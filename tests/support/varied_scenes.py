@@ -15,10 +15,10 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from rendering import configured, flat_wall
 
 from nlosrender import pipeline
 from nlosrender.engine.backend.start import start_backend
+from support.rendering import configured, flat_wall
 
 Array = NDArray[np.float64]
 Item = dict[str, Any]

@@ -9,11 +9,11 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from rendering import configured
 
 from nlosrender import pipeline
 from nlosrender.config.document import Config
 from nlosrender.engine.backend.start import start_backend
+from support.rendering import configured
 
 Array = NDArray[np.float64]
 Scene = Mapping[str, Any]

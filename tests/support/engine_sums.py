@@ -5,10 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from agreement import grouped, t_limit
 from numpy.typing import NDArray
 from scipy import stats
-from varied_scenes import Repeated
+
+from support.agreement import grouped, t_limit
+from support.varied_scenes import Repeated
 
 Array = NDArray[np.float64]
 # Energy of the third bounce: its discretisation error is up to 0.35 % of H (L2) of the 1 % that is asked for, and

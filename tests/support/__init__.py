@@ -1,0 +1,1 @@
+"""Helpers that several folders of tests share: captures without files, references, comparisons, meshes."""
