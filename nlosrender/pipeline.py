@@ -31,6 +31,7 @@ from nlosrender.rendering.outcome import Outcome, missing_light
 from nlosrender.rendering.render_warnings import render_warnings
 from nlosrender.rendering.report import Progress, RenderReport, Stopwatch, Warn, Warnings, Watch
 from nlosrender.rendering.set_up import (
+    calibrated_budget,
     describe_capture,
     describe_file,
     load_scene,
@@ -38,7 +39,6 @@ from nlosrender.rendering.set_up import (
     place_scene,
     prepare,
     set_up_engine,
-    settled_budget,
     started_backend,
 )
 from nlosrender.rendering.sharing import ALONE
@@ -47,6 +47,7 @@ if TYPE_CHECKING:
     from nlosrender.rendering.dask_cluster import Cluster
 
 __all__ = [
+    "calibrated_budget",
     "describe_capture",
     "describe_file",
     "load_scene",
@@ -56,7 +57,6 @@ __all__ = [
     "prepare",
     "render_capture",
     "set_up_engine",
-    "settled_budget",
     "started_backend",
 ]
 
@@ -128,7 +128,7 @@ def render_capture(
             warnings.say(paths.warning for paths in unsampled)
             warnings.say(render_warnings(config, backend, plan, engine, header, sharing))
         with stopwatch.stage("render"):
-            budget = settled_budget(config, engine)
+            budget = calibrated_budget(config, engine)
         with resumable(partial) as stop:
             provenance = provenance_attributes(
                 resolved, config_hash(config), engine=engine.name, seed=config.render.seed, meshes=engine.built.meshes

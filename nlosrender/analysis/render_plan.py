@@ -20,7 +20,7 @@ from nlosrender.rendering.set_up import set_up_engine, started_backend
 from nlosrender.scene.mesh_report import MeshReport
 
 if TYPE_CHECKING:
-    from nlosrender.engine.preflight.omitted_work import Skipped
+    from nlosrender.engine.preflight.omitted_work import OmittedWork
 
 MAX_WAIT = 30 * 86_400.0  # s
 
@@ -32,7 +32,7 @@ class RenderPlan:
     engine: str
     reason: str  # why this engine
     variant: str  # Mitsuba variant
-    skipped: tuple[Skipped, ...]
+    skipped: tuple[OmittedWork, ...]
     scan_type: str
     sensor_grid: tuple[int, int]  # columns, rows
     laser_grid: tuple[int, int]  # columns, rows; confocal: the sensor grid
@@ -69,7 +69,7 @@ def plan_render(config: Config) -> RenderPlan:
     """
     from nlosrender.engine.path.engine import Budget
     from nlosrender.engine.preflight.batch_memory import batch_bytes
-    from nlosrender.engine.preflight.omitted_work import skipped_work
+    from nlosrender.engine.preflight.omitted_work import omitted_work
     from nlosrender.engine.preflight.time_estimate import estimate_render_time
 
     begun = time.perf_counter()
@@ -93,7 +93,7 @@ def plan_render(config: Config) -> RenderPlan:
         engine=engine.name,
         reason=engine.reason,
         variant=backend.variant,
-        skipped=skipped_work(engine, scene_is_colored=config.scene.is_colored),
+        skipped=omitted_work(engine, scene_is_colored=config.scene.is_colored),
         scan_type=capture.scan_type,
         sensor_grid=(capture.sensor_grid.nx, capture.sensor_grid.ny),
         laser_grid=(capture.laser_grid.nx, capture.laser_grid.ny),

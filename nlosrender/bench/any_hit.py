@@ -9,14 +9,14 @@ import numpy as np
 from nlosrender.bench.runs import Float64, LoadedScene, Timer
 
 if TYPE_CHECKING:
-    from nlosrender.engine.virtual_lights.third_bounce import LitPatches
+    from nlosrender.engine.virtual_lights.third_bounce import ShadowRayTargets
 
 REPEATS = 3
 RAYS_PER_LAUNCH = 2**24
 SPREAD = 1024  # counters that the lanes share, so that they rarely wait for one another
 
 
-def trace_any_hit(loaded: LoadedScene, lit: LitPatches, *, only_asked: bool = False) -> tuple[int, float]:
+def trace_any_hit(loaded: LoadedScene, lit: ShadowRayTargets, *, only_asked: bool = False) -> tuple[int, float]:
     """Trace the shadow ray of every pair of sensor point and patch that face each other, and do nothing else.
 
     The rays are those of the gather, and in its order: neighbouring lanes are neighbouring sensor points looking at
@@ -40,15 +40,15 @@ def trace_any_hit(loaded: LoadedScene, lit: LitPatches, *, only_asked: bool = Fa
     import mitsuba as mi
 
     from nlosrender.engine.launch.device_arrays import on_device
-    from nlosrender.engine.launch.morton import z_order
+    from nlosrender.engine.launch.morton import morton_order
     from nlosrender.engine.path.laser_connections import WALL_OFFSET
 
     built, n_sensors = loaded.built, loaded.capture.n_sensors
     points = loaded.capture.sensor_grid.positions.reshape(-1, 3) / built.unit
-    order = np.argsort(z_order(points), kind="stable")
+    order = np.argsort(morton_order(points), kind="stable")
     sensors, tiles = _device_points(mi, points[order]), on_device(mi.UInt64, lit.tiles[order])
     centres, normals = _device_points(mi, lit.positions), _device_points(mi, lit.normals)
-    clearance = on_device(mi.UInt64, lit.clearance if only_asked else np.zeros_like(lit.clearance))
+    clearance = on_device(mi.UInt64, lit.mask if only_asked else np.zeros_like(lit.mask))
     step = max(1, RAYS_PER_LAUNCH // n_sensors)
     dr.eval(sensors, centres, normals)
 

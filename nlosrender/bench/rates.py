@@ -34,7 +34,7 @@ class GatherRate:
     scene: str
     triangles: int
     patches: int  # at the resolution of the target error
-    lit_patches: int  # of them, seen by a laser point: only these are gathered
+    shadow_ray_targets: int  # of them, seen by a laser point: only these are gathered
     pairs: int  # sensor points times all patches: the rays of a gather that leaves out none
     rays: int  # lit pairs that face each other
     asked_rays: int  # of ``rays``: the gather leaves out those that nothing can stop
@@ -66,18 +66,18 @@ def gather_rate(loaded: LoadedScene) -> GatherRate:
     from nlosrender.engine.path.engine import Budget
 
     plan, engine = virtual_lights_of(loaded)
-    fineness = engine.settle(Budget(target_error=GATHER_TARGET)).fineness or 1.0
+    patch_scale = engine.calibrate(Budget(target_error=GATHER_TARGET)).patch_scale or 1.0
     spent = []
     for _ in range(REPEATS + 1):  # the first run compiles
         engine.third.forget()  # lighting is a part of it
         timer = Timer()
         for batch in plan.batches:
-            engine.third.gather(batch, fineness)
+            engine.third.gather(batch, patch_scale)
         spent.append(timer.read()[0])
-    lit = engine.third.lit_patches(plan.batches[0], fineness)
+    lit = engine.third.shadow_ray_targets(plan.batches[0], patch_scale)
     rays, any_hit_seconds = trace_any_hit(loaded, lit)
     asked_rays, asked_seconds = trace_any_hit(loaded, lit, only_asked=True)
-    n_patches = len(engine.tessellator.patches(fineness))
+    n_patches = len(engine.tessellator.patches(patch_scale))
     return GatherRate(
         loaded.scene.name,
         loaded.built.n_triangles,

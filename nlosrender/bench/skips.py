@@ -73,15 +73,15 @@ def of_gather(loaded: LoadedScene) -> Iterator[Saving]:
     from nlosrender.engine.path.engine import Budget
 
     plan, engine = virtual_lights_of(loaded)
-    fineness = engine.settle(Budget(target_error=GATHER_TARGET)).fineness or 1.0
+    patch_scale = engine.calibrate(Budget(target_error=GATHER_TARGET)).patch_scale or 1.0
 
     def gather() -> Float64:
         engine.third.forget()  # visibility is a part of lighting, too
-        return np.concatenate([engine.third.gather(batch, fineness).values for batch in plan.batches], axis=3)
+        return np.concatenate([engine.third.gather(batch, patch_scale).values for batch in plan.batches], axis=3)
 
     if not engine.settings.needs_visibility:
         yield _saving("rays where nothing can lie between", loaded, gather, _tracing_all(engine, gather))
-    elif engine.third.lit_patches(plan.batches[0], fineness).clearance.any():
+    elif engine.third.shadow_ray_targets(plan.batches[0], patch_scale).mask.any():
         yield _saving("rays that nothing can stop", loaded, gather, _without_clearances(gather))
 
 
@@ -119,7 +119,7 @@ def _of_regions(loaded: LoadedScene) -> Iterator[Saving]:
     from nlosrender.engine.virtual_lights.third_bounce import ThirdBounce
 
     plan, engine = virtual_lights_of(loaded)
-    third, bin_width = engine.third, engine.tessellator.grading.bin_width
+    third, bin_width = engine.third, engine.tessellator.size_field.bin_width
     undivided = Tessellator(engine.built, engine.capture, bin_width, may_divide=False)
     one = ThirdBounce(third.paths, undivided, third.settings, third.lanes)
     ways = [lambda of=of: of.gather(plan.batches[0], FINENESS).values for of in (third, one)]
@@ -161,14 +161,14 @@ def of_paths(loaded: LoadedScene) -> Iterator[Saving]:
         tracing.integrator = load_path_integrator(replace(engine.settings, needs_visibility=True))
         yield _saving("rays of paths where nothing can lie between", loaded, render(engine), render(tracing))
     by_bsdf = engine_with(hidden_geometry_sampling=False)
-    if by_bsdf.hidden_box is not None:
+    if by_bsdf.hidden_aabb is not None:
         tracing = engine_with(hidden_geometry_sampling=False)
-        tracing.hidden_box = None
+        tracing.hidden_aabb = None
         what = "rays of paths that pass the hidden geometry by (BSDF sampling)"
         yield _saving(what, loaded, render(by_bsdf), render(tracing))
-    if engine.hidden_fraction in (0.0, 1.0):
-        kept = "hidden geometry" if engine.hidden_fraction else "BSDF"
-        mixed = engine_with(hidden_fraction=MIXTURE)
+    if engine.p_hidden_sampling in (0.0, 1.0):
+        kept = "hidden geometry" if engine.p_hidden_sampling else "BSDF"
+        mixed = engine_with(p_hidden_sampling=MIXTURE)
         yield _saving(f"MIS where {kept} sampling suffices", loaded, render(engine), render(mixed))
 
 
@@ -182,7 +182,7 @@ def _of_late_light(loaded: LoadedScene) -> Iterator[Saving]:
     for name in ("path", "virtual_lights"):
         config = loaded.scene.config(engine=name, split_bounces=False)
         plan, engine = pipeline.prepare(config, loaded.backend, built, capture, time_axis)
-        options = replace(engine.options, late_roulette=False)
+        options = replace(engine.options, has_time_gate=False)
         if isinstance(engine, VirtualLightEngine):
             patient: Engine = VirtualLightEngine(built, capture, time_axis, options, engine.lanes)
             budget = Budget(target_error=ROOM_TARGET)
@@ -190,7 +190,7 @@ def _of_late_light(loaded: LoadedScene) -> Iterator[Saving]:
             patient, budget = PathEngine(built, capture, time_axis, options), Budget(spp=PATHS)
 
         def render(one: Engine, budget: Budget = budget, batches: Sequence[Batch] = plan.batches) -> Float64:
-            return np.concatenate([one.render(batch, one.settle(budget)).mean for batch in batches], axis=3)
+            return np.concatenate([one.render(batch, one.calibrate(budget)).mean for batch in batches], axis=3)
 
         what = {"path": "most paths", "virtual_lights": "most walks"}[name] + " that end after the window"
         yield _saving(what, loaded, partial(render, engine), partial(render, patient))

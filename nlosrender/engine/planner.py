@@ -10,10 +10,10 @@ from nlosrender.capture.time_axis import TimeAxis
 from nlosrender.config.render import RenderConfig
 from nlosrender.engine.engines import Engine
 from nlosrender.engine.line_of_sight.engine import LineOfSightEngine
-from nlosrender.engine.path.engine import PathEngine, PathOptions
+from nlosrender.engine.path.engine import PathEngine, RenderOptions
 from nlosrender.engine.virtual_lights.elements.tessellator import MAX_PATCHES, can_tessellate, wall_sees_itself
 from nlosrender.engine.virtual_lights.engine import VirtualLightEngine, is_lambertian
-from nlosrender.engine.virtual_lights.third_bounce import FIRST_COARSENESS
+from nlosrender.engine.virtual_lights.third_bounce import COARSEST_SCALE
 from nlosrender.scene.build import BuiltScene
 from nlosrender.scene.view import BuiltView
 
@@ -27,7 +27,7 @@ def choose_engine(
     built: BuiltScene | BuiltView,
     capture: Capture,
     time_axis: TimeAxis,
-    options: PathOptions,
+    options: RenderOptions,
     lanes: int,
 ) -> Engine:
     """Return the engine for a scene (backend started), which knows the reason in plain words.
@@ -76,7 +76,7 @@ def _obstacle_close_by(engine: VirtualLightEngine, capture: Capture) -> str | No
     if capture.scan_type == "confocal":
         return "hidden geometry touches a laser or sensor point"
     most = MAX_PATCHES if tessellator.nearest_to_laser < TOUCHING else MOST_NEAR
-    if tessellator.count(FIRST_COARSENESS) > most:
+    if tessellator.count(COARSEST_SCALE) > most:
         return "hidden geometry touches so many points that paths cost less"
     return None
 

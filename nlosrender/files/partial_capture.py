@@ -22,7 +22,7 @@ from types import TracebackType
 from typing import Any
 
 from nlosrender.config.canonical import tree_hash
-from nlosrender.engine.launch.passes import Kept
+from nlosrender.engine.launch.passes import SavedStages
 from nlosrender.errors import FileError
 from nlosrender.files.capture_file import CaptureHeader
 from nlosrender.files.header_writer import root_attributes
@@ -223,7 +223,7 @@ class PartialCapture:
         """Whether a later render can go on with something: finished units, or a state of one in flight."""
         return bool(self.tally.units) or self.has_states
 
-    def keep_state(self, unit: UnitKey, budget: Mapping[str, Any], kept: Kept) -> None:
+    def keep_state(self, unit: UnitKey, budget: Mapping[str, Any], kept: SavedStages) -> None:
         """Write what there is of a unit in flight, instead of what was written of it before.
 
         Parameters
@@ -245,7 +245,7 @@ class PartialCapture:
         """Return whether something was kept of a unit in flight, usable or not."""
         return state_path(self.folder, unit).exists()
 
-    def kept_state(self, unit: UnitKey, budget: Mapping[str, Any]) -> Kept | None:
+    def kept_state(self, unit: UnitKey, budget: Mapping[str, Any]) -> SavedStages | None:
         """Return what an earlier render has kept of a unit with the same budget, if it is whole."""
         return read_state(state_path(self.folder, unit), self._tag(budget))
 

@@ -17,7 +17,7 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from nlosrender.engine.launch.passes import Kept, Snapshot
+from nlosrender.engine.launch.passes import SavedStages, Snapshot
 from nlosrender.files.journal import line_of, record_of
 from nlosrender.files.unit_log import UnitKey
 
@@ -36,7 +36,7 @@ def has_states(folder: Path) -> bool:
     return any(not path.name.endswith(NEW) for path in folder.glob(f"{PREFIX}*"))
 
 
-def write_state(path: Path, tag: str, kept: Kept) -> None:
+def write_state(path: Path, tag: str, kept: SavedStages) -> None:
     """Write a state, instead of an earlier one.
 
     Parameters
@@ -76,7 +76,7 @@ def write_state(path: Path, tag: str, kept: Kept) -> None:
         raise
 
 
-def read_state(path: Path, tag: str) -> Kept | None:
+def read_state(path: Path, tag: str) -> SavedStages | None:
     """Return a state that belongs to the render of ``tag``; None where there is none that is whole."""
     try:
         with os.fdopen(os.open(path, os.O_RDONLY | os.O_NOFOLLOW), "rb") as stream:

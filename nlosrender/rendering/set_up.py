@@ -54,11 +54,11 @@ def set_up_engine(
     return plan, engine, describe_file(config, built, capture, time_axis, shared_samples(engine))
 
 
-def settled_budget(config: Config, engine: Engine) -> Budget:
+def calibrated_budget(config: Config, engine: Engine) -> Budget:
     """Return when to stop, settled for the whole capture at once: no unit's result depends on how the work is cut."""
     from nlosrender.engine.path.engine import Budget
 
-    return engine.settle(Budget(config.render.spp, config.render.target_error, config.render.time_limit_s))
+    return engine.calibrate(Budget(config.render.spp, config.render.target_error, config.render.time_limit_s))
 
 
 def load_view(config: Config) -> BuiltView:
@@ -122,7 +122,7 @@ def prepare(
     replicas: int | None = None,
 ) -> tuple[Plan, Engine]:
     """Stages 3 and 4: cut the work into units and set up the engine; ``replicas`` other than the plan's on request."""
-    from nlosrender.engine.path.engine import PathOptions
+    from nlosrender.engine.path.engine import RenderOptions
     from nlosrender.engine.planner import choose_engine
 
     render = config.render
@@ -143,7 +143,7 @@ def prepare(
         max_item_samples=sharing.max_item_samples,
         min_items=sharing.min_items,
     )
-    options = PathOptions(
+    options = RenderOptions(
         bounces=bounces,
         laser_sampling=render.laser_sampling,
         hidden_geometry_sampling=render.hidden_geometry_sampling,

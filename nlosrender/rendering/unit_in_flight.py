@@ -8,7 +8,7 @@ from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
 from nlosrender.capture.plan import WorkItem
-from nlosrender.engine.launch.passes import Kept, Passes, Snapshot
+from nlosrender.engine.launch.passes import Passes, SavedStages, Snapshot
 from nlosrender.errors import FileError
 from nlosrender.files.partial_capture import PartialCapture
 from nlosrender.interruption import StopRequest
@@ -72,7 +72,7 @@ class UnitInFlight:
     def _state_of(self) -> tuple[Any, Mapping[str, Any]]:
         return self._key, self._budget
 
-    def _look(self, take: Callable[[], Kept]) -> None:
+    def _look(self, take: Callable[[], SavedStages]) -> None:
         now = time.perf_counter()
         if self._stop.came:
             self._signal_at = self._signal_at or now
@@ -84,7 +84,7 @@ class UnitInFlight:
             self._kept_at = time.perf_counter()
             self._pause = max(self._pause, KEEP_SECONDS, (self._kept_at - now) / KEEP_COST)
 
-    def _keep(self, kept: Kept) -> None:
+    def _keep(self, kept: SavedStages) -> None:
         noted = Snapshot(numbers={"seconds": self.seconds})
         try:
             self._partial.keep_state(*self._state_of, kept | {OF_UNIT: noted})

@@ -207,8 +207,8 @@ def test_arrival_times_in_a_sphere_are_sums_of_chords() -> None:
         assert_agrees(mean[None], variance[None], reference[None], replicas=REPLICAS, floor=floor)
 
 
-@pytest.mark.parametrize("hidden_fraction", [0.0, 0.5, 1.0])
-def test_a_small_wall_in_a_large_sphere(hidden_fraction: float) -> None:
+@pytest.mark.parametrize("p_hidden_sampling", [0.0, 0.5, 1.0])
+def test_a_small_wall_in_a_large_sphere(p_hidden_sampling: float) -> None:
     """Wherever the wall is, all its light meets the sphere: H_k = rho_w^2 rho^(k-2) / (4 pi^2 R^2) for k >= 4.
 
     H_4 = (rho_w / pi)^2 (rho / pi)^2 F (1 / (4 R^2)) F with F = integral of cos cos / d^2 over the sphere = pi. The
@@ -230,7 +230,7 @@ def test_a_small_wall_in_a_large_sphere(hidden_fraction: float) -> None:
         max_bounces=6,
         spp=32768,
     )
-    result = render(config, replicas=REPLICAS, hidden_fraction=hidden_fraction)
+    result = render(config, replicas=REPLICAS, p_hidden_sampling=p_hidden_sampling)
     setup = Setup(sphere_cells(center, radius, inside=True), 0.2 * np.arange(61), rho=rho, rho_wall=rho_wall)
     reference = third_bounces(setup, np.array([[[0.01, -0.02, 0.0]]]), grid_points(5, 3, 0.06, 0.05))
     assert_agrees(result.bounce(3), result.bounce_variance(3), reference, replicas=REPLICAS, floor=2e-3)

@@ -115,13 +115,13 @@ def cleared(triangles: Array, points: Array, normals: Array, others: Array, outl
     import drjit as dr
     import mitsuba as mi
 
-    from nlosrender.engine.virtual_lights.visibility.masks import Clearances, Surface
+    from nlosrender.engine.virtual_lights.visibility.masks import Surface, VisibilityMasks
 
     built: Any = SimpleNamespace(wall=SimpleNamespace(is_planar=planar), hidden_shapes=(mesh_of(triangles),))
     surface = Surface(vectors(mi.Point3f, points), vectors(mi.Vector3f, normals), vectors(mi.Vector3f, others))
     count = len(points)
     where, active = dr.zeros(mi.UInt32, count), dr.full(mi.Bool, True, count)
-    return np.array(Clearances(built).of(surface, outlook, where, active))
+    return np.array(VisibilityMasks(built).of(surface, outlook, where, active))
 
 
 def wall_points(rectangle: Array, points: Array, triangles: Array, random: np.random.Generator) -> Array:
@@ -184,14 +184,14 @@ def test_nothing_hides_a_point_from_where_it_is_said_to_be_open(name: str, recta
     import drjit as dr
     import mitsuba as mi
 
-    from nlosrender.engine.virtual_lights.visibility.masks import Outlook
+    from nlosrender.engine.virtual_lights.visibility.masks import WallTiles
 
     random = np.random.default_rng(7)
     triangles = SCENES[name](random).astype(np.float32).astype(np.float64)
     points, own = on_and_behind(triangles, random)
     turned = own + 0.4 * random.normal(size=own.shape)
     turned = (turned / np.linalg.norm(turned, axis=1)[:, None]).astype(np.float32).astype(np.float64)
-    outlook = Outlook.around([rectangle], MANY)
+    outlook = WallTiles.around([rectangle], MANY)
     n_hidden, n_open = 0, 0
     for normals, others in ((own, own), (own, turned), (turned, own)):  # flat, with shading normals, a cluster
         ends = wall_points(rectangle, points, triangles, random)
@@ -227,9 +227,9 @@ def stage_of(*hidden: dict[str, Any], scan: str = "single", **more: Any) -> Stag
     return Stage.of(flat_wall(*hidden, scan=scan, engine="virtual_lights", spp=None, **(sensors | more)))
 
 
-def lit_patches(stage: Stage) -> Any:
+def shadow_ray_targets(stage: Stage) -> Any:
     """Return the patches that the gather goes through."""
-    return stage.engine.third.lit_patches(stage.batch, 0.5)
+    return stage.engine.third.shadow_ray_targets(stage.batch, 0.5)
 
 
 def sensor_points(stage: Stage) -> Array:
@@ -243,11 +243,11 @@ def sensor_points(stage: Stage) -> Array:
 def test_what_an_engine_says_of_its_patches_is_so(hidden: tuple[dict[str, Any], ...]) -> None:
     """The same of the patches of a scene and the sensor points' own tiles, in the gather's order."""
     stage = stage_of(*hidden, scan="confocal")
-    lit, sensors = lit_patches(stage), sensor_points(stage)
+    lit, sensors = shadow_ray_targets(stage), sensor_points(stage)
     triangles = np.concatenate([triangles_of(shape) for shape in stage.engine.built.hidden_shapes])
     ends = np.broadcast_to(sensors, (len(lit.positions), *sensors.shape))
     bits = np.broadcast_to(lit.tiles, ends.shape[:2])
-    n_hidden, n_open = assert_sound(triangles, lit.positions, lit.normals, lit.clearance, ends, bits)
+    n_hidden, n_open = assert_sound(triangles, lit.positions, lit.normals, lit.mask, ends, bits)
     assert n_hidden > 20
     assert n_open > 20
 
@@ -256,14 +256,14 @@ def is_open(lit: Any) -> NDArray[np.bool_]:
     """Return which patches are open to all tiles."""
     from nlosrender.engine.virtual_lights.visibility.masks import OF_ALL
 
-    return lit.clearance == OF_ALL
+    return lit.mask == OF_ALL
 
 
 @pytest.mark.usefixtures("eager")
 def test_the_foremost_plate_is_open_and_the_hidden_one_is_not() -> None:
     """Of two plates one behind the other."""
     stage = stage_of(FRONT, BEHIND | {"center": [0.3, 0, 1.0]}, scan="confocal")
-    lit = lit_patches(stage)
+    lit = shadow_ray_targets(stage)
     is_front = lit.positions[:, 2] * stage.engine.built.unit < 0.9
     assert is_open(lit)[is_front].all()
     assert not is_open(lit)[~is_front].any()
@@ -274,7 +274,7 @@ def test_a_two_sided_plate_is_open_in_front() -> None:
     """What lies behind its plane is no matter to wall points before it."""
     two_sided = {"type": "twosided", "nested": {"type": "diffuse"}}
     stage = stage_of(FRONT | {"bsdf": two_sided}, BEHIND)
-    lit = lit_patches(stage)
+    lit = shadow_ray_targets(stage)
     is_front = lit.positions[:, 2] * stage.engine.built.unit < 0.9
     assert is_front.any()
     assert is_open(lit)[is_front].all()
@@ -285,7 +285,7 @@ def test_a_convex_body_is_open_where_no_other_is_in_the_way() -> None:
     """The faces of two boxes beside one another that look at the wall; not all of those that look at each other."""
     box = {"type": "box", "size": [0.3, 0.4, 0.8], "bsdf": ROUGH}
     stage = stage_of(box | {"center": [-0.4, 0, 0.6]}, box | {"center": [0.4, 0, 0.6]}, scan="confocal")
-    lit = lit_patches(stage)
+    lit = shadow_ray_targets(stage)
     faces_wall = lit.normals[:, 2] < -0.9
     inner = lit.normals[:, 0] * lit.positions[:, 0] < -0.1
     assert is_open(lit)[faces_wall].all()
@@ -298,7 +298,7 @@ def test_a_sphere_counts_by_its_box() -> None:
     """A plate before a sphere is open; behind a box that reaches over its plane it is not, and nor is the sphere."""
     for z, expected in ((1.2, True), (0.75, False)):
         stage = stage_of(FRONT | {"width": 0.3}, {"type": "sphere", "center": [0.0, 0, z], "radius": 0.2})
-        lit = lit_patches(stage)
+        lit = shadow_ray_targets(stage)
         in_plane = np.abs(lit.positions[:, 2] * stage.engine.built.unit - 0.8) < 5e-6  # rays end at an offset
         plate = in_plane & (lit.normals[:, 2] < -0.999)
         assert plate.any()
@@ -308,24 +308,24 @@ def test_a_sphere_counts_by_its_box() -> None:
 @pytest.mark.usefixtures("eager")
 def test_a_screen_leaves_the_tiles_beside_its_shadow_open() -> None:
     """A screen over the left half of the way hides the point from the left tiles of the wall only."""
-    from nlosrender.engine.virtual_lights.visibility.masks import OF_COLUMN, TILES, Outlook
+    from nlosrender.engine.virtual_lights.visibility.masks import OF_COLUMN, TILES, WallTiles
 
     # from (0, 0, 1) the screen at half the height, from x = -0.3 to -0.02, hides x from -0.6 to -0.04
     screen = np.array([[[-0.3, -0.5, 0.5], [-0.02, -0.5, 0.5], [-0.02, 0.5, 0.5]]])
     screen = np.concatenate([screen, [[[-0.3, -0.5, 0.5], [-0.02, 0.5, 0.5], [-0.3, 0.5, 0.5]]]])
     down = np.array([[0.0, 0, -1]])
-    outlook = Outlook.around([np.array([[-0.5, -0.4, 0], [0.5, 0.4, 0]])], MANY)
+    outlook = WallTiles.around([np.array([[-0.5, -0.4, 0], [0.5, 0.4, 0]])], MANY)
     beside = sum(OF_COLUMN << column for column in range(TILES // 2, TILES))
     assert cleared(screen, np.array([[0.0, 0, 1]]), down, down, outlook)[0] == beside
 
 
 def test_before_a_curved_wall_and_to_few_points_nothing_is_known() -> None:
     """All rays are traced, all the way."""
-    from nlosrender.engine.virtual_lights.visibility.masks import LEAST_POINTS, OF_ALL, Outlook
+    from nlosrender.engine.virtual_lights.visibility.masks import LEAST_POINTS, OF_ALL, WallTiles
 
     point, down = np.array([[0.0, 0, 0.5]]), np.array([[0.0, 0, -1]])
     far = flat(0.9)
-    many, few = (Outlook.around([RECTANGLE], count) for count in (LEAST_POINTS, LEAST_POINTS - 1))
+    many, few = (WallTiles.around([RECTANGLE], count) for count in (LEAST_POINTS, LEAST_POINTS - 1))
     assert cleared(far, point, down, down, many)[0] == OF_ALL
     assert not cleared(far, point, down, down, many, planar=False).any()
     assert not cleared(far, point, down, down, few).any()
@@ -333,7 +333,7 @@ def test_before_a_curved_wall_and_to_few_points_nothing_is_known() -> None:
 
 def test_nothing_is_known_of_points_behind_the_wall_or_in_it() -> None:
     """Rays find the wall itself there."""
-    from nlosrender.engine.virtual_lights.visibility.masks import Outlook
+    from nlosrender.engine.virtual_lights.visibility.masks import WallTiles
 
     points, down = np.array([[0.0, 0, -0.1], [0, 0, 0]]), np.array([[0.0, 0, -1], [0, 0, -1]])
-    assert not cleared(flat(0.9), points, down, down, Outlook.around([RECTANGLE], MANY)).any()
+    assert not cleared(flat(0.9), points, down, down, WallTiles.around([RECTANGLE], MANY)).any()

@@ -72,7 +72,7 @@ def sheet(folder: Path, n: int, height: float, waves: float, **place: Any) -> It
     return {"type": "mesh", "filename": "sheet.ply", "face_normals": True, "bsdf": DIFFUSE} | place
 
 
-def both(stage: Stage, monkeypatch: pytest.MonkeyPatch, coarseness: float) -> list[NDArray[np.float64]]:
+def both(stage: Stage, monkeypatch: pytest.MonkeyPatch, patch_scale: float) -> list[NDArray[np.float64]]:
     """Return the third bounce with clearances, and with rays all the way to every patch."""
     from nlosrender.engine.virtual_lights.visibility import masks as clearance
 
@@ -80,16 +80,16 @@ def both(stage: Stage, monkeypatch: pytest.MonkeyPatch, coarseness: float) -> li
     for least in (0, NEVER):
         monkeypatch.setattr(clearance, "LEAST_POINTS", least)
         third.forget()
-        results.append(third.gather(stage.batch, coarseness).values)
-        known = third.lit_patches(stage.batch, coarseness).clearance
+        results.append(third.gather(stage.batch, patch_scale).values)
+        known = third.shadow_ray_targets(stage.batch, patch_scale).mask
         assert known.any() == (least == 0)
     return results
 
 
-def assert_same(stage: Stage, monkeypatch: pytest.MonkeyPatch, coarseness: float = 0.6) -> None:
+def assert_same(stage: Stage, monkeypatch: pytest.MonkeyPatch, patch_scale: float = 0.6) -> None:
     """Check that clearances change nothing."""
     assert stage.engine.settings.needs_visibility
-    cleared, full = both(stage, monkeypatch, coarseness)
+    cleared, full = both(stage, monkeypatch, patch_scale)
     assert full.sum() > 0
     assert relative_l2(cleared - full, full) <= SAME
 
@@ -162,7 +162,7 @@ def test_nor_of_clusters(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, scan: 
     mesh = sheet(tmp_path, 120, 0.05, 60.0, translate=[0, 0.2, 0.48], rotate_deg=[angle, 0, 0])
     stage = stage_of(mesh, scan=scan, folder=tmp_path, sensors=(19, 17))
     assert stage.engine.tessellator.patches(1.0).is_cluster.mean() > 0.5
-    assert_same(stage, monkeypatch, coarseness=1.0)
+    assert_same(stage, monkeypatch, patch_scale=1.0)
 
 
 @pytest.mark.parametrize("scan", ["single", pytest.param("confocal", marks=pytest.mark.slow)])
@@ -174,7 +174,7 @@ def test_nor_of_regions(monkeypatch: pytest.MonkeyPatch, scan: str) -> None:
     monkeypatch.setattr(regions, "POINTS_PER_PATCH", 1)
     stage = stage_of(ROOM, TOUCHING, scan=scan, sensors=(26, 22))
     assert stage.engine.tessellator.regions is not None
-    assert_same(stage, monkeypatch, coarseness=1.0)
+    assert_same(stage, monkeypatch, patch_scale=1.0)
 
 
 def test_nor_of_further_bounces(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -187,6 +187,6 @@ def test_nor_of_further_bounces(monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(clearance, "LEAST_POINTS", least)
         stage = stage_of(FRONT, BEHIND, LETTER, scan="single", max_bounces=5, split_bounces=True)
         assert stage.engine.further is not None
-        results.append(stage.engine.render(stage.batch, Budget(fineness=1.0, rounds=2)).mean[:, -2:])
+        results.append(stage.engine.render(stage.batch, Budget(patch_scale=1.0, rounds=2)).mean[:, -2:])
     assert results[1].sum() > 0
     assert relative_l2(results[0] - results[1], results[1]) <= SAME

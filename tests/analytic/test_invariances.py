@@ -67,18 +67,18 @@ def test_cutting_a_capture_into_batches_changes_no_bit(scan: str, spot: float) -
 
 
 @pytest.mark.parametrize("spot", [0.0, 0.05])
-@pytest.mark.parametrize(("max_bounces", "hidden_fraction"), [(3, 1.0), (4, 0.0), (4, 0.5), (4, 1.0)])
+@pytest.mark.parametrize(("max_bounces", "p_hidden_sampling"), [(3, 1.0), (4, 0.0), (4, 0.5), (4, 1.0)])
 def test_cutting_a_render_into_launches_changes_no_bit(
-    max_bounces: int, hidden_fraction: float, spot: float, monkeypatch: pytest.MonkeyPatch
+    max_bounces: int, p_hidden_sampling: float, spot: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The random state is carried on: how fast a machine is, and so how long its launches are, does not matter."""
     config = interreflections(max_bounces=max_bounces, capture={"laser_spot_radius": spot})
-    usual = render(config, hidden_fraction=hidden_fraction)
+    usual = render(config, p_hidden_sampling=p_hidden_sampling)
     # loaded by the render above, once the backend had been started
     sampling = sys.modules["nlosrender.engine.launch.sample_schedule"]
     monkeypatch.setattr(sampling, "FIRST_SAMPLES", 3)
     monkeypatch.setattr(sampling, "PASS_SECONDS", 1e-9)  # one sample per lane and launch
-    assert_same(usual, render(config, hidden_fraction=hidden_fraction))
+    assert_same(usual, render(config, p_hidden_sampling=p_hidden_sampling))
 
 
 def test_bounces_sum_to_the_unsplit_total() -> None:
@@ -114,7 +114,7 @@ def test_what_a_window_cuts_off_is_counted_outside() -> None:
     """
     wide = render(interreflections(bins=(0.0, 0.03125, 320)))
     assert wide.outside.sum() == 0
-    narrow = render(interreflections(bins=(40 * 0.03125, 0.03125, 25)), late_roulette=False)
+    narrow = render(interreflections(bins=(40 * 0.03125, 0.03125, 25)), has_time_gate=False)
     assert 0.1 < narrow.outside.sum() / wide.mean.sum() < 0.9
     np.testing.assert_allclose(narrow.mean.sum(axis=-1) + narrow.outside, wide.mean.sum(axis=-1), rtol=ROUNDING)
     np.testing.assert_allclose(narrow.mean, wide.mean[..., 40:65], rtol=ROUNDING)

@@ -47,14 +47,14 @@ def lighting(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     from nlosrender.engine.virtual_lights import third_bounce
 
     lit: list[int] = []
-    illuminate: Callable[..., Any] = third_bounce.illuminate
+    light_patches: Callable[..., Any] = third_bounce.light_patches
 
     def counted(*arguments: Any) -> Any:
-        illuminated = illuminate(*arguments)
-        lit.append(len(np.array(illuminated.is_lit)))
-        return illuminated
+        lit_patches = light_patches(*arguments)
+        lit.append(len(np.array(lit_patches.is_lit)))
+        return lit_patches
 
-    monkeypatch.setattr(third_bounce, "illuminate", counted)
+    monkeypatch.setattr(third_bounce, "light_patches", counted)
     return lit
 
 
@@ -63,9 +63,9 @@ def test_a_batch_after_others_says_what_it_says_alone(scan: str) -> None:
     """Bit for bit, whatever an engine has gathered before: shards of a capture are engines of their own."""
     one = gather_of(scan)
     for batch in BATCHES[scan]:
-        for coarseness in (0.8, 0.5):
-            values = one.gather(batch, coarseness).values
-            np.testing.assert_array_equal(values, gather_of(scan).gather(batch, coarseness).values)
+        for patch_scale in (0.8, 0.5):
+            values = one.gather(batch, patch_scale).values
+            np.testing.assert_array_equal(values, gather_of(scan).gather(batch, patch_scale).values)
             assert values.any()
 
 
@@ -76,8 +76,8 @@ def test_one_laser_lights_each_resolution_once(scan: str, lighting: list[int]) -
 
     third = gather_of(scan)
     for batch in (pilot_of(third.paths.capture), *BATCHES[scan]):
-        for coarseness in (0.8, 0.5):
-            third.gather(batch, coarseness)
+        for patch_scale in (0.8, 0.5):
+            third.gather(batch, patch_scale)
     assert len(lighting) == len(set(lighting)) == 2
 
 
@@ -111,7 +111,7 @@ def test_what_was_lit_for_a_few_points_is_cleared_for_many(monkeypatch: pytest.M
     third, batch = gather_of("single"), BATCHES["single"][0]
     pilot = pilot_of(third.paths.capture, 3)
     third.gather(pilot, 0.5)
-    assert not third.lit_patches(pilot, 0.5).clearance.any()
-    known = third.lit_patches(batch, 0.5).clearance
-    np.testing.assert_array_equal(known, gather_of("single").lit_patches(batch, 0.5).clearance)
+    assert not third.shadow_ray_targets(pilot, 0.5).mask.any()
+    known = third.shadow_ray_targets(batch, 0.5).mask
+    np.testing.assert_array_equal(known, gather_of("single").shadow_ray_targets(batch, 0.5).mask)
     assert known.any()

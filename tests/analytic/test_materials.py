@@ -204,8 +204,8 @@ def test_a_colour_does_not_leak_into_other_channels() -> None:
 
 
 @pytest.mark.parametrize("laser_sampling", [True, False])
-@pytest.mark.parametrize("hidden_fraction", [0.0, 0.5, 1.0])
-def test_a_mirror_shows_the_image_of_the_laser_s_spot(laser_sampling: bool, hidden_fraction: float) -> None:
+@pytest.mark.parametrize("p_hidden_sampling", [0.0, 0.5, 1.0])
+def test_a_mirror_shows_the_image_of_the_laser_s_spot(laser_sampling: bool, p_hidden_sampling: float) -> None:
     """A perfect mirror at z = h shows the spot at depth 2 h: H = (1/pi)^2 mean of cos^2 / d^2 over the spot.
 
     A point cannot be connected through a mirror; a spot is found by the ray that left the mirror.
@@ -219,7 +219,7 @@ def test_a_mirror_shows_the_image_of_the_laser_s_spot(laser_sampling: bool, hidd
         spp=524288,
     )
     config["capture"]["sensor_grid"] |= {"width": 1.2, "height": 1.0}
-    result = render(config, replicas=REPLICAS, hidden_fraction=hidden_fraction)
+    result = render(config, replicas=REPLICAS, p_hidden_sampling=p_hidden_sampling)
     sensors = grid_points(3, 2, 1.2, 1.0)
     r, angle = np.meshgrid(radius * np.sqrt(midpoints(60)), 2 * np.pi * midpoints(90))
     image = laser + np.stack([r * np.cos(angle), r * np.sin(angle), np.full_like(r, 2 * h)], axis=-1).reshape(-1, 3)
@@ -261,7 +261,7 @@ def test_glass_delays_by_its_index() -> None:
         spp=2**22,
         russian_roulette=False,
     )
-    result = render(config, replicas=64, hidden_fraction=0.0)
+    result = render(config, replicas=64, p_hidden_sampling=0.0)
     seventh = result.bounce(7)[0, 0, 0, 0]
     distance = 2 * (z - t + t / n)
     expected = 0.96**4 / np.pi**2 / distance**2

@@ -47,11 +47,11 @@ def second_moments(triangles: Array, areas: Array) -> Array:
     return np.einsum("n,nki,nkj->ij", areas / 3, edges, edges)
 
 
-@pytest.mark.parametrize("coarseness", [1.0, 0.4])
-def test_clusters_lie_where_their_members_do(tmp_path: Path, coarseness: float) -> None:
+@pytest.mark.parametrize("patch_scale", [1.0, 0.4])
+def test_clusters_lie_where_their_members_do(tmp_path: Path, patch_scale: float) -> None:
     """Area, middle and second moments of a flat sheet are those of its parallelograms, coarse or fine."""
     tessellator = tessellated(sheet(tmp_path, N_FINE, waves=0.0), folder=tmp_path)
-    cells, patches = tessellator.cells, tessellator.patches(coarseness)
+    cells, patches = tessellator.elements, tessellator.patches(patch_scale)
     assert patches.is_cluster.all()
     assert len(patches) < len(cells.sizes) / 4
     a, b, c = (patches.corners[:, k] for k in range(3))
@@ -78,7 +78,7 @@ def test_clusters_send_on_the_light_of_their_members(
     from nlosrender.engine.virtual_lights.elements.clusters import Merger
 
     tessellator = tessellated(sheet(tmp_path, N_FINE) | {"face_normals": face_normals}, folder=tmp_path)
-    cells, normals, areas = tessellator.cells, tessellator.shared.normals, tessellator.shared.areas
+    cells, normals, areas = tessellator.elements, tessellator.shared.normals, tessellator.shared.areas
     assert np.allclose(cells.shading_normals, normals, atol=1e-6) == face_normals
     to_light = np.array([0.2, -0.1, -1.0]) / np.linalg.norm([0.2, -0.1, -1.0])
     merger = Merger(cells, normals, areas, tessellator.shared.allowed, 1e9 * to_light)
@@ -91,8 +91,8 @@ def test_clusters_send_on_the_light_of_their_members(
     assert patches.areas.sum() < 0.99 * areas.sum()  # what bends away from the laser sends less
 
 
-@pytest.mark.parametrize("coarseness", [1.0, 0.4])
-def test_no_cluster_lies_between_two_sheets(tmp_path: Path, coarseness: float) -> None:
+@pytest.mark.parametrize("patch_scale", [1.0, 0.4])
+def test_no_cluster_lies_between_two_sheets(tmp_path: Path, patch_scale: float) -> None:
     """Surfaces of one mesh above one another, 0.15 m apart, are clusters of their own: nothing reflects between."""
     item = sheet(tmp_path, N_FINE, waves=0.0)
     x, y = (side.ravel() for side in np.meshgrid(np.linspace(-0.4, 0.4, N_FINE), np.linspace(-0.4, 0.4, N_FINE + 1)))
@@ -101,7 +101,7 @@ def test_no_cluster_lies_between_two_sheets(tmp_path: Path, coarseness: float) -
     both = np.concatenate([lower, lower + np.array([0, 0, 0.15])])
     write_ply(tmp_path / "sheet.ply", both, np.concatenate([faces, faces + len(lower)]))
     tessellator = tessellated(item, folder=tmp_path)
-    patches = tessellator.patches(coarseness)
+    patches = tessellator.patches(patch_scale)
     assert patches.is_cluster.all()
     x, y, z = (patches.centres * tessellator.built.unit - item["translate"]).T
     heights = z - 0.2 * x + 0.3 * y
@@ -115,15 +115,15 @@ def test_what_a_cluster_is_made_of_does_not_matter(tmp_path: Path) -> None:
     """Cells merged in two steps have the sums of cells merged in one, and a member of each cluster lies in it."""
     tessellator = tessellated(sheet(tmp_path, N_FINE), folder=tmp_path)
     generator = np.random.default_rng(0)
-    finest = tessellator.shared.merger._cells
+    finest = tessellator.shared.merger._element_moments
     coarse = finest.merged(1.0, generator)
     twice = finest.merged(0.25, generator).merged(1.0, generator)
     assert len(twice) < 1.1 * len(coarse) < 0.1 * len(finest)
     for merged in (coarse, twice):
         assert merged.places.sum(axis=0) == pytest.approx(finest.places.sum(axis=0), rel=1e-9)
         assert merged.light.sum(axis=0) == pytest.approx(finest.light.sum(axis=0), rel=1e-9, abs=1e-12)
-        apart = np.linalg.norm(finest.in_box[merged.stands, :2] - merged.in_box[:, :2], axis=1)
-        same_facing = finest.facing[merged.stands] == merged.facing
+        apart = np.linalg.norm(finest.in_box[merged.representative, :2] - merged.in_box[:, :2], axis=1)
+        same_facing = finest.facing[merged.representative] == merged.facing
         # of a box and a sliver beside it, 1.3 by 1, no point is farther from the middle than their longer diagonal
         assert same_facing.all()
         assert (apart < 1.65 * 0.8 * 2.0**merged.scales).all()
@@ -132,9 +132,9 @@ def test_what_a_cluster_is_made_of_does_not_matter(tmp_path: Path) -> None:
 def test_the_number_of_patches_follows_the_accuracy_not_the_triangles(tmp_path: Path) -> None:
     """Sheets of one shape, 15 times apart in triangles, are as many patches at the same coarseness: as counted."""
     few, many = (tessellated(sheet(tmp_path, n), folder=tmp_path) for n in (50, 195))
-    for coarseness in (1.0, 0.7, 0.5):
-        assert len(many.patches(coarseness)) == pytest.approx(len(few.patches(coarseness)), rel=0.1)
-        assert many.count(coarseness) == pytest.approx(len(many.patches(coarseness)), rel=0.5)
+    for patch_scale in (1.0, 0.7, 0.5):
+        assert len(many.patches(patch_scale)) == pytest.approx(len(few.patches(patch_scale)), rel=0.1)
+        assert many.count(patch_scale) == pytest.approx(len(many.patches(patch_scale)), rel=0.5)
 
 
 def rendered(
@@ -145,13 +145,15 @@ def rendered(
 
     stage = Stage.of(config, folder)
     engine = stage.engine
-    budget = engine.settle(Budget(target_error=target))
+    budget = engine.calibrate(Budget(target_error=target))
     result = engine.render(stage.batch, budget)
     stated = float(np.sqrt(result.variance.sum() / (result.mean**2).sum()))
-    used = len(engine.tessellator.patches(budget.fineness))
-    engine.tessellator._kept.cache_clear()
+    used = len(engine.tessellator.patches(budget.patch_scale))
+    engine.tessellator._saved.cache_clear()
     monkeypatch.setattr("nlosrender.engine.virtual_lights.elements.size_field.MERGED", 0.0)
-    truth = engine.third.gather(stage.batch, min(budget.fineness, 1.0) / 2).values[0, 0, ..., :-1] * engine.paths.scale
+    truth = (
+        engine.third.gather(stage.batch, min(budget.patch_scale, 1.0) / 2).values[0, 0, ..., :-1] * engine.paths.scale
+    )
     return result.mean[0, stage.bounces.slot(3)], stated, truth, used
 
 

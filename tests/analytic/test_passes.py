@@ -16,7 +16,7 @@ from nlosrender import pipeline
 from nlosrender.capture.plan import Batch, WorkItem
 from nlosrender.capture.tile import Tile
 from nlosrender.engine.backend.start import start_backend
-from nlosrender.engine.launch.passes import Kept, Passes, Snapshot
+from nlosrender.engine.launch.passes import Passes, SavedStages, Snapshot
 from nlosrender.files.unit_state import read_state, write_state
 from nlosrender.rendering.units import render_unit
 
@@ -51,10 +51,10 @@ class StoppedError(Exception):
     """The render was ended between two passes."""
 
 
-def stopping(path: Path, tag: str) -> Callable[[Callable[[], Kept]], None]:
+def stopping(path: Path, tag: str) -> Callable[[Callable[[], SavedStages]], None]:
     """Return what keeps the state and ends the render after the next pass."""
 
-    def look(take: Callable[[], Kept]) -> None:
+    def look(take: Callable[[], SavedStages]) -> None:
         write_state(path, tag, take())
         raise StoppedError
 
@@ -69,7 +69,7 @@ def prepared(scene: dict[str, Any]) -> Callable[[Passes], Any]:
 
     def render(passes: Passes) -> Any:
         plan, engine, _ = pipeline.set_up_engine(config, backend)
-        budget = pipeline.settled_budget(config, engine)
+        budget = pipeline.calibrated_budget(config, engine)
         assert isinstance(budget, Budget)
         (unit,) = plan.work_items
         if scene is SCENES["two batches"]:
@@ -103,8 +103,8 @@ def test_going_on_from_any_pass_changes_no_bit(name: str, tmp_path: Path) -> Non
     whole = render(Passes())
     for _ in range(STOPS):
         with pytest.raises(StoppedError):
-            render(Passes(look=stopping(path, name), kept=read_state(path, name)))
-    result = render(Passes(kept=read_state(path, name)))
+            render(Passes(look=stopping(path, name), saved=read_state(path, name)))
+    result = render(Passes(saved=read_state(path, name)))
     assert whole.samples == result.samples
     for values in ("mean", "variance", "outside"):
         np.testing.assert_array_equal(getattr(result, values), getattr(whole, values))

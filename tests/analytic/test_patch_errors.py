@@ -61,8 +61,8 @@ def test_every_round_shape_is_refined() -> None:
     rods = [{"type": "cylinder", "center": [0, 0.5, 1], "axis": [1, 0, 0], "radius": 0.01, "height": 0.8}]
     built, capture, *_ = start(flat_wall(*balls, *rods))
     tessellator = Tessellator(built, capture, 0.02 / built.unit)
-    for coarseness in (1.0, 0.5):
-        counts, finer = tessellator.counts(coarseness), tessellator.counts(coarseness / 2)
+    for patch_scale in (1.0, 0.5):
+        counts, finer = tessellator.counts(patch_scale), tessellator.counts(patch_scale / 2)
         assert len(counts) == 5
         assert all(more > 2 * count for count, more in zip(counts, finer, strict=True) if count)
 

@@ -172,7 +172,7 @@ def test_a_plate_close_to_the_wall_is_that_of_quadrature() -> None:
     """1 cm from a 2 m wall: rays that start 1e-5 above the surface must not change the cosines of grazing paths."""
     near = {"width": 0.5, "height": 0.5, "center": [0.0, 0.0, 0.01], "normal": [0.0, 0.0, -1.0]}
     config = flat_wall({"type": "rectangle", **near}, sensors=(3, 2), bins=(0.0, 10.0, 1), spp=2**20)
-    result = render(config, replicas=REPLICAS, hidden_fraction=1.0)
+    result = render(config, replicas=REPLICAS, p_hidden_sampling=1.0)
     cells = rectangle_cells(0.5, 0.5, near["center"], near["normal"], n=1000)  # 0.5 mm: (0.05)^2 / 24 of the integrand
     reference = third_bounces(Setup(cells, np.array([0.0, 10.0])), LASER, grid_points(3, 2, 2.0, 1.6))
     assert_agrees(result.total, result.total_variance, reference, replicas=REPLICAS, floor=1e-4)

@@ -86,11 +86,11 @@ def test_every_region_covers_every_surface_once() -> None:
     engine = engine_of(ROOM)
     area = (2 * 2.0 * 1.2 + 2 * 1.6 * 1.2 + 2.0 * 1.6) / engine.built.unit**2
     count = len(engine.tessellator.regions.near)
-    for coarseness in (1.0, 0.4):
-        shared = engine.tessellator.patches(coarseness)
+    for patch_scale in (1.0, 0.4):
+        shared = engine.tessellator.patches(patch_scale)
         found = [
             shared.areas.sum() + patches.areas.sum()
-            for _, near in engine.tessellator.regional_patches(coarseness, range(count))
+            for _, near in engine.tessellator.regional_patches(patch_scale, range(count))
             for patches in near
         ]
         assert len(found) == count > 1
@@ -107,7 +107,7 @@ def test_cells_are_no_longer_than_their_distance_from_the_region() -> None:
     laser = engine.capture.laser_grid.positions.reshape(-1, 3) / unit
     for label, near in enumerate(regions.near):
         own = np.concatenate([points[regions.labels == label], laser])
-        for cells in (near.cells, regions.shared.cells):
+        for cells in (near.elements, regions.shared.elements):
             centres = cells.corners.mean(axis=1)
             distances = np.linalg.norm(centres[:, None] - own, axis=2).min(axis=1)
             assert (cells.sizes <= np.maximum(distances, 1e-3) * (1 + 1e-6)).all()
@@ -116,16 +116,23 @@ def test_cells_are_no_longer_than_their_distance_from_the_region() -> None:
 def test_cells_that_are_small_enough_are_quartered_by_nobody() -> None:
     """Parted first and quartered then, cells are those quartered at once: as many, of the same sizes and distances."""
     engine = engine_of(ROOM, PLATE)
-    from nlosrender.engine.virtual_lights.elements.subdivision import Cells, parted, quartered, triangles_of_mesh
+    from nlosrender.engine.virtual_lights.elements.subdivision import (
+        Elements,
+        elements_of_mesh,
+        partition_by_size,
+        subdivide,
+    )
 
     distance, shapes = engine.tessellator.distance, engine.built.hidden_shapes
-    once = quartered(Cells.joined([triangles_of_mesh(engine.built, 1, shape) for shape in shapes]), distance, None, 0.3)
-    small, large = parted(once, distance, None)
+    once = subdivide(
+        Elements.joined([elements_of_mesh(engine.built, 1, shape) for shape in shapes]), distance, None, 0.3
+    )
+    small, large = partition_by_size(once, distance, None)
     assert len(small.sizes) > 0 < len(large.sizes)
     assert (small.sizes <= small.distances).all()
     for least in (0.0, 0.2):
-        whole_cells = quartered(once, distance, None, least)
-        joined = Cells.joined([small, quartered(large, distance, None, least)])
+        whole_cells = subdivide(once, distance, None, least)
+        joined = Elements.joined([small, subdivide(large, distance, None, least)])
         for found, expected in ((joined.sizes, whole_cells.sizes), (joined.distances, whole_cells.distances)):
             np.testing.assert_array_equal(np.sort(found), np.sort(expected))
 

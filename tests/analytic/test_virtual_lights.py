@@ -226,18 +226,18 @@ def test_rays_are_left_out_exactly_where_nothing_can_hide(hidden: list[dict], fr
     assert nothing_occludes(built) == free
 
 
-@pytest.mark.parametrize("coarseness", [1.0, 0.3])
-def test_patches_cover_every_surface_once(coarseness: float) -> None:
+@pytest.mark.parametrize("patch_scale", [1.0, 0.3])
+def test_patches_cover_every_surface_once(patch_scale: float) -> None:
     """However fine, the areas of the patches add up to those of the surfaces, and their sizes stay below the limit."""
     from nlosrender.engine.virtual_lights.elements.tessellator import Tessellator
 
     built, capture, *_ = start(flat_wall(PLATE, BALL))
     tessellator = Tessellator(built, capture, 0.02 / built.unit)
-    patches = tessellator.patches(coarseness)
+    patches = tessellator.patches(patch_scale)
     assert patches.areas.sum() * built.unit**2 == pytest.approx(0.8 * 0.6 + 4 * np.pi * 0.3**2, rel=1e-6)
-    assert len(patches) == tessellator.count(coarseness)
+    assert len(patches) == tessellator.count(patch_scale)
     edges = np.linalg.norm(patches.corners - np.roll(patches.corners, 1, axis=1), axis=-1).max(axis=1)
-    assert (edges <= 1.1 * coarseness * patches.centres[:, 2]).all()  # 1.1: a sphere's parts are not all alike
+    assert (edges <= 1.1 * patch_scale * patches.centres[:, 2]).all()  # 1.1: a sphere's parts are not all alike
     on_ball = patches.primitives == 0
     assert np.linalg.norm(patches.normals, axis=1) == pytest.approx(1.0)
     assert on_ball.any()
@@ -256,7 +256,7 @@ def spread_shares(delays: tuple[float, ...], is_cluster: bool | None, n_bins: in
 
     from nlosrender.engine.launch.histogram import HistogramShape
     from nlosrender.engine.virtual_lights.gather.block_histogram import BlockHistogram
-    from nlosrender.engine.virtual_lights.gather.delay_distribution import Delays, spread_patch
+    from nlosrender.engine.virtual_lights.gather.delay_distribution import Delays, deposit_patch
 
     histogram = BlockHistogram(HistogramShape(1, 1, 1, 1, 1, n_bins), np.zeros(1, np.int64))
     # opaque: one kernel per window serves all
@@ -266,7 +266,7 @@ def spread_shares(delays: tuple[float, ...], is_cluster: bool | None, n_bins: in
     else:
         covered = Delays.of_either(dr.opaque(mi.Bool, is_cluster), mi.Vector4f(*corners))
     zero = mi.UInt32(0)
-    spread_patch(histogram, zero, zero, covered, dr.opaque(mi.Int32, whole), mi.Spectrum(2.0), mi.Bool(True))
+    deposit_patch(histogram, zero, zero, covered, dr.opaque(mi.Int32, whole), mi.Spectrum(2.0), mi.Bool(True))
     return histogram.on_host().ravel()
 
 

@@ -28,7 +28,7 @@ def compare(
 
     stage: Stage = TRAPS[name].stage(folder)
     assert stage.engine.name == "virtual_lights"
-    budget = stage.engine.settle(Budget(target_error=target))
+    budget = stage.engine.calibrate(Budget(target_error=target))
     budget = replace(budget, rounds=rounds if budget.rounds else None, spp=spp if budget.spp else None)
     lights = stage.repeated(budget, seeds)
     reference = TRAPS[name].stage(folder, "path", spp=spp, target_error=None)
@@ -99,7 +99,7 @@ def test_a_part_of_the_lasers_and_sensors_has_the_bits_of_the_whole(max_bounces:
 
     engine, batch = stage.engine, stage.batch
     part = replace(batch, sensors=replace(batch.sensors, x0=1), lasers=replace(batch.lasers, y0=1, x0=1))
-    budget = engine.settle(Budget(target_error=0.3))
+    budget = engine.calibrate(Budget(target_error=0.3))
     whole, small = (stage.seeded(0).render(tile, budget) for tile in (batch, part))
     lasers, sensors = part.lasers.flat_indices(2), part.sensors.flat_indices(3)
     assert (len(lasers), len(sensors)) == (2, 4)

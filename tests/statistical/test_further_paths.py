@@ -53,8 +53,8 @@ def assert_same_light(one: Rendering, other: Rendering) -> None:
 
 
 @pytest.mark.parametrize("scan", ["single", "confocal", "exhaustive"])
-@pytest.mark.parametrize("hidden_fraction", [0.0, 0.5, 1.0])
-def test_few_paths_carry_the_light_of_all(scan: str, hidden_fraction: float) -> None:
+@pytest.mark.parametrize("p_hidden_sampling", [0.0, 0.5, 1.0])
+def test_few_paths_carry_the_light_of_all(scan: str, p_hidden_sampling: float) -> None:
     """Bounce by bounce, H has the same expectation whether one path of seven goes on or every one.
 
     Forgetting their weight, or to take turns, would change the further bounces sevenfold.
@@ -63,8 +63,8 @@ def test_few_paths_carry_the_light_of_all(scan: str, hidden_fraction: float) -> 
         render(
             scene(scan=scan, lasers=(1, 2), seed=every),
             replicas=REPLICAS,
-            hidden_fraction=hidden_fraction,
-            further_every=every,
+            p_hidden_sampling=p_hidden_sampling,
+            continuation_period=every,
         )
         for every in (7, 1)
     )
@@ -76,7 +76,7 @@ def test_a_number_of_samples_that_is_no_multiple_is_not_biased() -> None:
     config = scene(sensors=(24, 20), bins=(0.3, 4.0, 1))
     sums = {}
     for every, seeds in ((5, range(1, 9)), (1, range(101, 109))):
-        plan, engine = path_engine(config, replicas=REPLICAS, hidden_fraction=1.0, further_every=every)
+        plan, engine = path_engine(config, replicas=REPLICAS, p_hidden_sampling=1.0, continuation_period=every)
         from nlosrender.engine.path.engine import Budget
 
         sums[every] = []
@@ -100,21 +100,21 @@ def test_paths_that_begin_directly_agree_with_traced_ones(
 
     box = {"type": "box", "center": [0.1, 0.1, 0.5], "size": [0.3, 0.2, 0.2], "rotate_deg": [10, 20, 30], "bsdf": GREY}
     config = scene(*HIDDEN, box, max_bounces=max_bounces, split_bounces=False)
-    direct = render(config, replicas=REPLICAS, hidden_fraction=1.0, further_every=3)
+    direct = render(config, replicas=REPLICAS, p_hidden_sampling=1.0, continuation_period=3)
     monkeypatch.setattr(path_integrator, "are_direct", lambda settings, sampler: False)
-    traced = render(config, ["render.seed=1"], replicas=REPLICAS, hidden_fraction=1.0, further_every=1)
+    traced = render(config, ["render.seed=1"], replicas=REPLICAS, p_hidden_sampling=1.0, continuation_period=1)
     assert_agrees(
         direct.total, direct.total_variance, traced.total, replicas=REPLICAS, reference_variance=traced.total_variance
     )
 
 
-@pytest.mark.parametrize("hidden_fraction", [0.0, 1.0])
-def test_launches_and_batches_do_not_show(hidden_fraction: float, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("p_hidden_sampling", [0.0, 1.0])
+def test_launches_and_batches_do_not_show(p_hidden_sampling: float, monkeypatch: pytest.MonkeyPatch) -> None:
     """The same bits in a few launches and in many, in one batch and in several."""
     from nlosrender.engine.launch import sample_schedule as sampling
 
     config = scene(sensors=(5, 7), spp=200)
-    options: dict = {"hidden_fraction": hidden_fraction, "further_every": 3}
+    options: dict = {"p_hidden_sampling": p_hidden_sampling, "continuation_period": 3}
     whole = render(config, **options)
     parts = render(config, batch_bytes=40_000, **options)
     assert len(parts.plan.batches) > 1
@@ -132,19 +132,19 @@ def test_all_turns_are_equally_likely_and_taken_together() -> None:
     import mitsuba as mi
     from scipy import stats
 
-    from nlosrender.engine.path.roulette import TURN_TILE, first_turns
+    from nlosrender.engine.path.roulette import PHASE_TILE, first_phases
 
     nx, ny, replicas, every = 50, 42, 3, 5
     points = np.arange(nx * ny, dtype=np.uint32)
-    turns = np.array(first_turns(7, points, nx, replicas * nx * ny, mi.UInt32(every))).reshape(replicas, ny, nx)
-    first = turns[:, ::TURN_TILE, ::TURN_TILE]
-    spread = first.repeat(TURN_TILE, axis=1).repeat(TURN_TILE, axis=2)[:, :ny, :nx]
+    turns = np.array(first_phases(7, points, nx, replicas * nx * ny, mi.UInt32(every))).reshape(replicas, ny, nx)
+    first = turns[:, ::PHASE_TILE, ::PHASE_TILE]
+    spread = first.repeat(PHASE_TILE, axis=1).repeat(PHASE_TILE, axis=2)[:, :ny, :nx]
     np.testing.assert_array_equal(turns, spread)
     assert stats.chisquare(np.bincount(first.ravel(), minlength=every)).pvalue > 1e-3
     assert (first[0] != first[1]).mean() > 0.5
-    again = np.array(first_turns(7, points[nx : 3 * nx], nx, 2 * nx, mi.UInt32(every))).reshape(2, nx)
+    again = np.array(first_phases(7, points[nx : 3 * nx], nx, 2 * nx, mi.UInt32(every))).reshape(2, nx)
     np.testing.assert_array_equal(again, turns[0, 1:3])  # whatever batch the points are in
-    other = np.array(first_turns(8, points, nx, nx * ny, mi.UInt32(every))).reshape(ny, nx)
+    other = np.array(first_phases(8, points, nx, nx * ny, mi.UInt32(every))).reshape(ny, nx)
     assert (other != turns[0]).mean() > 0.5
 
 
@@ -154,11 +154,11 @@ def test_all_turns_are_equally_likely_and_taken_together() -> None:
 )
 def test_time_and_variance_are_balanced(third: float, further: float, expected: int) -> None:
     """The share has the least product of variance A + n B and time 1 + 2 / n: n = sqrt(2 A / B), from 1 to 8."""
-    from nlosrender.engine.path.roulette import LoopCost, best_every
+    from nlosrender.engine.path.roulette import LoopCost, best_continuation_period
 
     cost = LoopCost(2.0, 8, 3)
-    assert best_every(lambda n: third + n * further, cost, split=False) == expected
-    assert best_every(lambda n: third + n * further, cost, split=True) == min(expected, 3)
+    assert best_continuation_period(lambda n: third + n * further, cost, split=False) == expected
+    assert best_continuation_period(lambda n: third + n * further, cost, split=True) == min(expected, 3)
     candidates = [(third + n * further) * (1 + 2.0 / n) for n in range(1, 9)]
     if further > 0:
         assert candidates[expected - 1] <= min(candidates) * (1 + 1e-12)
@@ -171,24 +171,24 @@ def test_what_cannot_matter_is_not_thinned(max_bounces: int | None) -> None:
 
     many, few = Budget(spp=2**22), Budget(spp=64)
     _, engine = path_engine(scene(max_bounces=max_bounces, split_bounces=False))
-    assert (engine._further_every(many) > 1) == (max_bounces is None)
-    assert engine._further_every(few) == 1
+    assert (engine._continuation_period(many) > 1) == (max_bounces is None)
+    assert engine._continuation_period(few) == 1
     _, without = path_engine(scene(max_bounces=max_bounces, russian_roulette=False, split_bounces=False))
-    assert without._further_every(many) == 1
+    assert without._continuation_period(many) == 1
     _, split = path_engine(scene(max_bounces=max_bounces, hidden_geometry_sampling=False, split_bounces=True))
-    assert split._further_every(many) == 1
+    assert split._continuation_period(many) == 1
 
 
-@pytest.mark.parametrize("hidden_fraction", [0.0, 1.0])
-def test_any_frame_serves_where_only_normals_matter(hidden_fraction: float) -> None:
+@pytest.mark.parametrize("p_hidden_sampling", [0.0, 1.0])
+def test_any_frame_serves_where_only_normals_matter(p_hidden_sampling: float) -> None:
     """Grey diffuse surfaces look the same from frames of their textures and from any others around the normal."""
     from nlosrender.engine.path.engine import Budget
     from nlosrender.engine.path.full_loop import load_path_integrator
 
-    plan, engine = path_engine(scene(), replicas=REPLICAS, hidden_fraction=hidden_fraction)
-    assert engine.settings.only_normals_matter
+    plan, engine = path_engine(scene(), replicas=REPLICAS, p_hidden_sampling=p_hidden_sampling)
+    assert engine.settings.is_plain_diffuse
     quick = engine.render(plan.batches[0], Budget(spp=65536))
-    engine.integrator = load_path_integrator(replace(engine.settings, only_normals_matter=False))
+    engine.integrator = load_path_integrator(replace(engine.settings, is_plain_diffuse=False))
     full = engine.render(plan.batches[0], Budget(spp=65536))
     mean, variance = (getattr(quick, name)[0].sum(axis=0) for name in ("mean", "variance"))
     reference, noise = (getattr(full, name)[0].sum(axis=0) for name in ("mean", "variance"))
@@ -208,7 +208,7 @@ def test_textures_and_grooves_need_their_frames(bsdf: dict, plain: bool) -> None
     """Only diffuse surfaces of one reflectance go without; nor does the wall make an exception."""
     item = {**PLATE, "bsdf": bsdf}
     for config in (scene(item), scene({**PLATE, "bsdf": GREY}, wall={"bsdf": bsdf})):
-        assert path_engine(config)[1].settings.only_normals_matter == plain
+        assert path_engine(config)[1].settings.is_plain_diffuse == plain
 
 
 def test_smooth_meshes_need_the_normals_of_their_vertices(tmp_path) -> None:
@@ -217,4 +217,4 @@ def test_smooth_meshes_need_the_normals_of_their_vertices(tmp_path) -> None:
     (tmp_path / "one.obj").write_text(vertices + "vn 0 0.1 -1\nvn 0.1 0 -1\nvn 0 0 -1\nf 1//1 2//2 3//3\n")
     for face_normals in (True, False):
         item = {"type": "mesh", "filename": str(tmp_path / "one.obj"), "face_normals": face_normals, "bsdf": GREY}
-        assert path_engine(scene(item))[1].settings.only_normals_matter == face_normals
+        assert path_engine(scene(item))[1].settings.is_plain_diffuse == face_normals

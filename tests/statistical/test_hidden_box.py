@@ -61,8 +61,8 @@ def test_no_bit_changes(name: str, scan: str, max_bounces: int | None) -> None:
     """Whatever the surfaces, the scan and the bounces: a path that misses everything carries nothing."""
     stage = stage_of(*SCENES[name], scan=scan, max_bounces=max_bounces)
     engine, traced = stage.engine, stage.seeded(stage.engine.options.seed)
-    assert engine.hidden_box is not None
-    traced.hidden_box = None
+    assert engine.hidden_aabb is not None
+    traced.hidden_aabb = None
     one, other = (rendered(each, stage.batch) for each in (engine, traced))
     np.testing.assert_array_equal(one, other)
     assert one.any()
@@ -72,7 +72,7 @@ def test_nor_how_many_paths_are_asked_for() -> None:
     """A lane whose paths all miss ends like any other, and the number of paths is the one asked for."""
     stage = stage_of(PLATE | {"width": 0.02, "height": 0.02})
     engine, traced = stage.engine, stage.seeded(stage.engine.options.seed)
-    traced.hidden_box = None
+    traced.hidden_aabb = None
     for spp in (2, 6, 20, 2000):
         one, other = (rendered(each, stage.batch, spp) for each in (engine, traced))
         np.testing.assert_array_equal(one, other)
@@ -85,7 +85,7 @@ def test_nothing_lies_outside_the_box() -> None:
     import drjit as dr
     import mitsuba as mi
 
-    built, box, random = stage.engine.built, stage.engine.hidden_box, np.random.default_rng(5)
+    built, box, random = stage.engine.built, stage.engine.hidden_aabb, np.random.default_rng(5)
     n = 200_000
     origins = np.stack([*random.uniform(-0.5, 0.5, (2, n)), np.full(n, 1e-9)]).astype(np.float32)
     directions = random.normal(size=(3, n)).astype(np.float32)
@@ -102,9 +102,9 @@ def test_rays_along_the_sides_count_as_meeting_it() -> None:
     start_backend("llvm")
     import mitsuba as mi
 
-    from nlosrender.engine.path.hidden_aabb import HiddenBox
+    from nlosrender.engine.path.hidden_aabb import HiddenAabb
 
-    box = HiddenBox.of(np.array([-0.5, -0.5, 0.5]), np.array([0.5, 0.5, 1.0]))
+    box = HiddenAabb.of(np.array([-0.5, -0.5, 0.5]), np.array([0.5, 0.5, 1.0]))
     x = np.array([0.0, 0.5, -0.5, 0.6, -0.6], np.float32)
     ray = mi.Ray3f(mi.Point3f(x, 0, 0), mi.Vector3f(0, 0, 1))
     np.testing.assert_array_equal(np.array(box.is_missed(ray)), [False, False, False, True, True])
@@ -122,7 +122,7 @@ def test_rays_along_the_sides_count_as_meeting_it() -> None:
 def test_no_box_where_it_saves_nothing(stage: Any) -> None:
     """Asking takes time: few rays miss it, or none that is traced."""
     start_backend("llvm")
-    assert stage().engine.hidden_box is None
+    assert stage().engine.hidden_aabb is None
 
 
 def test_the_box_is_no_part_of_the_kernel() -> None:
@@ -130,13 +130,13 @@ def test_the_box_is_no_part_of_the_kernel() -> None:
     stage = stage_of(PLATE, max_bounces=3)
     import drjit as dr
 
-    from nlosrender.engine.path.hidden_aabb import HiddenBox
+    from nlosrender.engine.path.hidden_aabb import HiddenAabb
 
     hashes = []
     for size in (1.0, 2.0):
         engine = stage.seeded(1)
-        assert engine.hidden_box is not None
-        engine.hidden_box = HiddenBox.of(np.array([-size, -size, 0.1]), np.array([size, size, 1]))
+        assert engine.hidden_aabb is not None
+        engine.hidden_aabb = HiddenAabb.of(np.array([-size, -size, 0.1]), np.array([size, size, 1]))
         with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
             dr.kernel_history_clear()
             rendered(engine, stage.batch)

@@ -105,7 +105,7 @@ def judged(trap: Trap, folder: Path) -> Honesty:
     stage: Stage = trap.stage(folder)
     assert stage.engine.name == "virtual_lights"
     target = trap.settings["target_error"]
-    budget = stage.engine.settle(Budget(target_error=target))
+    budget = stage.engine.calibrate(Budget(target_error=target))
     result = stage.seeded(SEED).render(stage.batch, budget)
     truth = stage.seeded(TRUTH_SEED).render(stage.batch, better(budget))
     return compared(trap.point, target, result, truth.mean, truth.variance)
@@ -127,7 +127,7 @@ def better(budget: Any) -> Any:
     """Return a budget for the truth."""
     return replace(
         budget,
-        fineness=budget.fineness / FINER if budget.fineness else None,
+        patch_scale=budget.patch_scale / FINER if budget.patch_scale else None,
         rounds=LONGER * budget.rounds if budget.rounds else None,
         spp=LONGER * budget.spp if budget.spp else None,
     )
@@ -189,7 +189,7 @@ def test_the_path_engine_confirms_the_error(number: int, tmp_path: Path) -> None
 
     stage = trap.stage(tmp_path)
     target = trap.settings["target_error"]
-    result = stage.seeded(SEED).render(stage.batch, stage.engine.settle(Budget(target_error=target)))
+    result = stage.seeded(SEED).render(stage.batch, stage.engine.calibrate(Budget(target_error=target)))
     seeds = range(TRUTH_SEED, TRUTH_SEED + 8)
     paths = trap.stage(tmp_path, "path", spp=1, target_error=None).repeated(Budget(spp=50_000), seeds)
     assert_honest([compared(trap.point, target, result, paths.mean, paths.means.var(axis=0, ddof=1) / len(seeds))])
@@ -225,7 +225,7 @@ def test_noise_falls_as_the_square_root_of_the_rounds(scene: Callable[[], Trap],
     stage, rounds, n_seeds = scene().stage(tmp_path), np.array([1, 4, 16, 64]), 8
     errors = []
     for n in rounds:
-        repeated = stage.repeated(Budget(fineness=1.0, rounds=int(n)), range(100 * n, 100 * n + n_seeds))
+        repeated = stage.repeated(Budget(patch_scale=1.0, rounds=int(n)), range(100 * n, 100 * n + n_seeds))
         further = repeated.means[:, :, stage.bounces.slot(4) :]
         noise = further - further.mean(axis=0)
         errors.append(math.sqrt((noise**2).sum() / (n_seeds - 1) / (further.mean(axis=0) ** 2).sum()))

@@ -20,7 +20,7 @@ SEEDS, OTHER_SEEDS = range(1, 11), range(101, 111)
 SHORT, LONG = 30, 150  # bins of 0.1 m
 ROOM = room([2.0, 1.6, 1.2], 0.7)
 OPEN = (SLANTED, SIDE)  # lets light go to and fro between wall and plates: the detour over the hidden geometry counts
-BUDGETS: dict[str, Item] = {"path": {"spp": 1024}, "virtual_lights": {"rounds": 1, "fineness": 1.0}}
+BUDGETS: dict[str, Item] = {"path": {"spp": 1024}, "virtual_lights": {"rounds": 1, "patch_scale": 1.0}}
 
 
 def scene(*hidden: Item, scan: str = "single", n_bins: int = SHORT, width: float = 0.1, **keys: Any) -> Item:
@@ -96,8 +96,8 @@ def test_a_window_that_holds_everything_keeps_every_bit(
 
     config = scene(*OPEN, scan=scan, n_bins=LONG, width=width, max_bounces=max_bounces, engine=engine)
     stage = Stage.of(config)
-    patient = Stage(with_options(stage.engine, late_roulette=False), stage.batch, stage.bounces)
-    horizon = getattr(stage.engine, "paths", stage.engine).horizon
+    patient = Stage(with_options(stage.engine, has_time_gate=False), stage.batch, stage.bounces)
+    horizon = getattr(stage.engine, "paths", stage.engine).capture_gate
     assert (horizon is None) == (max_bounces is not None)
     ours, theirs = (one.repeated(Budget(**BUDGETS[engine]), range(1)) for one in (stage, patient))
     assert ours.means.any()
@@ -139,7 +139,7 @@ def test_kernels_do_not_know_where_the_window_ends() -> None:
         for start in (0.0, -1.0, 0.5):
             axis = replace(engine.time_axis, start_opl=start)
             paths = type(engine)(engine.built, engine.capture, axis, engine.options)
-            walks = type(lights.further)(paths, lights.tessellator, lights.further.clearances)
+            walks = type(lights.further)(paths, lights.tessellator, lights.further.masks)
             dr.kernel_history_clear()
             paths.render(stage.batch, Budget(spp=16))
             walks.accumulate(stage.batch, walks.histogram(stage.batch, 2), 0)
@@ -158,13 +158,13 @@ def test_a_path_is_late_when_the_straight_way_to_the_laser_ends_after_the_window
 
     engine = stage.engine
     unit = engine.built.unit
-    deadline = engine.transport(stage.batch, engine.shape(stage.batch, 1)).deadline
+    deadline = engine.launch_params(stage.batch, engine.shape(stage.batch, 1)).time_gate
     # the laser is at (0.3, -0.2, 0); 3 m end in the window
     away = mi.Point3f(0.3, -0.2, 0.8) / unit
     beside = mi.Point3f(-0.5, -0.2, 0.0) / unit
     for point, on_wall, way in ((away, False, 0.8), (beside, False, 0.8), (beside, True, 1.0)):
         for opl, late in ((3 - way - 1e-4, False), (3 - way + 1e-4, True)):
-            assert dr.all(deadline.is_late(mi.Float(opl / unit), point, mi.Bool(on_wall)) == mi.Bool(late))
+            assert dr.all(deadline.is_past(mi.Float(opl / unit), point, mi.Bool(on_wall)) == mi.Bool(late))
 
 
 @pytest.mark.parametrize("engine", ["path", "virtual_lights"])
@@ -187,7 +187,7 @@ def test_without_survivors_no_light_comes_after_the_window(engine: str, scan: st
 
     usual = outside_and_inside()
     for module in (deadline, sites, walks):
-        monkeypatch.setattr(module, "LATE_SURVIVAL", 0.0)
+        monkeypatch.setattr(module, "GATE_SURVIVAL", 0.0)
     outside, inside = outside_and_inside()
     assert usual[0] > 0.1 * usual[1] > 0
     # 1e-4: paths that end within rounding of the window's end
@@ -201,7 +201,7 @@ def test_a_deadline_counts_the_legs(scan: str) -> None:
     stage = Stage.of(scene(ROOM, scan=scan, lasers=(2, 3), capture=LEGS))
     engine = stage.engine
     capture, unit, shape = engine.capture, engine.built.unit, engine.shape(stage.batch, 1)
-    deadline = engine.transport(stage.batch, shape).deadline
+    deadline = engine.launch_params(stage.batch, shape).time_gate
     own = scan == "confocal"
     legs = capture.sensor_legs.ravel() + (capture.laser_legs.ravel() if own else capture.laser_legs.min())
     expected = np.tile(engine.time_axis.end_opl - legs, shape.replicas)
@@ -218,15 +218,15 @@ def test_one_late_path_in_eight_carries_the_light_of_all() -> None:
     import drjit as dr
     import mitsuba as mi
 
-    from nlosrender.engine.launch.time_gate import Deadline, thinned_out
+    from nlosrender.engine.launch.time_gate import TimeGate, time_gate_roulette
 
     n = 2**16
     lane = dr.arange(mi.UInt32, n)
     point = mi.Point3f(0, 0, dr.select(lane % 2 == 0, mi.Float(2.0), 0.5))
-    deadline = Deadline(dr.full(mi.Float, 1.0, n), mi.Point3f(0), mi.Point3f(0), mi.Float(0))
+    deadline = TimeGate(dr.full(mi.Float, 1.0, n), mi.Point3f(0), mi.Point3f(0), mi.Float(0))
     generator = mi.PCG32(size=n)
     before = np.array(generator.state)
-    alive, thinned, carried = thinned_out(
+    alive, thinned, carried = time_gate_roulette(
         deadline, generator, mi.Bool(True), mi.Bool(False), mi.Float(0), point, mi.Bool(False), mi.Spectrum(3.0)
     )
     even = np.arange(n) % 2 == 0
@@ -237,29 +237,29 @@ def test_one_late_path_in_eight_carries_the_light_of_all() -> None:
     np.testing.assert_array_equal(value, np.where(even, 24, 3))
     # 5 sigma of 32768 draws of 1/8
     assert abs(alive[even].mean() - 1 / 8) < 5 * np.sqrt(7 / 64 / (n / 2))
-    again, _, carried = thinned_out(
+    again, _, carried = time_gate_roulette(
         deadline, generator, mi.Bool(alive), mi.Bool(thinned), mi.Float(0), point, mi.Bool(False), carried
     )
     np.testing.assert_array_equal(np.array(again), alive)
     np.testing.assert_array_equal(np.array(carried).reshape(-1), value)
 
 
-def share_in_time(late_roulette: bool) -> float:
+def share_in_time(has_time_gate: bool) -> float:
     """Return the share of a round's impulses that could reach some sensor point within the window."""
     stage = Stage.of(scene(ROOM, engine="virtual_lights"))
     from nlosrender.engine.virtual_lights.vpls import gather as further_bounces
 
-    engine = with_options(stage.engine, late_roulette=late_roulette)
-    shares, walk_back = [], further_bounces.walk_back
+    engine = with_options(stage.engine, has_time_gate=has_time_gate)
+    shares, vpl_contributions = [], further_bounces.vpl_contributions
 
     def recorded(plan: Any, transport: Any, sites: Any, *rest: Any) -> Any:
-        impulses = walk_back(plan, transport, sites, *rest)
-        heights = sites.positions[impulses.sites][:, 2] * engine.built.unit  # over the wall, with its sensor points
+        impulses = vpl_contributions(plan, transport, sites, *rest)
+        heights = sites.positions[impulses.vpls][:, 2] * engine.built.unit  # over the wall, with its sensor points
         shares.append((np.array(impulses.delays) + heights / 0.1 < SHORT).mean())
         return impulses
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(further_bounces, "walk_back", recorded)
+        patch.setattr(further_bounces, "vpl_contributions", recorded)
         engine.further.accumulate(stage.batch, engine.further.histogram(stage.batch, 2), 0)
     return float(shares[0])
 
@@ -274,12 +274,12 @@ def test_sites_that_only_late_light_reaches_are_few() -> None:
     """Of the far side of a deep room there are eight times fewer beside the others, and they stand for its area."""
     stage = Stage.of(scene(room([2.0, 1.6, 2.0]), engine="virtual_lights"))
     unit, ratios, areas = stage.engine.built.unit, [], []
-    for late_roulette in (False, True):
-        sampler = with_options(stage.engine, late_roulette=late_roulette).further.sampler
+    for has_time_gate in (False, True):
+        sampler = with_options(stage.engine, has_time_gate=has_time_gate).further.sampler
         sites = sampler.sample(2**15, np.random.default_rng(5))
         heights = sites.positions[:, 2] * unit
         far = heights > 1.999
-        assert stage.engine.paths.horizon.is_beyond(sites.positions[far]).all()
+        assert stage.engine.paths.capture_gate.is_beyond(sites.positions[far]).all()
         ratios.append(far.mean() / (heights < 0.5).mean())
         areas.append(sites.areas[far].sum() * unit**2)
     # 5 sigma of the fewest sites; they are stratified, which makes it less
@@ -290,7 +290,7 @@ def test_sites_that_only_late_light_reaches_are_few() -> None:
 
 def test_what_is_thinned_out_is_said() -> None:
     """The plan names it where paths or walks may end after the window, and only there."""
-    from nlosrender.engine.preflight.omitted_work import skipped_work
+    from nlosrender.engine.preflight.omitted_work import omitted_work
 
     what = "most paths on which light can only arrive after the time window"
     for keys, expected in (
@@ -302,5 +302,5 @@ def test_what_is_thinned_out_is_said() -> None:
     ):
         config = scene(*OPEN, **keys)
         engine = Stage.of(config).engine
-        named = {item.what for item in skipped_work(engine, scene_is_colored=configured(config).scene.is_colored)}
+        named = {item.what for item in omitted_work(engine, scene_is_colored=configured(config).scene.is_colored)}
         assert (what in named) == expected, keys

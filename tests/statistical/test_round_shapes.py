@@ -133,7 +133,7 @@ def test_a_shape_that_cannot_be_sampled_is_found_by_chance(hidden_geometry_sampl
             replicas=REPLICAS,
             **options,
         )
-        for seed, options in enumerate(({}, {"hidden_fraction": 0.0}))
+        for seed, options in enumerate(({}, {"p_hidden_sampling": 0.0}))
     ]
     mixed, by_chance = results
     without = render(flat_wall(SPHERE, sensors=(3, 2), bins=BINS, spp=65536))

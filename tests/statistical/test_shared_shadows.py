@@ -31,9 +31,9 @@ def test_shadows_of_one_edge_lose_no_light(scan: str, sensors: dict, lasers: dic
     settings = {"scan": scan, "engine": "virtual_lights", "spp": None, "bins": (0.0, 0.5, 10)}
     stage, free = (Stage.of(flat_wall(*hidden, **settings) | grids) for hidden in ((PLATE, SCREEN), (PLATE,)))
 
-    def energies(one: Stage, seed: int, coarseness: float) -> np.ndarray:
+    def energies(one: Stage, seed: int, patch_scale: float) -> np.ndarray:
         """Return the energy of every pair of laser and sensor point."""
-        return one.seeded(seed).third.gather(one.batch, coarseness).values.sum(axis=(0, 1, 4)).ravel()
+        return one.seeded(seed).third.gather(one.batch, patch_scale).values.sum(axis=(0, 1, 4)).ravel()
 
     floor = np.abs(energies(free, 0, COARSE) / energies(free, 0, FINE) - 1).max()
     assert floor < 0.005

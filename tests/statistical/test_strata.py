@@ -43,10 +43,10 @@ def test_every_stratum_is_visited_once(first: int, n: int) -> None:
     """Path i of a stage of n takes its first coordinate from the i-th of n equal parts, at one place in all parts."""
     import mitsuba as mi
 
-    from nlosrender.engine.launch.systematic_sequence import Strata, first_coordinate
+    from nlosrender.engine.launch.systematic_sequence import SystematicSequence, first_coordinate
 
     starts = np.array([0, 1, 2**31, 2**32 - 1], dtype=np.uint32)
-    strata = Strata.of_stage(range(first, first + n), mi.UInt32(starts))
+    strata = SystematicSequence.of_paths(range(first, first + n), mi.UInt32(starts))
     stride = int(np.array(strata.stride)[0])
     at = np.array(strata.at)
     for lane in range(len(starts)):
@@ -65,11 +65,11 @@ def test_the_place_within_the_parts_is_uniform(seed: int) -> None:
     from scipy import stats
 
     from nlosrender.engine.launch.launch_params import LaneRandomness
-    from nlosrender.engine.launch.systematic_sequence import Strata, first_coordinate
+    from nlosrender.engine.launch.systematic_sequence import SystematicSequence, first_coordinate
 
     n = 5
     lanes = mi.UInt32(np.arange(4096, dtype=np.uint32))
-    strata = Strata.of_stage(range(64, 64 + n), LaneRandomness.seeded(seed, lanes).sequence[0])
+    strata = SystematicSequence.of_paths(range(64, 64 + n), LaneRandomness.seeded(seed, lanes).sequence[0])
     within = np.array(first_coordinate(strata.at)) / 2.0**32 * n
     assert within.max() < 1 + 1e-6
     assert stats.kstest(within, "uniform").pvalue > 1e-4  # false alarm in one of 1e4

@@ -63,13 +63,13 @@ def test_every_subset_of_the_paper_s_techniques_agrees(laser: bool, hidden: bool
     )
 
 
-@pytest.mark.parametrize("hidden_fraction", [0.0, 0.3, 1.0])
+@pytest.mark.parametrize("p_hidden_sampling", [0.0, 0.3, 1.0])
 @pytest.mark.parametrize("scan", ["single", "exhaustive"])
-def test_the_mixture_does_not_change_the_result(scan: str, hidden_fraction: float) -> None:
+def test_the_mixture_does_not_change_the_result(scan: str, p_hidden_sampling: float) -> None:
     """Any share of hidden geometry sampling at wall vertices agrees with a half, bounce by bounce."""
     config = spot_scene(scan=scan, lasers=(1, 2), capture={}, split_bounces=True, bins=(0.3, 0.1, 40), spp=196608)
-    result = render(config, replicas=REPLICAS, hidden_fraction=hidden_fraction)
-    reference = render(config | {"render": config["render"] | {"seed": 5}}, replicas=REPLICAS, hidden_fraction=0.5)
+    result = render(config, replicas=REPLICAS, p_hidden_sampling=p_hidden_sampling)
+    reference = render(config | {"render": config["render"] | {"seed": 5}}, replicas=REPLICAS, p_hidden_sampling=0.5)
     # Bounces 4 and 5 found by chance are few large deposits: joined until they are many enough to be normal.
     for bounce, share in ((3, 0.05), (4, 0.2), (5, 0.2)):
         assert_agrees(
@@ -94,7 +94,7 @@ def test_a_wall_with_a_mirror_lobe_keeps_it() -> None:
         spp=131072,
     )
     chosen, mixed, by_chance = (
-        render(config | {"render": config["render"] | {"seed": seed}}, replicas=REPLICAS, hidden_fraction=fraction)
+        render(config | {"render": config["render"] | {"seed": seed}}, replicas=REPLICAS, p_hidden_sampling=fraction)
         for seed, fraction in enumerate((None, 0.5, 0.0))
     )
     for result in (chosen, mixed):
@@ -137,9 +137,9 @@ def test_hidden_geometry_before_a_curved_wall_is_found_either_way(shape: str) ->
                 },
             },
             replicas=REPLICAS,
-            hidden_fraction=hidden_fraction,
+            p_hidden_sampling=p_hidden_sampling,
         )
-        for seed, hidden_fraction in enumerate((0.5, 0.0))
+        for seed, p_hidden_sampling in enumerate((0.5, 0.0))
     )
     assert (mixed.bounce(2).sum() > 0) == (shape != "ball")
     np.testing.assert_array_equal(mixed.bounce(2), by_chance.bounce(2))

@@ -29,7 +29,7 @@ def test_no_mix_of_techniques_is_biased(sampling: bool, fraction: float | None, 
     """The energy of millions of paths is that of quadrature to 0.1 %, whatever the mixture on the wall."""
     spp = 2**23
     config = scene(bins=BINS, sensors=(3, 2), max_bounces=3, spp=spp, hidden_geometry_sampling=sampling)
-    result = render(config, **({"hidden_fraction": fraction} if fraction is not None else {}))
+    result = render(config, **({"p_hidden_sampling": fraction} if fraction is not None else {}))
     energy, expected = float(result.mean.sum()), float(truth().sum())
     noise = float(np.sqrt(result.variance.sum())) / expected
     assert 4 * noise < 2e-3, "too few paths to tell"

@@ -122,7 +122,7 @@ def render(
     batch_bytes
         Memory of a batch; small values cut the capture into many batches.
     options
-        Fields of ``PathOptions`` that no configuration has, such as ``hidden_fraction`` or ``replicas``.
+        Fields of ``RenderOptions`` that no configuration has, such as ``p_hidden_sampling`` or ``replicas``.
     """
     validated = configured(config, overrides, folder)
     backend = start_backend("llvm", colored=validated.is_colored, polarized=validated.render.polarized)

@@ -79,7 +79,7 @@ def see(
     ny, nx = engine.capture.sensor_grid.ny, engine.capture.sensor_grid.nx
     rows = batch_rows or ny
     tiles = [Tile(y, min(y + rows, ny), 0, nx) for y in range(0, ny, rows)]
-    budget = engine.settle(Budget(validated.render.spp, validated.render.target_error))
+    budget = engine.calibrate(Budget(validated.render.spp, validated.render.target_error))
     parts = [engine.render(Batch(tile, Tile(0, 1, 0, 1)), budget) for tile in tiles]
 
     def joined(name: str) -> Array:

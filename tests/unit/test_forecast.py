@@ -161,9 +161,9 @@ def skipped(*hidden, wall=None, **render) -> dict[str, str]:
     scene["scene"]["relay_wall"] = wall or scene["scene"]["relay_wall"]
     config = configured(scene)
     _, _, engine = prepared(config)
-    from nlosrender.engine.preflight.omitted_work import skipped_work  # the backend has to be started before
+    from nlosrender.engine.preflight.omitted_work import omitted_work  # the backend has to be started before
 
-    items = skipped_work(engine, scene_is_colored=config.scene.is_colored)
+    items = omitted_work(engine, scene_is_colored=config.scene.is_colored)
     return {item.what: item.why for item in items}
 
 
@@ -362,7 +362,7 @@ class _ClockworkPaths:
         self.scale = 1.0
         self.sees_light = True
 
-    def settle(self, budget, seconds):
+    def calibrate(self, budget, seconds):
         """1 / sqrt(n) = target at n = target^-2."""
         target = budget.target_error
         return budget if target is None else replace(budget, spp=round(target**-2) if self.sees_light else None)

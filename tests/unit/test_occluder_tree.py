@@ -22,9 +22,9 @@ def backend() -> None:
 
 def tree_of(triangles: Array) -> Any:
     """Return the tree of triangles (n, 3, 3)."""
-    from nlosrender.engine.virtual_lights.visibility.bvh import OccluderTree
+    from nlosrender.engine.virtual_lights.visibility.bvh import Bvh
 
-    return OccluderTree.of([mesh_of(triangles)])
+    return Bvh.of([mesh_of(triangles)])
 
 
 def soup(count: int) -> Array:

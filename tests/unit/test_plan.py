@@ -108,7 +108,7 @@ def pairs_of(unit) -> set[tuple[int, int]]:
 def test_units_are_whole_storage_tiles(scan_type, pairs, shard):
     """Each chunk of the file is filled by one unit, and a unit's batches cover it once, within the memory."""
     plan = planned(scan_type, pairs, Selection(shard=shard))
-    cells = list(plan.tiling.cells(plan.part.strips))
+    cells = list(plan.tiling.elements(plan.part.strips))
     covered = [0] * len(cells)
     for unit in plan.work_items:
         inside = [cell for cell in cells if unit.sensors.contains(cell)]

@@ -44,7 +44,7 @@ def test_a_scan_is_in_the_walls_frame(tmp_path: Path, frame: str) -> None:
     # float32 positions of 1 to 4 m in the file
     np.testing.assert_allclose(found.sensors, header.sensor_positions, atol=1e-6)
     np.testing.assert_allclose(found.lasers, header.laser_positions, atol=1e-6)
-    np.testing.assert_allclose(found.hidden_box, header.hidden_bounds, atol=1e-6)
+    np.testing.assert_allclose(found.hidden_aabb, header.hidden_bounds, atol=1e-6)
     np.testing.assert_allclose(found.wall_to_scene, POSE.matrix(), atol=1e-12)
     legs = np.linalg.norm(header.sensor_positions - header.sensor_position, axis=-1)
     np.testing.assert_allclose(found.sensor_legs, legs, atol=1e-6)

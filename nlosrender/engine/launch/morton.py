@@ -11,7 +11,7 @@ BITS = 10  # per axis: three times as many fill a number
 LEAST = 1e-30  # what a box of no size is divided by; more than nothing in float32, too
 
 
-def z_order(points: Float64) -> NDArray[np.int64]:
+def morton_order(points: Float64) -> NDArray[np.int64]:
     """Return the places (n,) of ``points`` (n, 3) along a Z-order curve through their box (Morton 1966)."""
     if not len(points):
         return np.zeros(0, np.int64)
@@ -25,6 +25,6 @@ def z_order(points: Float64) -> NDArray[np.int64]:
 
 def _spread(numbers: NDArray[np.uint32]) -> NDArray[np.uint32]:
     """Return numbers of ten bits with two empty bits after each: halves of the bits are moved apart, then theirs."""
-    for shift, kept in ((16, 0x030000FF), (8, 0x0300F00F), (4, 0x030C30C3), (2, 0x09249249)):
-        numbers = (numbers | numbers << np.uint32(shift)) & np.uint32(kept)
+    for shift, saved in ((16, 0x030000FF), (8, 0x0300F00F), (4, 0x030C30C3), (2, 0x09249249)):
+        numbers = (numbers | numbers << np.uint32(shift)) & np.uint32(saved)
     return numbers

@@ -24,23 +24,23 @@ class Snapshot:
     numbers: Mapping[str, Any] = field(default_factory=dict)
 
 
-Kept = dict[str, Snapshot]  # by stage
-Look = Callable[[Callable[[], Kept]], None]  # called between passes with what makes the state; may raise
+SavedStages = dict[str, Snapshot]  # by stage
+Look = Callable[[Callable[[], SavedStages]], None]  # called between passes with what makes the state; may raise
 
 
 def _no_progress(share: float) -> None:
     pass
 
 
-def _no_look(take: Callable[[], Kept]) -> None:
+def _no_look(take: Callable[[], SavedStages]) -> None:
     pass
 
 
 @dataclass
 class _Store:
     look: Look
-    kept: Kept  # of an earlier run: finished stages, and the one that was under way
-    finished: Kept = field(default_factory=dict)
+    saved: SavedStages  # of an earlier run: finished stages, and the one that was under way
+    finished: SavedStages = field(default_factory=dict)
 
 
 class Passes:
@@ -52,15 +52,15 @@ class Passes:
         Told the share of the work that is done, in [0, 1].
     look
         Called between passes; what it raises ends the render.
-    kept
+    saved
         The state that a call of ``look`` was given by an earlier render of the same unit; empty: there is none.
     """
 
     def __init__(
-        self, progress: Callable[[float], None] = _no_progress, look: Look = _no_look, kept: Kept | None = None
+        self, progress: Callable[[float], None] = _no_progress, look: Look = _no_look, saved: SavedStages | None = None
     ):
         self._progress, self._name = progress, ""
-        self._store = _Store(look, dict(kept or {}))
+        self._store = _Store(look, dict(saved or {}))
 
     def stage(self, name: str, begin: float = 0.0, end: float = 1.0) -> Passes:
         """Return the passes of a stage, or of a part of one, that takes the work from share ``begin`` to ``end``."""
@@ -70,8 +70,8 @@ class Passes:
 
     def resumed(self, array: str) -> Snapshot | None:
         """Return, once, what an earlier render had of this stage when it ended; None: no state with that array."""
-        kept = self._store.kept.get(self._name)
-        return self._store.kept.pop(self._name) if kept is not None and array in kept.arrays else None
+        saved = self._store.saved.get(self._name)
+        return self._store.saved.pop(self._name) if saved is not None and array in saved.arrays else None
 
     def between(self, share: float, take: Callable[[], Snapshot]) -> None:
         """Tell that ``share`` of the stage is done; ``take`` makes the state, should it be asked for.
@@ -87,9 +87,9 @@ class Passes:
     def finish(self, result: Snapshot) -> None:
         """Keep the result of a finished stage for later states, instead of those of its parts."""
         self._progress(1.0)
-        for kept in (self._store.finished, self._store.kept):
-            for name in [name for name in kept if name.startswith(f"{self._name}/")]:
-                del kept[name]
+        for saved in (self._store.finished, self._store.saved):
+            for name in [name for name in saved if name.startswith(f"{self._name}/")]:
+                del saved[name]
         self._store.finished[self._name] = result
 
 

@@ -7,7 +7,7 @@ import mitsuba as mi
 from nlosrender.scene.build import BuiltScene
 
 
-def only_normals_matter(built: BuiltScene) -> bool:
+def is_plain_diffuse(built: BuiltScene) -> bool:
     """Return whether all surfaces are flat and Mitsuba's ``diffuse`` of one reflectance."""
     shapes = (built.wall_shape, *built.hidden_shapes)
     return built.all_flat and all(_is_plain(shape) for shape in shapes)

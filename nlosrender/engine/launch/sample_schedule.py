@@ -27,7 +27,7 @@ from nlosrender.engine.launch.temporal_kernel import TemporalKernel
 FIRST_SAMPLES = 32  # per lane, before the first look at the error
 MOST_AT_FIRST = 2**23  # pairs of a path and a laser point in the first launch, whose speed is not known
 DEFAULT_TARGET = 0.01  # where neither an error nor samples are asked for
-SETTLED_SHARE = 0.9  # of the target error: the pilot's estimate has an error of its own
+CALIBRATED_SHARE = 0.9  # of the target error: the pilot's estimate has an error of its own
 PILOT_ERROR = 1.5  # times the goal: when a pilot has seen enough. Low-discrepancy numbers beat the 1 / sqrt(N) beyond
 PILOT_LANES = 512
 MOST_QUICKLY = 16.0  # times the samples: how far errors are trusted to fall faster than as 1 / sqrt(samples)
@@ -40,17 +40,17 @@ Launch = Callable[[DeviceHistogram, LaneRandomness, int], LaneRandomness]
 class Budget:
     """When to stop: after ``spp`` samples per sensor point, at ``target_error`` (relative L2 of H), after seconds.
 
-    An engine's ``settle`` turns a target error into fixed settings.
+    An engine's ``calibrate`` turns a target error into fixed settings.
     """
 
     spp: int | None = None
     target_error: float | None = None
     time_limit_s: float | None = None
-    fineness: float | None = None  # settled: coarseness of the patches of the virtual lights
+    patch_scale: float | None = None  # settled: coarseness of the patches of the virtual lights
     rounds: int | None = None  # settled: rounds of walks of the virtual lights
 
     @property
-    def is_settled(self) -> bool:
+    def is_calibrated(self) -> bool:
         """Whether no pilot is needed: samples or a time are given, or nothing is."""
         return self.target_error is None or self.spp is not None or self.time_limit_s is not None
 
@@ -76,7 +76,7 @@ def accumulate(
     scale: float = 1.0,
     slots: range | None = None,
     kernel: TemporalKernel | None = None,
-    owners: NDArray[np.uint32] | None = None,
+    row_points: NDArray[np.uint32] | None = None,
 ) -> Sampled:
     """Launch until the schedule has enough.
 
@@ -98,7 +98,7 @@ def accumulate(
         Bounce slots of the result, as for ``DeviceHistogram.statistics``.
     kernel
         As for ``DeviceHistogram``.
-    owners
+    row_points
         (sensors,) flat indices of the sensor points in the histogram's order; None: ``points``.
     """
     histogram = DeviceHistogram(shape, kernel)
@@ -135,7 +135,7 @@ def accumulate(
     dr.eval(mean, variance)
     contrasts = contrasts_of_points(
         histogram,
-        points if owners is None else owners,
+        points if row_points is None else row_points,
         scale / (done * shape.replicas),
         range(shape.slots) if slots is None else slots,
     )
@@ -158,7 +158,7 @@ class _PilotEndedError(Exception):
     """The time for a pilot is over."""
 
 
-def settled_by_pilot(
+def calibrated_by_pilot(
     budget: Budget,
     replicas: int,
     look: Callable[[Schedule, Passes], object],
@@ -184,7 +184,7 @@ def settled_by_pilot(
     least
         Samples: a pilot's lanes have ``FIRST_SAMPLES`` each at least, and fewer per lane err more than by the law.
     """
-    goal = SETTLED_SHARE * (budget.target_error or DEFAULT_TARGET)
+    goal = CALIBRATED_SHARE * (budget.target_error or DEFAULT_TARGET)
     schedule = Schedule(Budget(target_error=PILOT_ERROR * goal), replicas, known_squares)
     begun = time.perf_counter()
 

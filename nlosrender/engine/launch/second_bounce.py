@@ -6,24 +6,24 @@ import drjit as dr
 import mitsuba as mi
 
 from nlosrender.engine.launch.histogram import DeviceHistogram
-from nlosrender.engine.launch.launch_params import Transport
+from nlosrender.engine.launch.launch_params import LaunchParams
 from nlosrender.engine.path.laser_connections import connection_segment, delay_bin
 
 COINCIDENT = 1e-6  # engine units; a confocal pair has no path between its points
 
 
 @dr.syntax
-def deposit_second_bounce(transport: Transport, histogram: DeviceHistogram) -> None:
+def deposit_second_bounce(params: LaunchParams, histogram: DeviceHistogram) -> None:
     """Deposit, for every lane and each of its lasers, the light that goes from laser point to sensor point.
 
     The histogram has one slot. Values are per J of pulse and (engine unit)^2, as in ``trace_paths``.
     """
-    built, sensor = transport.built, transport.sensors.interaction
+    built, sensor = params.built, params.sensors.interaction
     context = mi.BSDFContext()
-    lane = dr.arange(mi.UInt32, dr.width(transport.sensors.delay_bins))
+    lane = dr.arange(mi.UInt32, dr.width(params.sensors.delay_bins))
     laser = mi.UInt32(0)
-    while dr.hint(laser < transport.n_lasers, exclude=[transport, histogram, built]):
-        points = transport.lasers.gather(transport.first_laser + laser)
+    while dr.hint(laser < params.n_lasers, exclude=[params, histogram, built]):
+        points = params.lasers.gather(params.first_laser + laser)
         lit = points.interaction
         to_laser = lit.p - sensor.p
         distance = dr.norm(to_laser)
@@ -36,5 +36,5 @@ def deposit_second_bounce(transport: Transport, histogram: DeviceHistogram) -> N
         active &= ~built.scene.ray_test(
             connection_segment(built, sensor, direction, lit), coherent=False, active=active
         )
-        histogram.deposit(lane, laser, mi.UInt32(0), delay_bin(transport, points, distance), value, active)
+        histogram.deposit(lane, laser, mi.UInt32(0), delay_bin(params, points, distance), value, active)
         laser += 1

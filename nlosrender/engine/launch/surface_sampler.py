@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nlosrender.engine.launch.device_arrays import on_device
-from nlosrender.engine.launch.morton import z_order
+from nlosrender.engine.launch.morton import morton_order
 from nlosrender.scene.build import WALL_ID, BuiltScene, wall_box
 from nlosrender.scene.pose import Float64
 
@@ -100,8 +100,8 @@ class SurfaceSampler:
         u = dr.minimum(
             (mi.Float(bits - low) + 0.5) / dr.maximum(mi.Float(high - low), 1.0), dr.one_minus_epsilon(mi.Float)
         )
-        owner = dr.gather(mi.UInt32, table.owner, entry, active)
-        shape = dr.gather(mi.ShapePtr, self._built.scene.shapes_dr(), owner, active)
+        row_of_lane = dr.gather(mi.UInt32, table.row_of_lane, entry, active)
+        shape = dr.gather(mi.ShapePtr, self._built.scene.shapes_dr(), row_of_lane, active)
         is_triangle = entry < self.n_triangles
         point, normal, primitive = mi.Point3f(0), mi.Normal3f(0), mi.UInt32(ANALYTIC)
         within = mi.Point2f(0)
@@ -134,13 +134,13 @@ class SurfaceSampler:
         return low
 
     def surface(
-        self, sample: SurfaceSample, direction: mi.Vector3f, active: mi.Bool, only_normals_matter: bool = False
+        self, sample: SurfaceSample, direction: mi.Vector3f, active: mi.Bool, is_plain_diffuse: bool = False
     ) -> mi.SurfaceInteraction3f:
         """Return the surface at sampled points of triangles as a ray in ``direction`` finds it; no ray is traced.
 
-        ``only_normals_matter``: its frame is any around the normal.
+        ``is_plain_diffuse``: its frame is any around the normal.
         """
-        if only_normals_matter:
+        if is_plain_diffuse:
             si = dr.zeros(mi.SurfaceInteraction3f)
             si.n = dr.normalize(sample.n)
             si.sh_frame = mi.Frame3f(si.n)
@@ -210,7 +210,7 @@ class _Table:
     edges: mi.UInt32  # entry i covers the integers [edges[i], edges[i + 1]); the last one also takes 2^32 - 1
     guide_bits: int
     guide: mi.UInt32  # entry at the start of each of 2^guide_bits equal parts of the integers (Chen & Asau 1974)
-    owner: mi.UInt32  # shape of each entry
+    row_of_lane: mi.UInt32  # shape of each entry
     primitive: mi.UInt32  # of each triangle within its shape
     corners: list[mi.Float]  # nine, of the triangles
 
@@ -218,18 +218,18 @@ class _Table:
     def of(cls, built: BuiltScene) -> _Table:
         """Return the table of a scene."""
         corners = [np.zeros((0, 3, 3))]
-        owners, primitives, analytic_areas = [np.zeros(0, np.uint32)], [np.zeros(0, np.uint32)], [np.zeros(0)]
+        row_points, primitives, analytic_areas = [np.zeros(0, np.uint32)], [np.zeros(0, np.uint32)], [np.zeros(0)]
         analytic_owners: list[int] = []
         for index, shape in enumerate(built.scene.shapes()):
             if shape.id() == WALL_ID:
                 continue
             if shape.is_mesh():
-                triangles, kept = facing_triangles(built, shape)
+                triangles, saved = facing_triangles(built, shape)
                 # neighbours in the table are neighbours in space: so are points with near first coordinates
-                order = np.argsort(z_order(triangles.mean(axis=1)), kind="stable")
+                order = np.argsort(morton_order(triangles.mean(axis=1)), kind="stable")
                 corners.append(triangles[order])
-                owners.append(np.full(len(kept), index, np.uint32))
-                primitives.append(kept[order])
+                row_points.append(np.full(len(saved), index, np.uint32))
+                primitives.append(saved[order])
             elif shape.class_name() in SAMPLEABLE_PLUGINS:
                 analytic_owners.append(index)
                 analytic_areas.append(np.ravel(shape.surface_area())[:1].astype(np.float64))
@@ -247,11 +247,11 @@ class _Table:
             mi.UInt32(np.concatenate([[0], cumulative]).astype(np.uint32)),
             guide_bits,
             on_device(mi.UInt32, guide),
-            mi.UInt32(np.concatenate([*owners, np.array(analytic_owners, np.uint32)])),
+            mi.UInt32(np.concatenate([*row_points, np.array(analytic_owners, np.uint32)])),
             mi.UInt32(np.concatenate(primitives)),
             [mi.Float(triangles[:, i, j].astype(np.float32)) for i in range(3) for j in range(3)],
         )
-        dr.eval(table.edges, table.owner)
+        dr.eval(table.edges, table.row_of_lane)
         return table
 
 
@@ -291,5 +291,5 @@ def facing_triangles(built: BuiltScene, mesh: mi.Mesh) -> tuple[Float64, NDArray
     corners = wall_box(built.wall) / built.unit
     # Shading normals may light a little of a geometric back side.
     one_sided = _is_one_sided(mesh) and not mesh.has_vertex_normals()
-    kept = np.flatnonzero(_visible_from(corners, triangles, one_sided, built.wall.is_planar))
-    return triangles[kept], kept.astype(np.uint32)
+    saved = np.flatnonzero(_visible_from(corners, triangles, one_sided, built.wall.is_planar))
+    return triangles[saved], saved.astype(np.uint32)

@@ -17,7 +17,7 @@ GOLDEN = 0x9E3779B9  # 2^32 over the golden ratio: places of later stages fall b
 
 
 @dataclass(frozen=True, eq=False)
-class Strata:
+class SystematicSequence:
     """Where every lane is in its stage. 64 bits: no part is missed, however many there are."""
 
     at: mi.UInt64  # its upper 32 bits are the next path's first coordinate
@@ -25,7 +25,7 @@ class Strata:
     stage: range = range(0)  # numbers of the paths
 
     @classmethod
-    def of_stage(cls, stage: range, start: mi.UInt32) -> Strata:
+    def of_paths(cls, stage: range, start: mi.UInt32) -> SystematicSequence:
         """Return the strata of the paths ``stage`` of every lane.
 
         Parameters
@@ -42,7 +42,7 @@ class Strata:
         return cls(at, dr.opaque(mi.UInt64, stride), stage)
 
     @classmethod
-    def within_stage(cls, stage: range, at: mi.UInt64) -> Strata:
+    def at_position(cls, stage: range, at: mi.UInt64) -> SystematicSequence:
         """Return the strata of a stage of which some paths are traced: ``at`` is where the lanes are."""
         return cls(at, dr.opaque(mi.UInt64, _stride(stage)), stage)
 

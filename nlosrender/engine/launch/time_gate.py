@@ -24,11 +24,11 @@ from nlosrender.scene.build import BuiltScene
 from nlosrender.scene.hidden_geometry import Bounds
 from nlosrender.scene.pose import Float64
 
-LATE_SURVIVAL = 1 / 8  # chance of a path to go on once all its light comes after the window
+GATE_SURVIVAL = 1 / 8  # chance of a path to go on once all its light comes after the window
 
 
 @dataclass(frozen=True, eq=False)
-class Deadline:
+class TimeGate:
     """What a lane needs to tell that its path is late; lengths in engine units, none of them part of a kernel."""
 
     latest: mi.Float  # per lane: longest way from where its paths begin to a laser point that ends in the window
@@ -36,7 +36,7 @@ class Deadline:
     high: mi.Point3f
     detour: mi.Float  # height to which light leaves a planar wall and comes back to it, there and back
 
-    def is_late(self, opl: mi.Float, point: mi.Point3f, on_wall: mi.Bool) -> mi.Bool:
+    def is_past(self, opl: mi.Float, point: mi.Point3f, on_wall: mi.Bool) -> mi.Bool:
         """Return whether a path of length ``opl`` up to ``point`` can only bring light after the window.
 
         From a planar wall light first goes to the hidden geometry: as far as to the laser's mirror image there.
@@ -46,11 +46,11 @@ class Deadline:
         return opl + dr.norm(reach) > self.latest
 
 
-def thinned_out(
-    deadline: Deadline | None,
+def time_gate_roulette(
+    time_gate: TimeGate | None,
     generator: mi.PCG32,
     alive: mi.Bool,
-    is_thinned: mi.Bool,
+    is_past_gate: mi.Bool,
     opl: mi.Float,
     point: mi.Point3f,
     on_wall: mi.Bool,
@@ -60,11 +60,11 @@ def thinned_out(
 
     Parameters
     ----------
-    deadline
+    time_gate
         None: no path is late.
     generator
         Drawn from by late paths alone: where there are none, no path's numbers change.
-    alive, is_thinned, throughput
+    alive, is_past_gate, throughput
         Which paths are under way, which of them have survived this, and what they carry.
     opl, point, on_wall
         Length of the path up to its last vertex [engine units], that vertex, and whether it lies on the relay wall.
@@ -72,17 +72,17 @@ def thinned_out(
     Returns
     -------
     tuple
-        ``alive``, ``is_thinned`` and ``throughput``.
+        ``alive``, ``is_past_gate`` and ``throughput``.
     """
-    if deadline is None:
-        return alive, is_thinned, throughput
-    late = alive & ~is_thinned & deadline.is_late(opl, point, on_wall)
-    survives = generator.next_float32(late) < LATE_SURVIVAL
-    return alive & (~late | survives), is_thinned | late, dr.select(late, throughput / LATE_SURVIVAL, throughput)
+    if time_gate is None:
+        return alive, is_past_gate, throughput
+    late = alive & ~is_past_gate & time_gate.is_past(opl, point, on_wall)
+    survives = generator.next_float32(late) < GATE_SURVIVAL
+    return alive & (~late | survives), is_past_gate | late, dr.select(late, throughput / GATE_SURVIVAL, throughput)
 
 
 @dataclass(frozen=True, eq=False)
-class Horizon:
+class CaptureTimeGate:
     """How far light of a capture may go and still arrive in its time window [engine units].
 
     Points and legs are those of the whole capture: what is late must not depend on how it is cut into batches.
@@ -94,7 +94,7 @@ class Horizon:
     detour: float
 
     @classmethod
-    def of(cls, built: BuiltScene, capture: Capture, time_axis: TimeAxis) -> Horizon:
+    def of(cls, built: BuiltScene, capture: Capture, time_axis: TimeAxis) -> CaptureTimeGate:
         """Return the horizon of a capture."""
         lowest = built.hidden_bounds[0][2] if built.wall.is_planar and built.hidden_bounds is not None else 0.0
         sensor_legs, laser_legs = capture.sensor_legs.reshape(-1), capture.laser_legs.reshape(-1)
@@ -112,15 +112,15 @@ class Horizon:
         ways = distance_to_box(points, self.sensor_box) + distance_to_box(points, self.laser_box)
         return ways > self.longest
 
-    def deadline_from(self, points: Float64) -> Deadline:
+    def of_points(self, points: Float64) -> TimeGate:
         """Return the deadline of walks from ``points`` (n, 3), one lane each, that sensor points look at."""
         latest = self.longest - distance_to_box(points, self.sensor_box)
         low, high = (_opaque_point(corner) for corner in self.laser_box)
-        return Deadline(on_device(mi.Float, latest), low, high, dr.opaque(mi.Float, self.detour))
+        return TimeGate(on_device(mi.Float, latest), low, high, dr.opaque(mi.Float, self.detour))
 
-    def deadline_of_sensors(
+    def of_sensors(
         self, built: BuiltScene, capture: Capture, time_axis: TimeAxis, index: NDArray[np.integer], sensor: mi.UInt32
-    ) -> Deadline:
+    ) -> TimeGate:
         """Return the deadline of paths from the sensor points ``index`` (n,), of which lanes have the ``sensor``-th."""
         own = capture.scan_type == "confocal"
         sensor_legs, laser_legs = capture.sensor_legs.reshape(-1), capture.laser_legs.reshape(-1)
@@ -132,7 +132,7 @@ class Horizon:
             low = high = dr.gather(mi.Point3f, points, sensor)
         per_lane = dr.gather(mi.Float, on_device(mi.Float, latest), sensor)
         dr.eval(per_lane, low)
-        return Deadline(per_lane, low, high, dr.opaque(mi.Float, self.detour))
+        return TimeGate(per_lane, low, high, dr.opaque(mi.Float, self.detour))
 
 
 def light_leaves_window(built: BuiltScene, capture: Capture, time_axis: TimeAxis, bounces: BounceAxis) -> bool:

@@ -22,17 +22,17 @@ from nlosrender.engine.launch.sample_schedule import (
     Sampled,
     Schedule,
     accumulate,
+    calibrated_by_pilot,
     pilot_replicas,
-    settled_by_pilot,
 )
 from nlosrender.engine.line_of_sight.loop import trace_view
 from nlosrender.engine.line_of_sight.view_params import (
+    ViewLaunchParams,
     ViewSettings,
-    ViewTransport,
     crosses_rough_surfaces,
-    view_transport,
+    view_launch_params,
 )
-from nlosrender.engine.path.engine import PathOptions
+from nlosrender.engine.path.engine import RenderOptions
 from nlosrender.errors import RenderError
 from nlosrender.scene.view import BuiltView
 
@@ -57,7 +57,7 @@ class LineOfSightEngine:
         built: BuiltView,
         capture: Capture,
         time_axis: TimeAxis,
-        options: PathOptions,
+        options: RenderOptions,
         reason: str = "a camera sees the scene itself",
     ):
         self.reason = reason
@@ -118,7 +118,7 @@ class LineOfSightEngine:
             mean[..., :-1], variance[..., :-1], mean[..., -1], sampled.per_lane * shape.replicas, sampled.contrasts
         )
 
-    def settle(self, budget: Budget, known_squares: float = 0.0, seconds: float = math.inf) -> Budget:
+    def calibrate(self, budget: Budget, known_squares: float = 0.0, seconds: float = math.inf) -> Budget:
         """Turn a target error into samples for the whole capture, found by a pilot on a few of its pixels.
 
         Parameters
@@ -126,7 +126,7 @@ class LineOfSightEngine:
         budget, known_squares, seconds
             As for the path engine.
         """
-        if budget.is_settled:
+        if budget.is_calibrated:
             return budget
         pilot = pilot_of(self.capture)
         replicas = pilot_replicas(self.options.replicas, pilot.sensors.size)
@@ -136,22 +136,22 @@ class LineOfSightEngine:
             self._accumulate(pilot, shape, schedule, passes)
 
         least = FIRST_SAMPLES * self.options.replicas
-        return settled_by_pilot(budget, replicas, look, known_squares, seconds, least)
+        return calibrated_by_pilot(budget, replicas, look, known_squares, seconds, least)
 
     def _accumulate(self, batch: Batch | Pilot, shape: HistogramShape, schedule: Schedule, passes: Passes) -> Sampled:
         pixels = np.array(batch.sensors.flat_indices(self.capture.sensor_grid.nx), dtype=np.uint32)
-        transport = view_transport(self.built, self.capture, self.time_axis, pixels, shape.lanes)
+        params = view_launch_params(self.built, self.capture, self.time_axis, pixels, shape.lanes)
 
         def launch(histogram: DeviceHistogram, randomness: LaneRandomness, more: int) -> LaneRandomness:
-            return self._launch(transport, histogram, randomness, more)
+            return self._launch(params, histogram, randomness, more)
 
         sampled = accumulate(shape, pixels, self.options.seed, launch, schedule, passes, self.scale)
         self.compile_seconds += sampled.compile_seconds
         return sampled
 
     def _launch(
-        self, transport: ViewTransport, histogram: DeviceHistogram, randomness: LaneRandomness, more: int
+        self, params: ViewLaunchParams, histogram: DeviceHistogram, randomness: LaneRandomness, more: int
     ) -> LaneRandomness:
-        advanced = trace_view(self.settings, transport, histogram, randomness, dr.opaque(mi.UInt32, more))
+        advanced = trace_view(self.settings, params, histogram, randomness, dr.opaque(mi.UInt32, more))
         dr.eval(histogram.sums, advanced.generator, advanced.sequence)
         return advanced

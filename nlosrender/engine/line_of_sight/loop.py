@@ -15,7 +15,7 @@ import mitsuba as mi
 from nlosrender.engine.launch.histogram import DeviceHistogram
 from nlosrender.engine.launch.launch_params import HIGHEST_SURVIVAL, LaneRandomness
 from nlosrender.engine.launch.recurrence import recurrence_steps
-from nlosrender.engine.line_of_sight.view_params import ViewSettings, ViewTransport
+from nlosrender.engine.line_of_sight.view_params import ViewLaunchParams, ViewSettings
 
 ROULETTE_AFTER = 3  # surface interactions: what is brightest is never thinned out
 
@@ -23,7 +23,7 @@ ROULETTE_AFTER = 3  # surface interactions: what is brightest is never thinned o
 @dr.syntax
 def trace_view(
     settings: ViewSettings,
-    transport: ViewTransport,
+    params: ViewLaunchParams,
     histogram: DeviceHistogram,
     randomness: LaneRandomness,
     n_samples: mi.UInt32,
@@ -32,9 +32,9 @@ def trace_view(
 
     Deposits are radiance [W m^-2 sr^-1] of the steady image, by the optical path length they have come.
     """
-    scene = transport.scene
+    scene = params.scene
     context = mi.BSDFContext()
-    lane = dr.arange(mi.UInt32, dr.width(transport.pixels))
+    lane = dr.arange(mi.UInt32, dr.width(params.pixels))
     no_laser = mi.UInt32(0)
     steps = recurrence_steps(2)
     max_bounces = settings.bounces.max_bounces
@@ -53,21 +53,21 @@ def trace_view(
     medium = mi.Float(1)  # refractive index along the ray
     before = dr.zeros(mi.Interaction3f)  # the last vertex
 
-    while dr.hint(alive | (started < n_samples), exclude=[settings, transport, histogram, scene]):
+    while dr.hint(alive | (started < n_samples), exclude=[settings, params, histogram, scene]):
         # ---- Start the next path ---------------------------------------------------------------------------------
         start = ~alive
         started = dr.select(start, started + 1, started)
         seq_u = dr.select(start, seq_u + steps[0], seq_u)
         seq_v = dr.select(start, seq_v + steps[1], seq_v)
-        first = _pixel_direction(transport, seq_u, seq_v)
-        ray.o = dr.select(start, transport.camera, ray.o)
+        first = _pixel_direction(params, seq_u, seq_v)
+        ray.o = dr.select(start, params.camera, ray.o)
         ray.d = dr.select(start, first, ray.d)
-        throughput = dr.select(start, _at_camera(transport, first), throughput)
+        throughput = dr.select(start, _at_camera(params, first), throughput)
         bounce = dr.select(start, mi.UInt32(0), bounce)
         is_delta |= start
         opl = dr.select(start, 0, opl)
         medium = dr.select(start, 1, medium)
-        before.p = dr.select(start, transport.camera, before.p)
+        before.p = dr.select(start, params.camera, before.p)
 
         # ---- Intersect -------------------------------------------------------------------------------------------
         si = scene.ray_intersect(ray, mi.RayFlags.All, coherent=False)
@@ -85,7 +85,7 @@ def trace_view(
         emitter_density = scene.pdf_emitter_direction(before, direction, found & ~is_delta)
         share = _power_heuristic(bsdf_density, dr.select(is_delta, 0, emitter_density))
         carried = throughput * emitter.eval(si, found)
-        arrival = transport.bin_of(opl)
+        arrival = params.bin_of(opl)
         if dr.hint(settings.has_sky, mode="scalar"):
             arrival = dr.select(hit, arrival, -1)  # from infinitely far away: outside any window
         histogram.deposit(lane, no_laser, slot, arrival, carried * dr.select(is_delta, 1, share), found)
@@ -107,11 +107,11 @@ def trace_view(
         carried = throughput * reflected * emitted
         index = mi.Float(medium)
         if dr.hint(settings.bends, mode="scalar"):
-            behind = dr.gather(mi.Float, transport.indices, dr.reinterpret_array(mi.UInt32, si.shape), connects)
+            behind = dr.gather(mi.Float, params.indices, dr.reinterpret_array(mi.UInt32, si.shape), connects)
             crosses = mi.Frame3f.cos_theta(wo) * mi.Frame3f.cos_theta(si.wi) < 0
             crossing = dr.select(mi.Frame3f.cos_theta(si.wi) > 0, behind, dr.rcp(behind))
             index = dr.select(crosses, medium * crossing, medium)
-        arrival = transport.bin_of(opl + index * towards.dist)
+        arrival = params.bin_of(opl + index * towards.dist)
         if dr.hint(settings.has_sky, mode="scalar"):
             arrival = dr.select(mi.has_flag(towards.emitter.flags(), mi.EmitterFlags.Infinite), -1, arrival)
         histogram.deposit(lane, no_laser, _slot(settings, bounce), arrival, carried * share, connects)
@@ -142,17 +142,17 @@ def trace_view(
     return LaneRandomness(generator, [seq_u, seq_v, *randomness.sequence[2:]])
 
 
-def _pixel_direction(transport: ViewTransport, bits_x: mi.UInt32, bits_y: mi.UInt32) -> mi.Vector3f:
+def _pixel_direction(params: ViewLaunchParams, bits_x: mi.UInt32, bits_y: mi.UInt32) -> mi.Vector3f:
     """Return the direction from the camera to a place in the lane's pixel: uniform over its area, a box filter."""
     x, y = (mi.Float(bits >> 8) * 2.0**-24 - 0.5 for bits in (bits_x, bits_y))
-    return dr.normalize(transport.pixels + x * transport.pixel_x + y * transport.pixel_y - transport.camera)
+    return dr.normalize(params.pixels + x * params.pixel_x + y * params.pixel_y - params.camera)
 
 
-def _at_camera(transport: ViewTransport, direction: mi.Vector3f) -> mi.Spectrum:
+def _at_camera(params: ViewLaunchParams, direction: mi.Vector3f) -> mi.Spectrum:
     """Return the throughput a path starts with: polarised, the turn from the implicit frame to the camera's."""
     if not mi.is_polarized:
         return mi.Spectrum(1)
-    horizontal = dr.normalize(dr.cross(direction, transport.up))
+    horizontal = dr.normalize(dr.cross(direction, params.up))
     turned = mi.mueller.rotate_stokes_basis_m(-direction, mi.mueller.stokes_basis(-direction), horizontal)
     return mi.Spectrum(turned)
 

@@ -36,7 +36,7 @@ class ViewSettings:
 
 
 @dataclass(frozen=True, eq=False)
-class ViewTransport:
+class ViewLaunchParams:
     """Everything a launch reads; lengths in engine units."""
 
     scene: mi.Scene
@@ -56,9 +56,9 @@ class ViewTransport:
         return mi.Int32(dr.floor(delay)) - self.start_bins
 
 
-def view_transport(
+def view_launch_params(
     built: BuiltView, capture: Capture, time_axis: TimeAxis, pixels: NDArray[np.integer], n_lanes: int
-) -> ViewTransport:
+) -> ViewLaunchParams:
     """Return what the lanes read: lane i looks through pixel ``pixels[i % len(pixels)]`` of the row-major grid."""
     grid = capture.sensor_grid
     centres = built.to_engine(grid.positions.reshape(-1, 3)[pixels])
@@ -67,7 +67,7 @@ def view_transport(
     # float64, and split: a window far from zero must not eat the precision of the path lengths
     start = time_axis.start_opl / time_axis.bin_width_opl
     whole = float(np.clip(np.floor(start), -(2**30), 2**30))
-    transport = ViewTransport(
+    params = ViewLaunchParams(
         scene=built.scene,
         camera=mi.Point3f(built.to_engine(capture.sensor_position).tolist()),
         pixels=per_lane,
@@ -81,9 +81,9 @@ def view_transport(
     )
     # opaque: a kernel must not depend on where the camera stands
     for name in ("camera", "pixel_x", "pixel_y", "up", "bins_per_unit", "start_bins", "start_fraction"):
-        dr.make_opaque(getattr(transport, name))
-    dr.eval(transport.pixels)
-    return transport
+        dr.make_opaque(getattr(params, name))
+    dr.eval(params.pixels)
+    return params
 
 
 def refractive_indices(scene: mi.Scene) -> mi.Float:

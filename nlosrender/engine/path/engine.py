@@ -18,45 +18,45 @@ from nlosrender.capture.time_axis import TimeAxis
 from nlosrender.engine.launch.device_arrays import laser_points, on_device, sensor_points
 from nlosrender.engine.launch.energy_contrasts import no_contrasts
 from nlosrender.engine.launch.histogram import DeviceHistogram, Histogram, HistogramShape
-from nlosrender.engine.launch.launch_params import LaneRandomness, PathSettings, Transport
-from nlosrender.engine.launch.morton import z_order
+from nlosrender.engine.launch.launch_params import LaneRandomness, LaunchParams, PathSettings
+from nlosrender.engine.launch.morton import morton_order
 from nlosrender.engine.launch.occlusion import nothing_occludes
 from nlosrender.engine.launch.passes import Passes
 from nlosrender.engine.launch.pilot_points import Pilot, pilot_of
-from nlosrender.engine.launch.plain_diffuse import only_normals_matter
+from nlosrender.engine.launch.plain_diffuse import is_plain_diffuse
 from nlosrender.engine.launch.sample_schedule import (
     FIRST_SAMPLES,
     Budget,
     Schedule,
     accumulate,
+    calibrated_by_pilot,
     lane_randomness,
     pilot_replicas,
-    settled_by_pilot,
 )
 from nlosrender.engine.launch.second_bounce import deposit_second_bounce
 from nlosrender.engine.launch.surface_sampler import SurfaceSampler
-from nlosrender.engine.launch.systematic_sequence import Strata
+from nlosrender.engine.launch.systematic_sequence import SystematicSequence
 from nlosrender.engine.launch.temporal_kernel import TemporalKernel
-from nlosrender.engine.launch.time_gate import Horizon, light_leaves_window
+from nlosrender.engine.launch.time_gate import CaptureTimeGate, light_leaves_window
 from nlosrender.engine.path.full_loop import load_path_integrator
-from nlosrender.engine.path.hidden_aabb import HiddenBox
+from nlosrender.engine.path.hidden_aabb import HiddenAabb
 from nlosrender.engine.path.roulette import (
     DIRECT,
     LEAST_PATHS,
     PILOT_SAMPLES,
     PILOT_SEED,
     TRACED,
-    best_every,
-    first_turns,
+    best_continuation_period,
+    first_phases,
 )
-from nlosrender.engine.path.technique_mixture import best_hidden_fraction, box_often_missed
+from nlosrender.engine.path.technique_mixture import box_often_missed, choose_p_hidden_sampling
 from nlosrender.engine.path.third_bounce_loop import are_direct
 from nlosrender.errors import RenderError
 from nlosrender.scene.build import BuiltScene
 
 
 @dataclass(frozen=True)
-class PathOptions:
+class RenderOptions:
     """The techniques of Royo et al. 2022 and what is computed."""
 
     bounces: BounceAxis
@@ -66,10 +66,10 @@ class PathOptions:
     channels: int = 1
     seed: int = 0
     replicas: int = 2
-    late_roulette: bool = True  # few paths go on that can only bring light after the time window
+    has_time_gate: bool = True  # few paths go on that can only bring light after the time window
     temporal_kernel_bins: float = 0.0  # full width of the kernel in time [bins]; 0: a plain histogram
-    hidden_fraction: float | None = None  # share of hidden geometry sampling on the wall; None: chosen from the scene
-    further_every: int | None = None  # of so many paths one goes on beyond the third bounce; None: found by a pilot
+    p_hidden_sampling: float | None = None  # share of hidden geometry sampling on the wall; None: chosen from the scene
+    continuation_period: int | None = None  # one path in so many goes on after bounce 3; None: by a pilot
 
 
 class PathEngine:
@@ -94,7 +94,7 @@ class PathEngine:
         built: BuiltScene,
         capture: Capture,
         time_axis: TimeAxis,
-        options: PathOptions,
+        options: RenderOptions,
         first_bounce: int = THIRD_BOUNCE,
         reason: str = "asked for",
     ):
@@ -106,20 +106,20 @@ class PathEngine:
         self.scale = capture.laser_energy / built.unit**2
         self.kernel = TemporalKernel(options.temporal_kernel_bins) if options.temporal_kernel_bins > 0 else None
         # None: nothing can arrive after the window, and no path is ended for it
-        thins_out = options.late_roulette and light_leaves_window(built, capture, time_axis, options.bounces)
-        self.horizon = Horizon.of(built, capture, time_axis) if thins_out else None
+        has_time_gate = options.has_time_gate and light_leaves_window(built, capture, time_axis, options.bounces)
+        self.capture_gate = CaptureTimeGate.of(built, capture, time_axis) if has_time_gate else None
         self.compile_seconds = 0.0
 
     # Made when they are needed: an engine that only lends its points to a gather samples no surfaces.
 
     @cached_property
-    def hidden_fraction(self) -> float:
+    def p_hidden_sampling(self) -> float:
         """Share of hidden geometry sampling at a vertex of the wall."""
-        if self.options.hidden_fraction is not None:
-            return self.options.hidden_fraction
+        if self.options.p_hidden_sampling is not None:
+            return self.options.p_hidden_sampling
         if not self.options.hidden_geometry_sampling:
             return 0.0
-        return best_hidden_fraction(self.built, self.sampler, self.capture, self.time_axis)
+        return choose_p_hidden_sampling(self.built, self.sampler, self.capture, self.time_axis)
 
     @cached_property
     def settings(self) -> PathSettings:
@@ -128,19 +128,19 @@ class PathEngine:
         return PathSettings(
             bounces=self.options.bounces,
             first_bounce=self.first_bounce,
-            hidden_fraction=self.hidden_fraction,
+            p_hidden_sampling=self.p_hidden_sampling,
             laser_sampling=self.options.laser_sampling,
             russian_roulette=self.options.russian_roulette,
             spot_radius=self.capture.laser_spot_radius / self.built.unit,
             needs_visibility=not nothing_occludes(self.built),
             has_transmission=any(bool(flag & mi.BSDFFlags.Transmission) for flag in flags),
-            only_normals_matter=only_normals_matter(self.built),
+            is_plain_diffuse=is_plain_diffuse(self.built),
         )
 
     @cached_property
-    def hidden_box(self) -> HiddenBox | None:
+    def hidden_aabb(self) -> HiddenAabb | None:
         """Box around the hidden geometry; None where few rays from the wall miss it, or all are sent to points."""
-        if self.hidden_fraction > 0:
+        if self.p_hidden_sampling > 0:
             return None
         return box_often_missed(self.built, self.capture, self.time_axis)
 
@@ -183,13 +183,11 @@ class PathEngine:
                 f"a batch of {shape.size:.2e} sums is more than 32-bit indices reach; lower render.memory_limit"
             )
         if self._has_bounces:
-            transport = self._of_paths(batch, shape, self._further_every(budget))
+            params = self._of_paths(batch, shape, self._continuation_period(budget))
             if budget.target_error is not None:
                 known_squares += self.second_squares(batch)
             schedule = Schedule(budget, shape.replicas, known_squares, shape.lanes * shape.lasers)
-            mean, variance, per_lane, contrasts = self._accumulate(
-                batch, shape, transport, schedule, passes or Passes()
-            )
+            mean, variance, per_lane, contrasts = self._accumulate(batch, shape, params, schedule, passes or Passes())
         else:
             axes = (shape.channels, bounces.n_slots, shape.lasers, shape.sensors, shape.row)
             mean, variance, per_lane = np.zeros(axes), np.zeros(axes), 0
@@ -200,7 +198,7 @@ class PathEngine:
             raise RenderError("the path engine produced a value that is not finite; please report the configuration")
         return Histogram(mean[..., :-1], variance[..., :-1], mean[..., -1], per_lane * shape.replicas, contrasts)
 
-    def settle(self, budget: Budget, known_squares: float = 0.0, seconds: float = math.inf) -> Budget:
+    def calibrate(self, budget: Budget, known_squares: float = 0.0, seconds: float = math.inf) -> Budget:
         """Turn a target error into samples for the whole capture, found by a pilot on a few of its points.
 
         The number does not depend on how the capture is cut. Budgets with ``spp`` or a time limit stay as they are.
@@ -212,9 +210,9 @@ class PathEngine:
         known_squares
             As for ``render``, over the pilot's points.
         seconds
-            As for ``settled_by_pilot``.
+            As for ``calibrated_by_pilot``.
         """
-        if budget.is_settled:
+        if budget.is_calibrated:
             return budget
         if not self._has_bounces:
             return budget
@@ -222,14 +220,14 @@ class PathEngine:
         shape = replace(
             self.shape(pilot, self.n_slots), replicas=pilot_replicas(self.options.replicas, pilot.sensors.size)
         )
-        transport = self._of_paths(pilot, shape, self._further_every(budget))
+        params = self._of_paths(pilot, shape, self._continuation_period(budget))
 
         def look(schedule: Schedule, passes: Passes) -> None:
-            self._accumulate(pilot, shape, transport, schedule, passes)
+            self._accumulate(pilot, shape, params, schedule, passes)
 
         known_squares += self.second_squares(pilot)
         least = FIRST_SAMPLES * self.options.replicas
-        return settled_by_pilot(budget, shape.replicas, look, known_squares, seconds, least)
+        return calibrated_by_pilot(budget, shape.replicas, look, known_squares, seconds, least)
 
     @property
     def n_slots(self) -> int:
@@ -243,25 +241,27 @@ class PathEngine:
         return highest is None or highest >= self.first_bounce
 
     def _accumulate(
-        self, batch: Batch | Pilot, shape: HistogramShape, transport: Transport, schedule: Schedule, passes: Passes
+        self, batch: Batch | Pilot, shape: HistogramShape, params: LaunchParams, schedule: Schedule, passes: Passes
     ) -> tuple[np.ndarray, np.ndarray, int, np.ndarray]:
-        bounces, owners = self.options.bounces, self.sensor_indices(batch)
-        points = owners[self.lane_order(batch)]
+        bounces, row_points = self.options.bounces, self.sensor_indices(batch)
+        points = row_points[self.lane_order(batch)]
         seed, kernel = self.options.seed, self.kernel
 
         def launch(histogram: DeviceHistogram, randomness: LaneRandomness, more: int) -> LaneRandomness:
-            if randomness.turn is None:
-                turns = first_turns(seed, points, self.capture.sensor_grid.nx, shape.lanes, transport.further_every)
-                randomness = replace(randomness, turn=turns)
-            strata = randomness.strata
-            if strata is None or strata.stage != schedule.stage:
-                strata = Strata.of_stage(schedule.stage, randomness.sequence[0])
-            advanced, strata = self.integrator.accumulate(transport, histogram, randomness, strata, more)
-            return replace(advanced, strata=replace(strata, stage=schedule.stage))
+            if randomness.phase is None:
+                phases = first_phases(
+                    seed, points, self.capture.sensor_grid.nx, shape.lanes, params.continuation_period
+                )
+                randomness = replace(randomness, phase=phases)
+            systematic = randomness.systematic
+            if systematic is None or systematic.stage != schedule.stage:
+                systematic = SystematicSequence.of_paths(schedule.stage, randomness.sequence[0])
+            advanced, systematic = self.integrator.accumulate(params, histogram, randomness, systematic, more)
+            return replace(advanced, systematic=replace(systematic, stage=schedule.stage))
 
         first = 1 if bounces.split else 0  # the second bounce has slot 0
         slots = range(-first, bounces.n_slots - first)
-        result = accumulate(shape, points, seed, launch, schedule, passes, self.scale, slots, kernel, owners)
+        result = accumulate(shape, points, seed, launch, schedule, passes, self.scale, slots, kernel, row_points)
         self.compile_seconds += result.compile_seconds
         return result.mean, result.variance, result.per_lane, result.contrasts
 
@@ -273,12 +273,12 @@ class PathEngine:
             options.replicas, batch.sensors.size, lasers, slots, options.channels, self.time_axis.n_bins
         )
 
-    def transport(
+    def launch_params(
         self,
         batch: Batch | Pilot,
         shape: HistogramShape,
         order: NDArray[np.int64] | None = None,
-    ) -> Transport:
+    ) -> LaunchParams:
         """Return what the lanes of a batch read, whether they trace paths or not.
 
         Parameters
@@ -288,22 +288,22 @@ class PathEngine:
         order
             (n,) the batch's sensor points in the order in which lanes take them; None: as they are.
         """
-        index, horizon = self.sensor_indices(batch), self.horizon
+        index, capture_gate = self.sensor_indices(batch), self.capture_gate
         sensors = sensor_points(self.built, self.capture, self.time_axis, index)
         lasers = laser_points(self.built, self.capture, self.time_axis, self.laser_indices(batch))
         lane = dr.arange(mi.UInt32, shape.lanes)
         sensor = lane % shape.sensors
         if order is not None:
             sensor = dr.gather(mi.UInt32, on_device(mi.UInt32, order), sensor)
-        owner = lane // shape.sensors * shape.sensors + sensor
+        row_of_lane = lane // shape.sensors * shape.sensors + sensor
         confocal = self.capture.scan_type == "confocal"
         first_laser = mi.UInt32(sensor) if confocal else dr.zeros(mi.UInt32, shape.lanes)
         per_lane = sensors.gather(sensor)
-        dr.eval(per_lane.interaction, per_lane.delay_bins, per_lane.delay_fraction, first_laser, owner)
-        deadline = None
-        if horizon is not None:
-            deadline = horizon.deadline_of_sensors(self.built, self.capture, self.time_axis, index, sensor)
-        return Transport(
+        dr.eval(per_lane.interaction, per_lane.delay_bins, per_lane.delay_fraction, first_laser, row_of_lane)
+        time_gate = None
+        if capture_gate is not None:
+            time_gate = capture_gate.of_sensors(self.built, self.capture, self.time_axis, index, sensor)
+        return LaunchParams(
             built=self.built,
             sampler=self.sampler,
             sensors=per_lane,
@@ -312,51 +312,53 @@ class PathEngine:
             lasers_per_lane=shape.lasers,
             n_lasers=dr.opaque(mi.UInt32, shape.lasers),
             bins_per_unit=dr.opaque(mi.Float, self.built.unit / self.time_axis.bin_width_opl),
-            deadline=deadline,
-            hidden_box=None,
-            owner=owner,
-            further_every=dr.opaque(mi.UInt32, 1),
+            time_gate=time_gate,
+            hidden_aabb=None,
+            row_of_lane=row_of_lane,
+            continuation_period=dr.opaque(mi.UInt32, 1),
         )
 
-    def _of_paths(self, batch: Batch | Pilot, shape: HistogramShape, further_every: int) -> Transport:
-        """Return what the lanes of a batch read that trace paths, neighbours together; see ``Transport``."""
-        transport = self.transport(batch, shape, self.lane_order(batch))
-        if self.hidden_fraction > 0:
+    def _of_paths(self, batch: Batch | Pilot, shape: HistogramShape, continuation_period: int) -> LaunchParams:
+        """Return what the lanes of a batch read that trace paths, neighbours together; see ``LaunchParams``."""
+        params = self.launch_params(batch, shape, self.lane_order(batch))
+        if self.p_hidden_sampling > 0:
             self.sampler.set_up()
-        return replace(transport, hidden_box=self.hidden_box, further_every=dr.opaque(mi.UInt32, further_every))
+        return replace(
+            params, hidden_aabb=self.hidden_aabb, continuation_period=dr.opaque(mi.UInt32, continuation_period)
+        )
 
     def lane_order(self, batch: Batch | Pilot) -> NDArray[np.int64]:
         """Return the order in which lanes take a batch's sensor points: rays of a packet start near each other."""
         positions = self.capture.sensor_grid.positions.reshape(-1, 3)[self.sensor_indices(batch)]
-        return np.argsort(z_order(positions), kind="stable")
+        return np.argsort(morton_order(positions), kind="stable")
 
-    def _further_every(self, budget: Budget) -> int:
+    def _continuation_period(self, budget: Budget) -> int:
         """Return of how many paths one goes on beyond the third bounce: the same however the capture is cut."""
-        if not self.settings.may_stop_early:
+        if not self.settings.has_continuation_roulette:
             return 1
-        if self.options.further_every is not None:
-            return self.options.further_every
+        if self.options.continuation_period is not None:
+            return self.options.continuation_period
         has_end = budget.target_error is None and budget.time_limit_s is None
         if has_end and (budget.spp or 0) * self.capture.n_sensors < LEAST_PATHS:
             return 1
-        return self._best_every
+        return self._best_period
 
     @cached_property
-    def _best_every(self) -> int:
+    def _best_period(self) -> int:
         direct, split = are_direct(self.settings, self.sampler), self.options.bounces.split
-        return best_every(self._pilot_variance, DIRECT if direct else TRACED, split)
+        return best_continuation_period(self._pilot_variance, DIRECT if direct else TRACED, split)
 
-    def _pilot_variance(self, further_every: int) -> float:
+    def _pilot_variance(self, continuation_period: int) -> float:
         """Return the variance of H, summed, of a few samples at a few points: in arbitrary units."""
         pilot, nx = pilot_of(self.capture), self.capture.sensor_grid.nx
         replicas = pilot_replicas(self.options.replicas, pilot.sensors.size)
         shape, order = replace(self.shape(pilot, self.n_slots), replicas=replicas), self.lane_order(pilot)
-        transport, histogram = self._of_paths(pilot, shape, further_every), DeviceHistogram(shape, self.kernel)
+        params, histogram = self._of_paths(pilot, shape, continuation_period), DeviceHistogram(shape, self.kernel)
         points = self.sensor_indices(pilot)[order]
-        turns = first_turns(PILOT_SEED, points, nx, shape.lanes, transport.further_every)
-        random = replace(lane_randomness(shape, points, PILOT_SEED), turn=turns)
-        strata = Strata.of_stage(range(PILOT_SAMPLES), random.sequence[0])
-        self.integrator.accumulate(transport, histogram, random, strata, PILOT_SAMPLES)
+        phases = first_phases(PILOT_SEED, points, nx, shape.lanes, params.continuation_period)
+        random = replace(lane_randomness(shape, points, PILOT_SEED), phase=phases)
+        systematic = SystematicSequence.of_paths(range(PILOT_SAMPLES), random.sequence[0])
+        self.integrator.accumulate(params, histogram, random, systematic, PILOT_SAMPLES)
         return float(histogram.on_host(histogram.statistics(PILOT_SAMPLES)[1])[..., :-1].sum())
 
     def second_squares(self, batch: Batch | Pilot) -> float:
@@ -369,7 +371,7 @@ class PathEngine:
         """Return the second bounce (channel, 1, laser, sensor, row): exact, so one replica computes it."""
         shape = replace(self.shape(batch, 1), replicas=1)
         histogram = DeviceHistogram(shape)
-        deposit_second_bounce(self.transport(batch, shape), histogram)
+        deposit_second_bounce(self.launch_params(batch, shape), histogram)
         return histogram.on_host(histogram.total(self.scale))
 
     def sensor_indices(self, batch: Batch | Pilot) -> np.ndarray:

@@ -17,10 +17,10 @@ import mitsuba as mi
 
 from nlosrender.capture.bounces import FIRST_BOUNCE, THIRD_BOUNCE, BounceAxis
 from nlosrender.engine.launch.histogram import DeviceHistogram
-from nlosrender.engine.launch.launch_params import LaneRandomness, PathSettings, Transport
+from nlosrender.engine.launch.launch_params import LaneRandomness, LaunchParams, PathSettings
 from nlosrender.engine.launch.recurrence import recurrence_steps
-from nlosrender.engine.launch.systematic_sequence import Strata, first_coordinate
-from nlosrender.engine.launch.time_gate import thinned_out
+from nlosrender.engine.launch.systematic_sequence import SystematicSequence, first_coordinate
+from nlosrender.engine.launch.time_gate import time_gate_roulette
 from nlosrender.engine.path.laser_connections import connect_to_lasers, deposit_spot
 from nlosrender.engine.path.third_bounce_loop import are_direct, trace_direct_paths
 from nlosrender.engine.path.vertex_steps import (
@@ -40,29 +40,29 @@ MOST_TRIES = 4  # of a lane whose paths miss everything, before the others of it
 @dr.syntax
 def trace_paths(
     settings: PathSettings,
-    transport: Transport,
+    params: LaunchParams,
     histogram: DeviceHistogram,
     randomness: LaneRandomness,
-    strata: Strata,
+    systematic: SystematicSequence,
     n_samples: mi.UInt32,
-) -> tuple[LaneRandomness, Strata]:
+) -> tuple[LaneRandomness, SystematicSequence]:
     """Trace ``n_samples`` more paths per lane and deposit what they carry; return the advanced random state.
 
     Throughput is in units of radiance per (engine unit)^-2; the caller scales by energy and unit.
     """
-    built, sampler, sensors = transport.built, transport.sampler, transport.sensors
+    built, sampler, sensors = params.built, params.sampler, params.sensors
     wall = mi.ShapePtr(built.wall_shape)
-    lane = transport.owner
-    q = settings.hidden_fraction  # probability of hidden geometry sampling at a wall vertex
+    lane = params.row_of_lane
+    q = settings.p_hidden_sampling  # probability of hidden geometry sampling at a wall vertex
     steps = recurrence_steps(2) if 0 < q < 1 else (*recurrence_steps(1), 1)  # the second chooses the technique
-    stride = strata.stride
+    stride = systematic.stride
     max_bounces, last_vertex = settings.bounces.max_bounces, settings.last_vertex
-    deadline = transport.deadline if settings.thins_out else None
-    further_share = 1.0 / mi.Float(transport.further_every)
+    time_gate = params.time_gate if settings.has_time_gate else None
+    further_share = 1.0 / mi.Float(params.continuation_period)
 
     # ---- State -------------------------------------------------------------------------------------------------
     generator = mi.PCG32(randomness.generator)
-    at = mi.UInt64(strata.at)
+    at = mi.UInt64(systematic.at)
     seq_v, seq_t = (mi.UInt32(start) for start in randomness.sequence[1:])
     started = mi.UInt32(0)  # paths begun by this lane
     alive = mi.Bool(False)  # a ray is under way
@@ -71,15 +71,15 @@ def trace_paths(
     throughput = mi.Spectrum(0)  # of the path up to the last vertex
     opl = mi.Float(0)  # optical path length from the sensor point [engine units]
     medium = mi.Float(1)  # refractive index along the ray
-    is_thinned = mi.Bool(False)  # the path can only bring light after the window, and has survived that roulette
+    is_past_gate = mi.Bool(False)  # the path can only bring light after the window, and has survived that roulette
 
     # what a launch reads is no state of the loop
     while dr.hint(
         alive | (started < n_samples),
-        exclude=[settings, transport, histogram, built, sampler, sensors, deadline, further_share],
+        exclude=[settings, params, histogram, built, sampler, sensors, time_gate, further_share],
     ):
         # ---- Intersect -----------------------------------------------------------------------------------------
-        there = arrive(settings, transport, way, alive)
+        there = arrive(settings, params, way, alive)
         si, hit = there.si, there.is_reached
         opl += medium * there.distance
 
@@ -87,7 +87,7 @@ def trace_paths(
         if dr.hint(settings.finds_spot, mode="scalar"):
             deposit_spot(
                 settings,
-                transport,
+                params,
                 histogram,
                 lane,
                 si,
@@ -107,8 +107,8 @@ def trace_paths(
         hit &= dr.any(mi.unpolarized_spectrum(throughput) != 0)
 
         # ---- Thin out what comes after the window, once a path ---------------------------------------------------
-        hit, is_thinned, throughput = thinned_out(
-            deadline, generator, hit, is_thinned, opl, si.p, there.on_wall, throughput
+        hit, is_past_gate, throughput = time_gate_roulette(
+            time_gate, generator, hit, is_past_gate, opl, si.p, there.on_wall, throughput
         )
 
         # ---- Connect to the lasers and deposit ---------------------------------------------------------------------
@@ -120,7 +120,7 @@ def trace_paths(
                 in_reach &= bounce <= max_bounces
             leg = there.leg
             connect_to_lasers(
-                settings, transport, histogram, generator, lane, si, in_reach, bounce, opl, throughput, way.origin, leg
+                settings, params, histogram, generator, lane, si, in_reach, bounce, opl, throughput, way.origin, leg
             )
 
         # ---- Continue, or start the next path ----------------------------------------------------------------------
@@ -138,7 +138,7 @@ def trace_paths(
             opl = dr.select(start, 0, opl)
             bounce = dr.select(start, mi.UInt32(FIRST_BOUNCE), bounce)
             medium = dr.select(start, 1, medium)
-            is_thinned &= ~start
+            is_past_gate &= ~start
         else:
             vertex = sensors.interaction
             throughput = _at_sensor(sensors.interaction)
@@ -159,27 +159,25 @@ def trace_paths(
         sample = None
         if dr.hint(q > 0, mode="scalar"):
             sample = sampler.sample(numbers.bits_u, numbers.v, has_target)
-            dark = has_target & turns_away(transport, sample, vertex.p)
+            dark = has_target & turns_away(params, sample, vertex.p)
             if dr.hint(q == 1 and sampler.dark_behind, mode="scalar"):
                 # the next path starts at once
-                while dr.hint(dark & start & (started < n_samples), exclude=[transport, sampler, vertex, start]):
+                while dr.hint(dark & start & (started < n_samples), exclude=[params, sampler, vertex, start]):
                     started += 1
                     again = sampler.sample(first_coordinate(at), unit_interval(seq_v), dark)
                     at += stride
                     seq_v += steps[0]
                     sample = again
-                    dark = turns_away(transport, again, vertex.p)
+                    dark = turns_away(params, again, vertex.p)
             alive &= ~dark
             has_target &= ~dark
-        way, survival, eta = leave(
-            settings, transport, generator, vertex, on_wall, numbers, sample, by_bsdf, has_target
-        )
-        if dr.hint(transport.hidden_box is not None, mode="scalar"):
+        way, survival, eta = leave(settings, params, generator, vertex, on_wall, numbers, sample, by_bsdf, has_target)
+        if dr.hint(params.hidden_aabb is not None, mode="scalar"):
             # before a planar wall all surfaces lie in the box: the next path starts at once
-            misses, tries = start & by_bsdf & misses_hidden(transport, way.ray), mi.UInt32(0)
+            misses, tries = start & by_bsdf & misses_hidden(params, way.ray), mi.UInt32(0)
             while dr.hint(
                 misses & (started < n_samples) & (tries < MOST_TRIES),
-                exclude=[settings, transport, sensors, on_wall, start],
+                exclude=[settings, params, sensors, on_wall, start],
             ):
                 started += 1
                 tries += 1
@@ -189,9 +187,9 @@ def trace_paths(
                 seq_t += steps[1]
                 point, nowhere = sensors.interaction, mi.Bool(False)
                 way, survival, eta = leave(
-                    settings, transport, generator, point, on_wall, following, None, misses, nowhere
+                    settings, params, generator, point, on_wall, following, None, misses, nowhere
                 )
-                misses &= misses_hidden(transport, way.ray)
+                misses &= misses_hidden(params, way.ray)
             alive &= ~misses
         medium *= eta
 
@@ -206,7 +204,9 @@ def trace_paths(
             way.value /= dr.maximum(survival, 1e-9)
         alive &= dr.any(mi.unpolarized_spectrum(way.value) != 0)
 
-    return replace(randomness, generator=generator, sequence=[randomness.sequence[0], seq_v, seq_t]), Strata(at, stride)
+    return replace(
+        randomness, generator=generator, sequence=[randomness.sequence[0], seq_v, seq_t]
+    ), SystematicSequence(at, stride)
 
 
 def _at_sensor(point: mi.SurfaceInteraction3f) -> mi.Spectrum:
@@ -239,29 +239,29 @@ def _plugin_class(variant: str) -> type:
                     None if max_bounces < 0 else max_bounces, bool(properties.get("split_bounces", True))
                 ),
                 first_bounce=int(properties.get("first_bounce", FIRST_BOUNCE + 1)),
-                hidden_fraction=float(properties.get("hidden_fraction", 1.0)),
+                p_hidden_sampling=float(properties.get("hidden_fraction", 1.0)),
                 laser_sampling=bool(properties.get("laser_sampling", True)),
                 russian_roulette=bool(properties.get("russian_roulette", True)),
                 spot_radius=float(properties.get("spot_radius", 0.0)),
                 needs_visibility=bool(properties.get("needs_visibility", True)),
                 has_transmission=bool(properties.get("has_transmission", False)),
-                only_normals_matter=bool(properties.get("only_normals_matter", False)),
+                is_plain_diffuse=bool(properties.get("only_normals_matter", False)),
             )
 
         def accumulate(
             self,
-            transport: Transport,
+            params: LaunchParams,
             histogram: DeviceHistogram,
             randomness: LaneRandomness,
-            strata: Strata,
+            systematic: SystematicSequence,
             n_samples: int,
-        ) -> tuple[LaneRandomness, Strata]:
+        ) -> tuple[LaneRandomness, SystematicSequence]:
             """Trace ``n_samples`` more paths per lane into ``histogram``; return the advanced random state."""
-            trace = trace_direct_paths if are_direct(self.settings, transport.sampler) else trace_paths
+            trace = trace_direct_paths if are_direct(self.settings, params.sampler) else trace_paths
             count = dr.opaque(mi.UInt32, n_samples)
-            advanced, strata = trace(self.settings, transport, histogram, randomness, strata, count)
-            dr.eval(histogram.sums, advanced.generator, advanced.sequence, advanced.turn, strata.at)
-            return advanced, strata
+            advanced, systematic = trace(self.settings, params, histogram, randomness, systematic, count)
+            dr.eval(histogram.sums, advanced.generator, advanced.sequence, advanced.phase, systematic.at)
+            return advanced, systematic
 
         def to_string(self) -> str:
             return f"NlosPathIntegrator[{self.settings}]"
@@ -279,12 +279,12 @@ def load_path_integrator(settings: PathSettings) -> mi.Integrator:
             "max_bounces": -1 if bounces.max_bounces is None else bounces.max_bounces,
             "first_bounce": settings.first_bounce,
             "split_bounces": bounces.split,
-            "hidden_fraction": settings.hidden_fraction,
+            "hidden_fraction": settings.p_hidden_sampling,
             "laser_sampling": settings.laser_sampling,
             "russian_roulette": settings.russian_roulette,
             "spot_radius": settings.spot_radius,
             "needs_visibility": settings.needs_visibility,
             "has_transmission": settings.has_transmission,
-            "only_normals_matter": settings.only_normals_matter,
+            "only_normals_matter": settings.is_plain_diffuse,
         }
     )

@@ -11,14 +11,14 @@ from nlosrender.scene.pose import Float64
 
 
 @dataclass(frozen=True, eq=False)
-class HiddenBox:
+class HiddenAabb:
     """A box [engine units], opaque: its place is no part of a kernel."""
 
     least: mi.Point3f
     most: mi.Point3f
 
     @classmethod
-    def of(cls, least: Float64, most: Float64) -> HiddenBox:
+    def of(cls, least: Float64, most: Float64) -> HiddenAabb:
         """Return the box with corners (3,)."""
         ends = (mi.Point3f(*(dr.opaque(mi.Float, float(x)) for x in corner)) for corner in (least, most))
         return cls(*ends)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from nlosrender.capture.bounces import FIRST_BOUNCE
 from nlosrender.engine.launch.device_arrays import WallPoints
 from nlosrender.engine.launch.histogram import DeviceHistogram
-from nlosrender.engine.launch.launch_params import PathSettings, Transport
+from nlosrender.engine.launch.launch_params import LaunchParams, PathSettings
 from nlosrender.scene.build import BuiltScene
 from nlosrender.scene.pose import Float64
 
@@ -31,7 +31,7 @@ HEIGHT_SHARE = 0.25  # of a surface's height over a planar wall: the ray offset 
 @dr.syntax
 def connect_to_lasers(
     settings: PathSettings,
-    transport: Transport,
+    params: LaunchParams,
     histogram: DeviceHistogram,
     generator: mi.PCG32,
     lane: mi.UInt32,
@@ -55,18 +55,18 @@ def connect_to_lasers(
     if dr.hint(settings.finds_spot, mode="scalar"):
         in_spot = _on_disc(generator, active) * settings.spot_radius
     vertex = si, active, opl, throughput, origin, leg
-    if dr.hint(transport.lasers_per_lane == 1, mode="scalar"):
-        _connect(settings, transport, histogram, in_spot, lane, mi.UInt32(0), slot, *vertex, coherent)
+    if dr.hint(params.lasers_per_lane == 1, mode="scalar"):
+        _connect(settings, params, histogram, in_spot, lane, mi.UInt32(0), slot, *vertex, coherent)
     else:
         laser = mi.UInt32(0)
-        while dr.hint(laser < transport.n_lasers, exclude=[settings, transport, histogram, vertex]):
-            _connect(settings, transport, histogram, in_spot, lane, laser, slot, *vertex, coherent)
+        while dr.hint(laser < params.n_lasers, exclude=[settings, params, histogram, vertex]):
+            _connect(settings, params, histogram, in_spot, lane, laser, slot, *vertex, coherent)
             laser += 1
 
 
 def _connect(
     settings: PathSettings,
-    transport: Transport,
+    params: LaunchParams,
     histogram: DeviceHistogram,
     in_spot: mi.Vector3f,
     lane: mi.UInt32,
@@ -80,9 +80,9 @@ def _connect(
     leg: mi.Vector3f,
     coherent: bool,
 ) -> None:
-    built = transport.built
+    built = params.built
     context = mi.BSDFContext()
-    points = transport.lasers.gather(transport.first_laser + laser)
+    points = params.lasers.gather(params.first_laser + laser)
     lit = points.interaction
     if settings.finds_spot:
         lit.p = lit.p + lit.to_world(in_spot)
@@ -103,7 +103,7 @@ def _connect(
     value = throughput * reflected * emitted / distance2
     if settings.finds_spot:
         # balance heuristic against finding the same point of the spot by the next ray
-        share = dr.select(si.shape == mi.ShapePtr(built.wall_shape), 1 - settings.hidden_fraction, 1.0)
+        share = dr.select(si.shape == mi.ShapePtr(built.wall_shape), 1 - settings.p_hidden_sampling, 1.0)
         cosine = dr.maximum(dr.dot(lit.n, -direction), 0)
         value *= _balance(distance2, share * pdf * cosine * dr.pi * settings.spot_radius**2)
     active = active & dr.any(
@@ -112,14 +112,14 @@ def _connect(
     if settings.needs_visibility:
         segment = connection_segment(built, si, direction, lit)
         active &= ~built.scene.ray_test(segment, coherent=coherent, active=active)
-    bins = delay_bin(transport, points, opl + distance)
+    bins = delay_bin(params, points, opl + distance)
     histogram.deposit(lane, laser, slot, bins, value, active)
 
 
 @dr.syntax
 def deposit_spot(
     settings: PathSettings,
-    transport: Transport,
+    params: LaunchParams,
     histogram: DeviceHistogram,
     lane: mi.UInt32,
     si: mi.SurfaceInteraction3f,
@@ -139,16 +139,16 @@ def deposit_spot(
     spot_area = dr.pi * settings.spot_radius**2
     cosine = dr.maximum(-dr.dot(si.n, ray.d), 1e-9)
     laser = mi.UInt32(0)
-    while dr.hint(laser < transport.n_lasers, exclude=[settings, transport, histogram]):
-        points = transport.lasers.gather(transport.first_laser + laser)
+    while dr.hint(laser < params.n_lasers, exclude=[settings, params, histogram]):
+        points = params.lasers.gather(params.first_laser + laser)
         lit = points.interaction
         inside = active & (dr.squared_norm(si.p - lit.p) < settings.spot_radius**2)
-        emitted = transport.built.wall_bsdf.eval(context, lit, lit.to_local(-ray.d), inside) / (cosine * spot_area)
+        emitted = params.built.wall_bsdf.eval(context, lit, lit.to_local(-ray.d), inside) / (cosine * spot_area)
         carried = throughput * value * emitted / density
         if dr.hint(settings.laser_sampling, mode="scalar"):
             carried *= dr.select(is_delta, 1, _balance(density * cosine * spot_area, distance2))
         inside &= dr.any(carried > 0)
-        histogram.deposit(lane, laser, slot, delay_bin(transport, points, opl), carried, inside)
+        histogram.deposit(lane, laser, slot, delay_bin(params, points, opl), carried, inside)
         laser += 1
 
 
@@ -160,10 +160,10 @@ def _slot(settings: PathSettings, bounce: mi.UInt32) -> mi.UInt32:
     return dr.minimum(bounce - (FIRST_BOUNCE + 1), mi.UInt32(bounces.n_slots - 2))
 
 
-def delay_bin(transport: Transport, points: WallPoints, opl: mi.Float) -> mi.Int32:
+def delay_bin(params: LaunchParams, points: WallPoints, opl: mi.Float) -> mi.Int32:
     """Return the bin of a path: its length in bins, plus what laser and sensor point add."""
-    sensors = transport.sensors
-    delay = opl * transport.bins_per_unit + (points.delay_fraction + sensors.delay_fraction)
+    sensors = params.sensors
+    delay = opl * params.bins_per_unit + (points.delay_fraction + sensors.delay_fraction)
     return mi.Int32(dr.floor(dr.minimum(delay, 1e9))) + points.delay_bins + sensors.delay_bins
 
 

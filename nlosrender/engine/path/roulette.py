@@ -22,7 +22,7 @@ from nlosrender.engine.launch.systematic_sequence import GOLDEN
 PILOT_SAMPLES = 64  # per lane
 PILOT_SEED = 0x5EED  # of its own: the choice does not depend on the render's seed
 LEAST_PATHS = 2**20  # of a capture: fewer are traced faster than tried out
-TURN_TILE = 4  # sensor points along either axis whose paths go on at the same time
+PHASE_TILE = 4  # sensor points along either axis whose paths go on at the same time
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,7 @@ DIRECT = LoopCost(2.0, 8, 3)  # ``trace_direct_paths``
 TRACED = LoopCost(0.5, 8, 1)  # ``trace_paths``
 
 
-def best_every(variance: Callable[[int], float], cost: LoopCost, split: bool) -> int:
+def best_continuation_period(variance: Callable[[int], float], cost: LoopCost, split: bool) -> int:
     """Return of how many paths one goes on.
 
     Parameters
@@ -65,7 +65,7 @@ def best_every(variance: Callable[[int], float], cost: LoopCost, split: bool) ->
     return min(max(round(math.sqrt(third * cost.relative / further)), 1), most)
 
 
-def first_turns(seed: int, points: NDArray[np.integer], nx: int, lanes: int, every: mi.UInt32) -> mi.UInt32:
+def first_phases(seed: int, points: NDArray[np.integer], nx: int, lanes: int, every: mi.UInt32) -> mi.UInt32:
     """Return for every lane which of its first ``every`` paths goes on, the first one being 0.
 
     Parameters
@@ -79,10 +79,10 @@ def first_turns(seed: int, points: NDArray[np.integer], nx: int, lanes: int, eve
     every
         Of so many paths one goes on.
     """
-    tile = points // nx // TURN_TILE * -(-nx // TURN_TILE) + points % nx // TURN_TILE
+    tile = points // nx // PHASE_TILE * -(-nx // PHASE_TILE) + points % nx // PHASE_TILE
     lane = dr.arange(mi.UInt32, lanes)
     own = dr.gather(mi.UInt32, on_device(mi.UInt32, tile), lane % len(points))
     random, _ = mi.sample_tea_32(own, (lane // len(points)) ^ dr.opaque(mi.UInt32, seed * GOLDEN % 2**32), 8)
-    turns = random % every
-    dr.eval(turns)
-    return turns
+    phases = random % every
+    dr.eval(phases)
+    return phases

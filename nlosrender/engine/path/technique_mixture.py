@@ -12,7 +12,7 @@ from nlosrender.capture.grids import Capture
 from nlosrender.capture.time_axis import TimeAxis
 from nlosrender.engine.launch.device_arrays import sensor_points
 from nlosrender.engine.launch.surface_sampler import SurfaceSampler
-from nlosrender.engine.path.hidden_aabb import HiddenBox
+from nlosrender.engine.path.hidden_aabb import HiddenAabb
 from nlosrender.engine.path.laser_connections import offset_origin
 from nlosrender.scene.build import BuiltScene
 
@@ -22,7 +22,9 @@ OFTEN = 0.2  # of the rays from the wall miss the box: asking it costs less than
 BOX_MARGIN = 1e-5  # of the largest coordinate: float32 places of surfaces are within it
 
 
-def best_hidden_fraction(built: BuiltScene, sampler: SurfaceSampler, capture: Capture, time_axis: TimeAxis) -> float:
+def choose_p_hidden_sampling(
+    built: BuiltScene, sampler: SurfaceSampler, capture: Capture, time_axis: TimeAxis
+) -> float:
     """Return the mixture on the relay wall; one technique alone where it suffices: cheaper and less noisy."""
     if sampler.is_empty or built.hidden_bounds is None:
         return 0.0
@@ -41,13 +43,13 @@ def surrounded_share(built: BuiltScene, capture: Capture, time_axis: TimeAxis) -
     return float(dr.mean(dr.select(is_met, mi.Float(1), 0))[0])
 
 
-def box_often_missed(built: BuiltScene, capture: Capture, time_axis: TimeAxis) -> HiddenBox | None:
+def box_often_missed(built: BuiltScene, capture: Capture, time_axis: TimeAxis) -> HiddenAabb | None:
     """Return the box around the hidden geometry, or None where few rays from the wall miss it."""
     if not built.wall.is_planar or built.hidden_bounds is None:
         return None
     least, most = (np.asarray(corner, dtype=np.float64) / built.unit for corner in built.hidden_bounds)
     margin = BOX_MARGIN * (1 + max(np.abs(least).max(), np.abs(most).max()))
-    box = HiddenBox.of(least - margin, most + margin)
+    box = HiddenAabb.of(least - margin, most + margin)
     is_missed = box.is_missed(_rays_from_sensors(built, capture, time_axis))
     return box if float(dr.mean(dr.select(is_missed, mi.Float(1), 0))[0]) > OFTEN else None
 

@@ -2,7 +2,7 @@
 
 What ``trace_paths`` finds as the nearest hit of a ray is known beforehand: the sampled point lies on a known triangle.
 Both legs are any-hit queries, and only points that face sensor and laser point take them. Every lane traces one path
-per iteration, so that the lanes of a packet stay at neighbouring points of the hidden geometry (``strata``).
+per iteration, so that the lanes of a packet stay at neighbouring points of the hidden geometry (``systematic``).
 
 Where further bounces are asked for, every n-th path goes on (``follow_paths``) and carries the light of n: the third
 bounce has most of the variance and the further ones most of the cost. Which of n paths it is, is random: no bias.
@@ -16,18 +16,18 @@ import mitsuba as mi
 
 from nlosrender.capture.bounces import THIRD_BOUNCE
 from nlosrender.engine.launch.histogram import DeviceHistogram
-from nlosrender.engine.launch.launch_params import LaneRandomness, PathSettings, Transport
+from nlosrender.engine.launch.launch_params import LaneRandomness, LaunchParams, PathSettings
 from nlosrender.engine.launch.recurrence import recurrence_steps
 from nlosrender.engine.launch.surface_sampler import SurfaceSample, SurfaceSampler
-from nlosrender.engine.launch.systematic_sequence import Strata, first_coordinate
-from nlosrender.engine.launch.time_gate import thinned_out
+from nlosrender.engine.launch.systematic_sequence import SystematicSequence, first_coordinate
+from nlosrender.engine.launch.time_gate import time_gate_roulette
 from nlosrender.engine.path.laser_connections import connect_to_lasers, connection_segment
 from nlosrender.engine.path.vertex_steps import DirectionNumbers, arrive, leave, turns_away, unit_interval
 
 
 def are_direct(settings: PathSettings, sampler: SurfaceSampler) -> bool:
     """Return whether all paths of these settings begin as those traced here do."""
-    only_hidden = settings.hidden_fraction == 1 and settings.laser_sampling and not settings.finds_spot
+    only_hidden = settings.p_hidden_sampling == 1 and settings.laser_sampling and not settings.finds_spot
     is_first = settings.first_bounce == THIRD_BOUNCE
     return only_hidden and is_first and not sampler.has_analytic and not mi.is_polarized
 
@@ -35,39 +35,37 @@ def are_direct(settings: PathSettings, sampler: SurfaceSampler) -> bool:
 @dr.syntax
 def trace_direct_paths(
     settings: PathSettings,
-    transport: Transport,
+    params: LaunchParams,
     histogram: DeviceHistogram,
     randomness: LaneRandomness,
-    strata: Strata,
+    systematic: SystematicSequence,
     n_samples: mi.UInt32,
-) -> tuple[LaneRandomness, Strata]:
+) -> tuple[LaneRandomness, SystematicSequence]:
     """Trace ``n_samples`` more paths per lane and deposit what they carry; as ``trace_paths``."""
-    sampler, sensors, stride = transport.sampler, transport.sensors, strata.stride
-    sensor, every = sensors.interaction, transport.further_every
-    lane = transport.owner
-    own_laser = transport.lasers.gather(transport.first_laser).interaction.p
+    sampler, sensors, stride = params.sampler, params.sensors, systematic.stride
+    sensor, every = sensors.interaction, params.continuation_period
+    lane = params.row_of_lane
+    own_laser = params.lasers.gather(params.first_laser).interaction.p
     (step,) = recurrence_steps(1)
 
     # ---- State -------------------------------------------------------------------------------------------------
     generator = mi.PCG32(randomness.generator)
-    at = mi.UInt64(strata.at)
+    at = mi.UInt64(systematic.at)
     seq_v = mi.UInt32(randomness.sequence[1])
-    turn = mi.UInt32(randomness.turn)  # paths until the next one that goes on
+    phase = mi.UInt32(randomness.phase)  # paths until the next one that goes on
     done = mi.UInt32(0)  # paths of this lane
 
-    while dr.hint(
-        done < n_samples, exclude=[settings, transport, histogram, sampler, sensors, sensor, own_laser, every]
-    ):
+    while dr.hint(done < n_samples, exclude=[settings, params, histogram, sampler, sensors, sensor, own_laser, every]):
         # ---- Sample a point of the hidden geometry -------------------------------------------------------------
         sample = sampler.sample(first_coordinate(at), unit_interval(seq_v), mi.Bool(True))
         goes_on = mi.Bool(False)
         if dr.hint(settings.goes_on, mode="scalar"):
-            goes_on = turn == 0
-            turn = dr.select(goes_on, every, turn) - 1
-        active = ~turns_away(transport, sample, sensor.p)
-        if dr.hint(sampler.dark_behind and transport.lasers_per_lane == 1, mode="scalar"):
-            active &= goes_on | ~turns_away(transport, sample, own_laser)
-        generator = _connect_sample(settings, transport, histogram, generator, lane, sample, active, goes_on)
+            goes_on = phase == 0
+            phase = dr.select(goes_on, every, phase) - 1
+        active = ~turns_away(params, sample, sensor.p)
+        if dr.hint(sampler.dark_behind and params.lasers_per_lane == 1, mode="scalar"):
+            active &= goes_on | ~turns_away(params, sample, own_laser)
+        generator = _connect_sample(settings, params, histogram, generator, lane, sample, active, goes_on)
 
         # ---- Next path -----------------------------------------------------------------------------------------
         at += stride
@@ -75,13 +73,13 @@ def trace_direct_paths(
         done += 1
 
     sequence = [randomness.sequence[0], seq_v, randomness.sequence[2]]
-    return LaneRandomness(generator, sequence, turn), Strata(at, stride)
+    return LaneRandomness(generator, sequence, phase), SystematicSequence(at, stride)
 
 
 @dr.syntax
 def _connect_sample(
     settings: PathSettings,
-    transport: Transport,
+    params: LaunchParams,
     histogram: DeviceHistogram,
     generator: mi.PCG32,
     lane: mi.UInt32,
@@ -90,13 +88,13 @@ def _connect_sample(
     goes_on: mi.Bool,
 ) -> mi.PCG32:
     """Connect a sampled point to its sensor point and to the lasers, and go on; packets in the dark pass by."""
-    if dr.hint(active, exclude=[settings, transport, histogram, lane, sample, goes_on]):
-        built, sampler, sensor = transport.built, transport.sampler, transport.sensors.interaction
+    if dr.hint(active, exclude=[settings, params, histogram, lane, sample, goes_on]):
+        built, sampler, sensor = params.built, params.sampler, params.sensors.interaction
         leg = sample.p - sensor.p
         distance = dr.norm(leg)
         direction = leg / distance
         received = built.wall_bsdf.eval(mi.BSDFContext(), sensor, sensor.to_local(direction), active)
-        si = sampler.surface(sample, direction, active, settings.only_normals_matter)
+        si = sampler.surface(sample, direction, active, settings.is_plain_diffuse)
         throughput = received * (dr.abs(dr.dot(si.n, direction)) * sampler.area / dr.square(distance))
         seen = active & dr.any(throughput > 0)
         if dr.hint(settings.needs_visibility, mode="scalar"):
@@ -105,7 +103,7 @@ def _connect_sample(
         bounce, no_spot = mi.UInt32(THIRD_BOUNCE), mi.PCG32()
         connect_to_lasers(
             settings,
-            transport,
+            params,
             histogram,
             no_spot,
             lane,
@@ -119,9 +117,9 @@ def _connect_sample(
             coherent=True,
         )
         if dr.hint(settings.goes_on, mode="scalar"):
-            carried = throughput * mi.Float(transport.further_every)
+            carried = throughput * mi.Float(params.continuation_period)
             generator = follow_paths(
-                settings, transport, histogram, generator, lane, si, seen & goes_on, carried, distance
+                settings, params, histogram, generator, lane, si, seen & goes_on, carried, distance
             )
     return generator
 
@@ -129,7 +127,7 @@ def _connect_sample(
 @dr.syntax
 def follow_paths(
     settings: PathSettings,
-    transport: Transport,
+    params: LaunchParams,
     histogram: DeviceHistogram,
     generator: mi.PCG32,
     lane: mi.UInt32,
@@ -147,31 +145,29 @@ def follow_paths(
     alive
         Lanes whose paths go on.
     """
-    built, sampler = transport.built, transport.sampler
+    built, sampler = params.built, params.sampler
     last_vertex = settings.last_vertex
-    deadline = transport.deadline if settings.thins_out else None
+    time_gate = params.time_gate if settings.has_time_gate else None
 
     # ---- State -------------------------------------------------------------------------------------------------
     bounce = mi.UInt32(THIRD_BOUNCE)  # bounce index of the vertex
     on_wall = mi.Bool(False)  # the vertex lies on the relay wall
     medium = mi.Float(1)  # refractive index along the ray
-    is_thinned = mi.Bool(False)  # as in ``trace_paths``
+    is_past_gate = mi.Bool(False)  # as in ``trace_paths``
 
-    while dr.hint(alive, exclude=[settings, transport, histogram, lane, built, sampler, deadline]):
+    while dr.hint(alive, exclude=[settings, params, histogram, lane, built, sampler, time_gate]):
         # ---- Thin out what comes after the window, once a path ---------------------------------------------------
-        alive, is_thinned, throughput = thinned_out(
-            deadline, generator, alive, is_thinned, opl, vertex.p, on_wall, throughput
+        alive, is_past_gate, throughput = time_gate_roulette(
+            time_gate, generator, alive, is_past_gate, opl, vertex.p, on_wall, throughput
         )
 
         # ---- Sample the next direction -----------------------------------------------------------------------------
         numbers = DirectionNumbers.drawn(generator, alive)
         has_target = alive & on_wall
         sample = sampler.sample(numbers.bits_u, numbers.v, has_target)
-        has_target &= ~turns_away(transport, sample, vertex.p)
+        has_target &= ~turns_away(params, sample, vertex.p)
         by_bsdf = alive & ~on_wall
-        way, survival, eta = leave(
-            settings, transport, generator, vertex, on_wall, numbers, sample, by_bsdf, has_target
-        )
+        way, survival, eta = leave(settings, params, generator, vertex, on_wall, numbers, sample, by_bsdf, has_target)
         alive = by_bsdf | has_target
         if dr.hint(settings.russian_roulette, mode="scalar"):
             # by the albedo just met, but not at the third bounce: there few paths go on already
@@ -181,7 +177,7 @@ def follow_paths(
         medium *= eta
 
         # ---- Intersect -----------------------------------------------------------------------------------------
-        there = arrive(settings, transport, way, alive)
+        there = arrive(settings, params, way, alive)
         opl += medium * there.distance
         throughput = dr.select(there.is_reached, throughput * way.value / there.density, 0)
         bounce += 1
@@ -191,7 +187,7 @@ def follow_paths(
         vertex, on_wall = there.si, there.on_wall
         connect_to_lasers(
             settings,
-            transport,
+            params,
             histogram,
             generator,
             lane,

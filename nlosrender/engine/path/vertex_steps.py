@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from nlosrender.engine.launch.launch_params import HIGHEST_SURVIVAL, PathSettings, Transport
+from nlosrender.engine.launch.launch_params import HIGHEST_SURVIVAL, LaunchParams, PathSettings
 from nlosrender.engine.launch.surface_sampler import SurfaceSample
 from nlosrender.engine.path.laser_connections import leg_to_tangent_plane, offset_origin
 from nlosrender.scene.build import BuiltScene
@@ -74,7 +74,7 @@ def unit_interval(bits: mi.UInt32) -> mi.Float:
 
 def intersect(settings: PathSettings, built: BuiltScene, ray: mi.Ray3f, active: mi.Bool) -> mi.SurfaceInteraction3f:
     """Return what a ray meets. Where only normals matter, any frame around them serves, and is quicker to get."""
-    if not settings.only_normals_matter:
+    if not settings.is_plain_diffuse:
         return built.scene.ray_intersect(ray, mi.RayFlags.All, coherent=False, active=active)
     si = built.scene.ray_intersect(ray, mi.RayFlags.Minimal, coherent=False, active=active)
     si.sh_frame = mi.Frame3f(si.n)
@@ -82,9 +82,9 @@ def intersect(settings: PathSettings, built: BuiltScene, ray: mi.Ray3f, active: 
     return si
 
 
-def arrive(settings: PathSettings, transport: Transport, way: Departure, active: mi.Bool) -> Arrival:
+def arrive(settings: PathSettings, params: LaunchParams, way: Departure, active: mi.Bool) -> Arrival:
     """Trace a ray to the next vertex and say how dense its direction was sampled."""
-    built, sampler, q = transport.built, transport.sampler, settings.hidden_fraction
+    built, sampler, q = params.built, params.sampler, settings.p_hidden_sampling
     wall = mi.ShapePtr(built.wall_shape)
     si = intersect(settings, built, way.ray, active)
     is_reached = active & si.is_valid()
@@ -109,7 +109,7 @@ def arrive(settings: PathSettings, transport: Transport, way: Departure, active:
 
 def leave(
     settings: PathSettings,
-    transport: Transport,
+    params: LaunchParams,
     generator: mi.PCG32,
     vertex: mi.SurfaceInteraction3f,
     on_wall: mi.Bool,
@@ -137,7 +137,7 @@ def leave(
         The departure; what the roulette may let a path survive with, the albedo just met, 1 on the way to a target;
         and what the refractive index along the ray is multiplied by.
     """
-    built, q = transport.built, settings.hidden_fraction
+    built, q = params.built, settings.p_hidden_sampling
     context = mi.BSDFContext()
     way = Departure.none(built)
     wo, survival, eta = mi.Vector3f(0, 0, 1), mi.Float(1), mi.Float(1)
@@ -164,7 +164,7 @@ def leave(
         wo = dr.select(has_target, local, wo)
         way.value = dr.select(has_target, f, way.value)
         way.bsdf_density = dr.select(has_target, (1 - q) * pdf, way.bsdf_density)
-        way.hidden_density = dr.select(on_wall & ~way.is_delta, q / transport.sampler.area, 0)
+        way.hidden_density = dr.select(on_wall & ~way.is_delta, q / params.sampler.area, 0)
     world = vertex.to_world(wo)
     way.origin = mi.Point3f(vertex.p)
     ray_origin = offset_origin(built, vertex, world)
@@ -175,15 +175,15 @@ def leave(
     return way, survival, eta
 
 
-def turns_away(transport: Transport, sample: SurfaceSample, origin: mi.Point3f) -> mi.Bool:
+def turns_away(params: LaunchParams, sample: SurfaceSample, origin: mi.Point3f) -> mi.Bool:
     """Return whether a sampled point shows its dark side to ``origin``: such a path ends without a ray."""
-    if not transport.sampler.dark_behind:
+    if not params.sampler.dark_behind:
         return mi.Bool(False)
     return dr.dot(sample.n, sample.p - origin) >= 0
 
 
-def misses_hidden(transport: Transport, ray: mi.Ray3f) -> mi.Bool:
+def misses_hidden(params: LaunchParams, ray: mi.Ray3f) -> mi.Bool:
     """Return whether a ray from a planar wall passes the hidden geometry by: such a path ends without a ray."""
-    if transport.hidden_box is None:
+    if params.hidden_aabb is None:
         return mi.Bool(False)
-    return transport.hidden_box.is_missed(ray)
+    return params.hidden_aabb.is_missed(ray)

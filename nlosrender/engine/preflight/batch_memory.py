@@ -12,7 +12,7 @@ from nlosrender.engine.engines import Engine
 from nlosrender.engine.preflight.omitted_work import traces_paths
 from nlosrender.engine.virtual_lights.engine import VirtualLightEngine
 from nlosrender.engine.virtual_lights.gather.block_histogram import BlockHistogram
-from nlosrender.engine.virtual_lights.third_bounce import FIRST_COARSENESS, REFINEMENT
+from nlosrender.engine.virtual_lights.third_bounce import COARSEST_SCALE, REFINEMENT
 from nlosrender.errors import ConfigError, Problem, RenderError
 
 PATCH_BYTES = 400  # float64 on the host, while they are cut and joined, and float32 on the device
@@ -99,7 +99,7 @@ def _points(engine: Engine) -> str:
 
 
 def _refuse_patches(engine: VirtualLightEngine, memory_limit: int) -> None:
-    needed = engine.tessellator.count(FIRST_COARSENESS) * REFINEMENT
+    needed = engine.tessellator.count(COARSEST_SCALE) * REFINEMENT
     if needed * PATCH_BYTES > memory_limit:
         message = (
             f"bins of {engine.time_axis.bin_width_opl:.3g} m need {needed:.1e} patches of the hidden geometry, "

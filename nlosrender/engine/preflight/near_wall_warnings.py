@@ -80,7 +80,9 @@ def _rare_light_warnings(engine: Engine, built: BuiltScene, capture: Capture) ->
     if not isinstance(engine, PathEngine) or capture.scan_type == "confocal" or engine.sampler.is_empty:
         return
     height, (x, y, z) = _nearest_above(built, capture.laser_grid)
-    share = max(engine.hidden_fraction, LEAST_FRACTION) * math.pi * max(height, WALL_OFFSET) ** 2 / engine.sampler.area
+    share = (
+        max(engine.p_hidden_sampling, LEAST_FRACTION) * math.pi * max(height, WALL_OFFSET) ** 2 / engine.sampler.area
+    )
     if share < RARE:
         yield (
             f"a hidden surface lies {height * built.unit:.2g} m before the laser point ({x:.4g}, {y:.4g}, {z:.4g}) m: "

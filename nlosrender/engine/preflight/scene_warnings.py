@@ -18,7 +18,7 @@ from nlosrender.engine.launch.surface_sampler import SAMPLEABLE_PLUGINS, facing_
 from nlosrender.engine.preflight.near_wall_warnings import near_wall_warnings, points_above_wall
 from nlosrender.engine.virtual_lights.elements.tessellator import MAX_PATCHES
 from nlosrender.engine.virtual_lights.engine import VirtualLightEngine
-from nlosrender.engine.virtual_lights.third_bounce import FIRST_COARSENESS, REFINEMENT
+from nlosrender.engine.virtual_lights.third_bounce import COARSEST_SCALE, REFINEMENT
 from nlosrender.scene.build import BuiltScene, wall_box
 from nlosrender.scene.hidden_geometry import Surface
 from nlosrender.scene.pose import Float64
@@ -164,16 +164,16 @@ def _any_visible(built: BuiltScene, surfaces: list[_SurfacePoints], grid: PointG
     """Return for each surface whether any of its points is seen from any of a sample of the grid's points."""
     wall_points = points_above_wall(built, grid)
     step = max(1, len(surfaces) * len(wall_points) * POINTS_PER_SURFACE // MOST_RAYS)
-    origins, targets, owners = [], [], []
+    origins, targets, row_points = [], [], []
     seen = np.zeros(len(surfaces), dtype=bool)
-    for owner, surface in enumerate(surfaces):
+    for row_of_lane, surface in enumerate(surfaces):
         wall, point = np.nonzero(_turned_to(surface, wall_points, GRAZING))
         if not len(wall):  # rays that all graze tell nothing, such as those to a plate almost on the wall
-            seen[owner] = _turned_to(surface, wall_points).any()
+            seen[row_of_lane] = _turned_to(surface, wall_points).any()
         wall, point = wall[::step], point[::step]
         origins.append(wall_points[wall])
         targets.append(surface.points[point])
-        owners.append(np.full(len(wall), owner))
+        row_points.append(np.full(len(wall), row_of_lane))
     start, end = np.concatenate(origins), np.concatenate(targets)
     if len(start):
         ray = mi.Ray3f(
@@ -184,7 +184,7 @@ def _any_visible(built: BuiltScene, surfaces: list[_SurfacePoints], grid: PointG
             [],
         )
         free = ~np.array(built.scene.ray_test(ray), dtype=bool)
-        seen[np.concatenate(owners)[free]] = True
+        seen[np.concatenate(row_points)[free]] = True
     return seen
 
 
@@ -196,7 +196,7 @@ def _bin_warnings(engine: Engine, time_axis: TimeAxis) -> Iterator[str]:
             f"of this size are known (float32, about {finest / 4:.1g} m): light is spread over several bins."
         )
     if isinstance(engine, VirtualLightEngine):
-        needed = engine.tessellator.count(FIRST_COARSENESS) * REFINEMENT
+        needed = engine.tessellator.count(COARSEST_SCALE) * REFINEMENT
         if needed > MAX_PATCHES:
             yield (
                 f"time_axis.bin_width_opl: bins of {time_axis.bin_width_opl:.3g} m are so fine that {needed:.1e} "

@@ -18,15 +18,15 @@ from nlosrender.capture.grids import Capture
 from nlosrender.capture.plan import Batch, Plan, Tile
 from nlosrender.engine.engines import Engine, SamplingEngine
 from nlosrender.engine.launch.histogram import Histogram
-from nlosrender.engine.launch.passes import Kept, Passes
+from nlosrender.engine.launch.passes import Passes, SavedStages
 from nlosrender.engine.launch.sample_schedule import Budget
 from nlosrender.engine.preflight.batch_memory import n_pairs
-from nlosrender.engine.preflight.omitted_work import makes_walks, traces_paths
+from nlosrender.engine.preflight.omitted_work import traces_paths, traces_vpls
 from nlosrender.engine.virtual_lights.engine import VirtualLightEngine
-from nlosrender.engine.virtual_lights.third_bounce import FIRST_COARSENESS, REFINEMENT
+from nlosrender.engine.virtual_lights.third_bounce import COARSEST_SCALE, REFINEMENT
 
 PILOT_SECONDS = 1.0
-SETTLING_SECONDS = 5.0  # of the pilot that says how many paths a target error takes
+CALIBRATION_SECONDS = 5.0  # of the pilot that says how many paths a target error takes
 PILOT_BYTES = 512e6  # of histograms: a forecast must not take the memory of the render
 PILOT_DEPOSITS = 5e8  # of the gather, patches times bins they cover: a fraction of a second
 MOST_PILOTS = 20.0  # pilots' worth of deposits for one sensor point above which no pilot is run
@@ -62,7 +62,7 @@ def estimate_render_time(engine: Engine, plan: Plan, budget: Budget, lanes: int)
         Rendering alone, and what it takes to settle the target error: no start, no compilation, no writing.
     """
     limit = budget.time_limit_s
-    goes_on = traces_paths(engine) or makes_walks(engine)  # as long as there is time
+    goes_on = traces_paths(engine) or traces_vpls(engine)  # as long as there is time
     if limit is not None and budget.spp is None and budget.target_error is None and goes_on:
         return TimeEstimate(limit, "render.time_limit_s")
     pilot = pilot_batch(engine, plan)
@@ -70,17 +70,17 @@ def estimate_render_time(engine: Engine, plan: Plan, budget: Budget, lanes: int)
         return TimeEstimate(limit, "no pilot: the bins are so fine that the gather of one sensor point takes too long")
     begun = time.perf_counter()
     free = budget if isinstance(engine, VirtualLightEngine) else replace(budget, time_limit_s=None)
-    settled = engine.settle(free, seconds=SETTLING_SECONDS)
+    calibrated = engine.calibrate(free, seconds=CALIBRATION_SECONDS)
     seconds, lit_shares = time.perf_counter() - begun, None
     parts = []
     paths = engine.paths if isinstance(engine, VirtualLightEngine) else engine
     if isinstance(engine, VirtualLightEngine):
-        seconds += _light_seconds(engine, plan, pilot, settled)
+        seconds += _light_seconds(engine, plan, pilot, calibrated)
         parts.append("patches and walks settled")
     if traces_paths(engine):
-        traced, rays = _path_seconds(paths, plan, pilot, settled, lanes)
+        traced, rays = _path_seconds(paths, plan, pilot, calibrated, lanes)
         lit_shares = _lit_shares(rays, engine.options.bounces)
-        cut_short = budget.spp is None and seconds > SETTLING_SECONDS
+        cut_short = budget.spp is None and seconds > CALIBRATION_SECONDS
         parts.append("error extrapolated" if cut_short else "time ~ paths")
         seconds += math.inf if traced is None else traced
     points = "pixels" if engine.capture.scan_type == LINE_OF_SIGHT else "sensor points"
@@ -111,7 +111,7 @@ def _deposits_per_sensor(engine: VirtualLightEngine, batch: Batch) -> float:
 
     The size of a patch at distance d is 2 sqrt(d w) with w the bin width, so that it covers 2 sqrt(d / w) bins.
     """
-    patches = engine.tessellator.count(FIRST_COARSENESS) * (1 + REFINEMENT)
+    patches = engine.tessellator.count(COARSEST_SCALE) * (1 + REFINEMENT)
     farthest = float(engine.built.hidden_bounds[1][2]) if engine.built.hidden_bounds is not None else 0.0
     bins = 1 + 2 * math.sqrt(max(farthest, 0.0) / engine.time_axis.bin_width_opl)
     lasers = batch.lasers.size if engine.capture.scan_type == "exhaustive" else 1
@@ -128,7 +128,7 @@ def _middle(tile: Tile, most: int) -> Tile:
 
 
 def _path_seconds(
-    paths: SamplingEngine, plan: Plan, pilot: Batch, settled: Budget, lanes: int
+    paths: SamplingEngine, plan: Plan, pilot: Batch, calibrated: Budget, lanes: int
 ) -> tuple[float | None, Histogram]:
     """Return the seconds of path tracing, None when the settled paths are not known, and what the pilot saw."""
     paths.render(pilot, Budget(spp=1))  # compiles
@@ -141,9 +141,9 @@ def _path_seconds(
     per_path = max(seconds - overhead, 1e-6) / max(second.samples - first.samples, 1) / pilot.sensors.size
     if launches.seconds_per_sample is not None:
         per_path = launches.seconds_per_sample / plan.replicas / pilot.sensors.size
-    if settled.spp is None:
+    if calibrated.spp is None:
         return None, second
-    needed = float(math.ceil(settled.spp / plan.replicas) * plan.replicas)
+    needed = float(math.ceil(calibrated.spp / plan.replicas) * plan.replicas)
     largest = max(batch.sensors.size for batch in plan.batches)
     # A pilot of a few sensor points leaves processors idle that the render will use; a quarter of the lanes fills
     # their vector units, the rest only evens out the load.
@@ -160,7 +160,7 @@ class _Launches:
     def __init__(self) -> None:
         self._marks: list[tuple[float, int]] = []  # when, and samples per lane so far
 
-    def __call__(self, take: Callable[[], Kept]) -> None:
+    def __call__(self, take: Callable[[], SavedStages]) -> None:
         (snapshot,) = take().values()
         self._marks.append((time.perf_counter(), snapshot.numbers["done"]))
 
@@ -194,26 +194,26 @@ def _lit_shares(pilot: Histogram, bounces: BounceAxis) -> tuple[float | None, ..
     return tuple(None if slot == third else share for slot, share in enumerate(shares))
 
 
-def _light_seconds(engine: VirtualLightEngine, plan: Plan, pilot: Batch, settled: Budget) -> float:
+def _light_seconds(engine: VirtualLightEngine, plan: Plan, pilot: Batch, calibrated: Budget) -> float:
     """Return the seconds of the gather and the walks."""
     part = _middle(pilot.sensors, max(1, pilot.sensors.size // 4))
     quarter = Batch(part, part if engine.capture.scan_type == "confocal" else pilot.lasers)
-    fineness = settled.fineness or FIRST_COARSENESS
-    engine.third.gather(pilot, fineness)  # compiles
+    patch_scale = calibrated.patch_scale or COARSEST_SCALE
+    engine.third.gather(pilot, patch_scale)  # compiles
     if traces_paths(engine):
-        seconds = _extrapolated(engine, plan, pilot, quarter, lambda batch: engine.third.pair(batch, fineness))
+        seconds = _extrapolated(engine, plan, pilot, quarter, lambda batch: engine.third.pair(batch, patch_scale))
     else:  # all that a render does, with one round of walks; the other rounds add up
-        once = replace(settled, rounds=1, target_error=None, time_limit_s=None)
+        once = replace(calibrated, rounds=1, target_error=None, time_limit_s=None)
         engine.render(quarter, once)  # compiles
         seconds = _extrapolated(engine, plan, pilot, quarter, lambda batch: engine.render(batch, once))
-    further, rounds = engine.further, settled.rounds or 0
+    further, rounds = engine.further, calibrated.rounds or 0
     if further is not None and rounds > 1:
 
-        def walk(batch: Batch) -> None:
+        def subpath(batch: Batch) -> None:
             further.accumulate(batch, further.histogram(batch, plan.replicas), 0)
             dr.sync_thread()
 
-        seconds += (rounds - 1) * _extrapolated(engine, plan, pilot, quarter, walk)
+        seconds += (rounds - 1) * _extrapolated(engine, plan, pilot, quarter, subpath)
     return seconds
 
 

@@ -100,10 +100,10 @@ def unsampled_paths(engine: Engine) -> tuple[UnsampledPaths, ...]:
 
 
 def _classes(notation: str, found: Iterable[SpecularLight], what: str, advice: str) -> Iterator[UnsampledPaths]:
-    lights = sorted(found, key=lambda light: (light.first_bounce, light.item))
-    if lights:
-        items = tuple(dict.fromkeys(light.item for light in lights))
-        yield UnsampledPaths(notation, lights[0].first_bounce, items, what, advice)
+    packed = sorted(found, key=lambda light: (light.first_bounce, light.item))
+    if packed:
+        items = tuple(dict.fromkeys(light.item for light in packed))
+        yield UnsampledPaths(notation, packed[0].first_bounce, items, what, advice)
 
 
 def _listed(items: tuple[str, ...]) -> str:

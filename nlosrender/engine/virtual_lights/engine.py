@@ -21,12 +21,12 @@ from nlosrender.engine.launch.occlusion import nothing_occludes
 from nlosrender.engine.launch.passes import Passes, Snapshot
 from nlosrender.engine.launch.pilot_points import Pilot, pilot_of
 from nlosrender.engine.launch.sample_schedule import DEFAULT_TARGET, Budget
-from nlosrender.engine.path.engine import PathEngine, PathOptions
+from nlosrender.engine.path.engine import PathEngine, RenderOptions
 from nlosrender.engine.virtual_lights.elements.tessellator import Tessellator, wall_sees_itself
 from nlosrender.engine.virtual_lights.gather.lighting import GatherSettings
 from nlosrender.engine.virtual_lights.reciprocity import is_reciprocal
 from nlosrender.engine.virtual_lights.third_bounce import (
-    FIRST_COARSENESS,
+    COARSEST_SCALE,
     REFINEMENT,
     Gathered,
     ThirdBounce,
@@ -36,7 +36,7 @@ from nlosrender.engine.virtual_lights.third_bounce import (
 from nlosrender.engine.virtual_lights.vpls.gather import (
     SHARES_OF_THIRD,
     SQUARES,
-    FurtherBounces,
+    VplBounces,
     rounds_needed,
 )
 from nlosrender.errors import RenderError
@@ -67,7 +67,7 @@ class VirtualLightEngine:
 
     name = "virtual_lights"
 
-    def __init__(self, built: BuiltScene, capture: Capture, time_axis: TimeAxis, options: PathOptions, lanes: int):
+    def __init__(self, built: BuiltScene, capture: Capture, time_axis: TimeAxis, options: RenderOptions, lanes: int):
         self.built, self.capture, self.time_axis, self.options, self.lanes = built, capture, time_axis, options, lanes
         self.paths = PathEngine(built, capture, time_axis, options, first_bounce=THIRD_BOUNCE + 1)
         self.tessellator = Tessellator(built, capture, time_axis.bin_width_opl / built.unit)
@@ -81,12 +81,12 @@ class VirtualLightEngine:
         all_lambertian = self.settings.is_diffuse and is_lambertian(built.wall_shape.bsdf())
         reciprocal = is_reciprocal(built, capture, time_axis.n_bins, is_lambertian=all_lambertian)
         self.third = ThirdBounce(self.paths, self.tessellator, self.settings, lanes, reciprocal)
-        self.further: FurtherBounces | None = None  # else the path engine
+        self.further: VplBounces | None = None  # else the path engine
         if self.has_further_bounces and self.settings.is_diffuse:
-            clearances = self.third.clearances if self.settings.needs_visibility else None
-            self.further = FurtherBounces(self.paths, self.tessellator, clearances)
+            masks = self.third.masks if self.settings.needs_visibility else None
+            self.further = VplBounces(self.paths, self.tessellator, masks)
         self.reason = f"Lambertian surfaces before a {'planar' if built.wall.is_planar else 'curved'} wall"
-        self._settled: dict[Budget, Budget] = {}
+        self._calibrated: dict[Budget, Budget] = {}
 
     def set_up(self) -> None:
         """Make what all resolutions and batches share, else made when it is first needed: it grows with the triangles.
@@ -94,8 +94,8 @@ class VirtualLightEngine:
         Sums over small cells, and the tree of what may hide something.
         """
         self.tessellator.set_up()
-        if self.settings.needs_visibility and self.third.clearances.are_worthwhile(self.capture.n_sensors):
-            self.third.clearances.set_up()
+        if self.settings.needs_visibility and self.third.masks.pay_off(self.capture.n_sensors):
+            self.third.masks.set_up()
 
     @property
     def has_further_bounces(self) -> bool:
@@ -120,39 +120,39 @@ class VirtualLightEngine:
         """Seconds spent compiling so far; the gather's own kernels count as rendering."""
         return self.paths.compile_seconds
 
-    def settle(self, budget: Budget, seconds: float = math.inf) -> Budget:
+    def calibrate(self, budget: Budget, seconds: float = math.inf) -> Budget:
         """Turn a target error into settings for the whole capture, tried on a few of its points.
 
         The settings do not depend on how the capture is cut. With a time limit only the patches are settled.
-        A pilot of paths ends after ``seconds``, as for ``settled_by_pilot``.
+        A pilot of paths ends after ``seconds``, as for ``calibrated_by_pilot``.
         """
-        if budget.fineness is not None:
+        if budget.patch_scale is not None:
             return budget
-        if budget not in self._settled:
-            settled = self.settle_lights(budget)
+        if budget not in self._calibrated:
+            calibrated = self.calibrate_lights(budget)
             if self.has_further_bounces and self.further is None:
-                squares = self.third.gather(pilot_of(self.capture), settled.fineness or FIRST_COARSENESS).squares
+                squares = self.third.gather(pilot_of(self.capture), calibrated.patch_scale or COARSEST_SCALE).squares
                 goal = REST_OF_MANY * (budget.target_error or DEFAULT_TARGET)
-                paths = self.paths.settle(replace(budget, target_error=goal), squares, seconds)
-                settled = replace(settled, spp=paths.spp)
+                paths = self.paths.calibrate(replace(budget, target_error=goal), squares, seconds)
+                calibrated = replace(calibrated, spp=paths.spp)
             if math.isfinite(seconds):
-                return settled
-            self._settled[budget] = settled
-        return self._settled[budget]
+                return calibrated
+            self._calibrated[budget] = calibrated
+        return self._calibrated[budget]
 
-    def settle_lights(self, budget: Budget) -> Budget:
+    def calibrate_lights(self, budget: Budget) -> Budget:
         """Return ``budget`` with the settings of patches and walks; what the path engine has to do is left open."""
         pilot = pilot_of(self.capture)
         target = budget.target_error or DEFAULT_TARGET
         share = THIRD_OF_MANY if self.has_further_bounces else THIRD_ALONE
         if budget.time_limit_s is not None:
-            return replace(budget, fineness=self._fineness_in_time(budget, share * target))
+            return replace(budget, patch_scale=self._patch_scale_in_time(budget, share * target))
         if self.further is not None:
             share = SHARES_OF_THIRD[0]
         few = self._pilot_of_patches(pilot)
-        fineness, third = self.third.settle(few, share * target)
+        patch_scale, third = self.third.calibrate(few, share * target)
         if self.further is None:
-            return replace(budget, fineness=fineness)
+            return replace(budget, patch_scale=patch_scale)
         goal, squares = REST_OF_MANY * target, third.squares * (pilot.sensors.size / few.sensors.size)
         squares += self.paths.second_squares(pilot)
         replicas = max(2, PILOT_LANES // pilot.sensors.size // 2 * 2)
@@ -164,9 +164,9 @@ class VirtualLightEngine:
             error = histogram.relative_error(done, squares)
         share = self.further.share_of_third(third.n_patches, error * math.sqrt(done) / target)
         if share < SHARES_OF_THIRD[0]:
-            fineness, _ = self.third.settle(few, share * target)
+            patch_scale, _ = self.third.calibrate(few, share * target)
         rounds = rounds_needed(error, done, math.sqrt(SQUARES - share**2) * target)
-        return replace(budget, fineness=fineness, rounds=rounds)
+        return replace(budget, patch_scale=patch_scale, rounds=rounds)
 
     def _pilot_of_patches(self, pilot: Pilot) -> Pilot:
         """Return the pilot that patches are settled on: few points, unless some surface is nearer than they are apart.
@@ -185,10 +185,10 @@ class VirtualLightEngine:
         The variance of the third bounce is the square of its estimated discretisation error.
         """
         begun, passes = time.perf_counter(), passes or Passes()
-        budget = self.settle(budget)
-        fineness = budget.fineness or FIRST_COARSENESS
+        budget = self.calibrate(budget)
+        patch_scale = budget.patch_scale or COARSEST_SCALE
         shared = 0.5 if self.has_further_bounces else 1.0
-        coarse, fine = self.third.pair(batch, fineness, passes.stage("third bounce", 0, shared))
+        coarse, fine = self.third.pair(batch, patch_scale, passes.stage("third bounce", 0, shared))
         left = budget.time_limit_s
         if left is not None:
             left = max(0.0, left - (time.perf_counter() - begun))
@@ -227,14 +227,14 @@ class VirtualLightEngine:
             done, skipped, before = (earlier.numbers[name] for name in ("done", "skipped", "seconds"))
         begun, share = time.perf_counter() - before, 0.0
 
-        def told(skipped: int) -> None:
+        def report_progress(skipped: int) -> None:
             numbers = {"done": done, "skipped": skipped, "seconds": time.perf_counter() - begun}
             numbers["groups"] = contrasts.groups
-            kept = {"contrasts": contrasts.sums, "grouped": contrasts.grouped}
-            passes.between(share, lambda: Snapshot({"sums": histogram.sums.numpy()} | kept, numbers))
+            saved = {"contrasts": contrasts.sums, "grouped": contrasts.grouped}
+            passes.between(share, lambda: Snapshot({"sums": histogram.sums.numpy()} | saved, numbers))
 
         while True:
-            self.further.accumulate(batch, histogram, done, told, skipped)
+            self.further.accumulate(batch, histogram, done, report_progress, skipped)
             done, skipped = done + 1, 0
             if budget.rounds is not None:
                 share = done / budget.rounds
@@ -246,35 +246,35 @@ class VirtualLightEngine:
             contrasts.add(done, share >= 1)
             if share >= 1:
                 break
-            told(0)
+            report_progress(0)
         bounces = self.options.bounces
         first = bounces.slot(THIRD_BOUNCE + 1)
         slots = range(-first, bounces.n_slots - first)
         statistics = histogram.statistics(done, self.paths.scale, slots)
         errors = contrasts.result(self.paths.scale / (done * self.options.replicas), slots)
         mean, variance = (histogram.on_host(values) for values in statistics)
-        impulses = done * self.further.impulses_per_round
+        contributions = done * self.further.contributions_per_round
         if not self.built.wall.is_planar:
             mean[:, :1] += self.paths.second_bounce(batch)
-        return Histogram(mean[..., :-1], variance[..., :-1], mean[..., -1], impulses, errors)
+        return Histogram(mean[..., :-1], variance[..., :-1], mean[..., -1], contributions, errors)
 
-    def _fineness_in_time(self, budget: Budget, target: float) -> float:
+    def _patch_scale_in_time(self, budget: Budget, target: float) -> float:
         """Return the fineness for ``target``, or the one that half of the time is predicted to suffice for."""
         pilot = pilot_of(self.capture)
         pairs = self.capture.n_sensors * (self.capture.n_lasers if self.capture.scan_type == "exhaustive" else 1)
         lasers = pilot.lasers.size if self.capture.scan_type == "exhaustive" else 1
         more = pairs / (pilot.sensors.size * lasers)
-        fineness = FIRST_COARSENESS
-        coarse, second = self.third.gather(pilot, fineness), self.paths.second_squares(pilot)
+        patch_scale = COARSEST_SCALE
+        coarse, second = self.third.gather(pilot, patch_scale), self.paths.second_squares(pilot)
         while True:
-            finer = self.third.finer(fineness, REFINEMENT)
+            finer = self.third.finer(patch_scale, REFINEMENT)
             begun = time.perf_counter()
             fine = self.third.gather(pilot, finer)
             predicted = (time.perf_counter() - begun) * more * 4
             error = estimated_error(coarse, fine, second)
             if error <= target or predicted > (budget.time_limit_s or 0.0) / 2:
-                return finer if error <= target else fineness
-            fineness, coarse = finer, fine
+                return finer if error <= target else patch_scale
+            patch_scale, coarse = finer, fine
 
 
 def is_lambertian(bsdf: mi.BSDF) -> bool:

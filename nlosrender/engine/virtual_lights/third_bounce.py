@@ -13,27 +13,27 @@ from numpy.typing import NDArray
 from nlosrender.capture.plan import Batch
 from nlosrender.engine.launch.device_arrays import on_device
 from nlosrender.engine.launch.histogram import HistogramShape, relative_l2_error
-from nlosrender.engine.launch.launch_params import Transport
+from nlosrender.engine.launch.launch_params import LaunchParams
 from nlosrender.engine.launch.passes import Passes, Snapshot
 from nlosrender.engine.launch.pilot_points import Pilot
 from nlosrender.engine.path.engine import PathEngine
 from nlosrender.engine.virtual_lights.elements.patches import Patches
 from nlosrender.engine.virtual_lights.elements.tessellator import MAX_PATCHES, MOST_KEPT, Tessellator
 from nlosrender.engine.virtual_lights.gather.block_histogram import BlockHistogram
-from nlosrender.engine.virtual_lights.gather.device_patches import Places, upload_patches
+from nlosrender.engine.virtual_lights.gather.device_patches import PatchRegions, upload_patches
 from nlosrender.engine.virtual_lights.gather.gather_passes import GatherPasses
 from nlosrender.engine.virtual_lights.gather.lighting import (
     ROWS,
-    Clearing,
     GatherSettings,
-    Illuminated,
-    Lights,
-    illuminate,
-    lights_of,
+    LitPatches,
+    MaskQuery,
+    PackedPatches,
+    light_patches,
+    pack_patches,
 )
-from nlosrender.engine.virtual_lights.visibility.masks import Clearances, Outlook, count_sensors
+from nlosrender.engine.virtual_lights.visibility.masks import VisibilityMasks, WallTiles, count_sensors
 
-FIRST_COARSENESS = 1.0
+COARSEST_SCALE = 1.0
 NEAR = 1e-3  # engine units: the centres of nearer patches are rounded by more than 1e-4 of their distance
 REFINEMENT = 3.0  # at least so many times more patches between the two resolutions that are compared
 APART = 2.5  # at least so many times fewer patches has what a resolution is compared with, where there is any
@@ -49,7 +49,7 @@ class Gathered:
 
     values: NDArray[np.float64]
     n_patches: int
-    coarseness: float
+    patch_scale: float
     merged: float  # share of the area that is in clusters
 
     @property
@@ -59,12 +59,12 @@ class Gathered:
 
 
 @dataclass(frozen=True, eq=False)
-class LitPatches:
+class ShadowRayTargets:
     """Patches that some laser point lights [engine units], and what is known of the rays that sensor points ask for."""
 
     positions: NDArray[np.float64]  # (n, 3) where rays from sensor points end
     normals: NDArray[np.float64]  # (n, 3)
-    clearance: NDArray[np.uint64]  # (n,) see ``Clearances.of``
+    mask: NDArray[np.uint64]  # (n,) see ``VisibilityMasks.of``
     tiles: NDArray[np.uint64]  # (sensors,) bit of the tile that each sensor point lies in, numbered as in the batch
 
 
@@ -72,7 +72,7 @@ class LitPatches:
 class _Lanes:
     """One lane per sensor point and replica, neighbours together."""
 
-    transport: Transport  # what they read
+    params: LaunchParams  # what they read
     index: mi.UInt32
     replica: mi.UInt32
     order: NDArray[np.int64]  # (sensors,) the sensor point of each lane of a replica, numbered as in the batch
@@ -107,30 +107,32 @@ class ThirdBounce:
     ):
         self.paths, self.tessellator, self.settings, self.lanes = paths, tessellator, settings, lanes
         self.is_reciprocal = is_reciprocal
-        self.clearances = Clearances(paths.built)
-        self._kept: dict[float, Illuminated] = {}  # per coarseness
+        self.masks = VisibilityMasks(paths.built)
+        self._saved: dict[float, LitPatches] = {}  # per coarseness
 
-    def gather(self, batch: Batch | Pilot, coarseness: float, passes: Passes | None = None) -> Gathered:
+    def gather(self, batch: Batch | Pilot, patch_scale: float, passes: Passes | None = None) -> Gathered:
         """Gather a batch at one resolution."""
         passes = passes or Passes()
-        patches = self.tessellator.patches(coarseness)  # made once: large ones are not kept
+        patches = self.tessellator.patches(patch_scale)  # made once: large ones are not kept
         if (earlier := passes.resumed("values")) is not None:
             values = earlier.arrays["values"]
         elif self.is_reciprocal and isinstance(batch, Batch):
-            values = self._by_reciprocity(batch, coarseness, patches, passes)
+            values = self._by_reciprocity(batch, patch_scale, patches, passes)
         else:
-            values = self._sums(batch, coarseness, patches, passes.stage("sums")).on_host()
+            values = self._sums(batch, patch_scale, patches, passes.stage("sums")).on_host()
         passes.finish(Snapshot({"values": values}))
         # of the shared ones: how a capture is cut must not show in the error it states
         merged = float(patches.areas[patches.is_cluster].sum() / max(patches.areas.sum(), 1e-300))
-        count = len(patches) if self.tessellator.regions is None else self.tessellator.count(coarseness)
-        return Gathered(values, max(count, 1), coarseness, merged)  # 1: nothing may face the wall
+        count = len(patches) if self.tessellator.regions is None else self.tessellator.count(patch_scale)
+        return Gathered(values, max(count, 1), patch_scale, merged)  # 1: nothing may face the wall
 
     def forget(self) -> None:
         """Light patches anew from now on, as an engine would that has gathered nothing yet."""
-        self._kept = {}
+        self._saved = {}
 
-    def _by_reciprocity(self, batch: Batch, coarseness: float, patches: Patches, passes: Passes) -> NDArray[np.float64]:
+    def _by_reciprocity(
+        self, batch: Batch, patch_scale: float, patches: Patches, passes: Passes
+    ) -> NDArray[np.float64]:
         """Gather from every two points once: the one with the higher index stands for the sensor point.
 
         Whatever the batch, so that how a capture is cut does not show. A batch of other lasers than sensor points is
@@ -142,21 +144,21 @@ class ThirdBounce:
         if (earlier := one.resumed("values")) is not None:
             values = earlier.arrays["values"]
         else:
-            sums = self._sums(batch, coarseness, patches, one, np.searchsorted(lasers, sensors, side="right"))
+            sums = self._sums(batch, patch_scale, patches, one, np.searchsorted(lasers, sensors, side="right"))
             if is_symmetric:
                 return sums.on_host(is_symmetric=True)
             values = sums.on_host()
         one.finish(Snapshot({"values": values}))
         exchanged = Batch(sensors=batch.lasers, lasers=batch.sensors)
         other = passes.stage("other way", 0.5, 1)
-        others = self._sums(exchanged, coarseness, patches, other, np.searchsorted(sensors, lasers))
+        others = self._sums(exchanged, patch_scale, patches, other, np.searchsorted(sensors, lasers))
         values += others.on_host().swapaxes(2, 3)
         return values
 
     def _sums(
         self,
         batch: Batch | Pilot,
-        coarseness: float,
+        patch_scale: float,
         patches: Patches,
         passes: Passes,
         lasers: NDArray[np.int64] | None = None,
@@ -170,121 +172,125 @@ class ThirdBounce:
         histogram = BlockHistogram(shape, lanes.order)
         work = GatherPasses(self.settings, histogram, passes)
         if len(patches):
-            outlook = self._outlook(batch)
-            lights = self._shared_lights(lanes.transport, shape, coarseness, patches, outlook)
-            tile = outlook.tile_bit(mi.UInt32(0), lanes.transport.sensors.interaction.p)
-            work.gather(lanes.transport, lights, lanes.index, lanes.replica, tile)
-        for labels, near in self.tessellator.regional_patches(coarseness, np.unique(lanes.regions).tolist()):
-            places = Places.of([len(one) for one in near])
+            wall_tiles = self._wall_tiles(batch)
+            packed = self._shared_lights(lanes.params, shape, patch_scale, patches, wall_tiles)
+            tile = wall_tiles.tile_bit(mi.UInt32(0), lanes.params.sensors.interaction.p)
+            work.gather(lanes.params, packed, lanes.index, lanes.replica, tile)
+        for labels, near in self.tessellator.regional_patches(patch_scale, np.unique(lanes.regions).tolist()):
+            places = PatchRegions.of([len(one) for one in near])
             if not len(places.numbers):  # nothing is close to the wall there
                 continue
             chosen = np.flatnonzero(np.isin(lanes.regions, labels))
             part = np.searchsorted(labels, lanes.regions[chosen]) * shape.replicas + chosen // shape.sensors
             index = on_device(mi.UInt32, chosen)
-            some, outlook = lanes.transport.of_lanes(index), self._outlook(batch, labels)
-            illuminated = self._illuminate(some, shape, Patches.joined(near), places, outlook)
-            lights = lights_of(self.settings, some, illuminated, shape.replicas, shape.lasers)
-            tile = outlook.tile_bit(on_device(mi.UInt32, part // shape.replicas), some.sensors.interaction.p)
-            work.gather(some, lights, index, on_device(mi.UInt32, part), tile)
+            some, wall_tiles = lanes.params.gather_lanes(index), self._wall_tiles(batch, labels)
+            lit_patches = self._light_by_lasers(some, shape, Patches.joined(near), places, wall_tiles)
+            packed = pack_patches(self.settings, some, lit_patches, shape.replicas, shape.lasers)
+            tile = wall_tiles.tile_bit(on_device(mi.UInt32, part // shape.replicas), some.sensors.interaction.p)
+            work.gather(some, packed, index, on_device(mi.UInt32, part), tile)
         return histogram
 
-    def lit_patches(self, batch: Batch | Pilot, coarseness: float) -> LitPatches:
+    def shadow_ray_targets(self, batch: Batch | Pilot, patch_scale: float) -> ShadowRayTargets:
         """Return the patches that the gather of a batch goes through, in its order; those all sensor points share."""
         shape = self.shape(batch)
-        lanes, patches, outlook = self._lanes(batch, shape), self.tessellator.patches(coarseness), self._outlook(batch)
-        lights = self._shared_lights(lanes.transport, shape, coarseness, patches, outlook)
-        rows = np.array(lights.packed, np.float32).reshape(-1, ROWS, 4)
-        ends, normals = (rows[:, 3] + rows[:, 4] + rows[:, 5])[:, :3], np.array(lights.interaction.n, np.float64).T
+        lanes, patches, wall_tiles = (
+            self._lanes(batch, shape),
+            self.tessellator.patches(patch_scale),
+            self._wall_tiles(batch),
+        )
+        packed = self._shared_lights(lanes.params, shape, patch_scale, patches, wall_tiles)
+        rows = np.array(packed.packed, np.float32).reshape(-1, ROWS, 4)
+        ends, normals = (rows[:, 3] + rows[:, 4] + rows[:, 5])[:, :3], np.array(packed.interaction.n, np.float64).T
         tiles = np.empty(shape.sensors, np.uint64)
-        bits = np.array(outlook.tile_bit(mi.UInt32(0), lanes.transport.sensors.interaction.p))
+        bits = np.array(wall_tiles.tile_bit(mi.UInt32(0), lanes.params.sensors.interaction.p))
         tiles[lanes.order] = bits[: shape.sensors]
-        return LitPatches(ends.astype(np.float64), normals, np.array(lights.clearance), tiles)
+        return ShadowRayTargets(ends.astype(np.float64), normals, np.array(packed.mask), tiles)
 
     def _shared_lights(
-        self, transport: Transport, shape: HistogramShape, coarseness: float, patches: Patches, outlook: Outlook
-    ) -> Lights:
+        self, params: LaunchParams, shape: HistogramShape, patch_scale: float, patches: Patches, wall_tiles: WallTiles
+    ) -> PackedPatches:
         """Return what all sensor points gather; patches are kept lit where that serves other batches, too."""
-        illuminated = self._kept.get(coarseness)
-        if illuminated is None:
-            illuminated = self._illuminate(transport, shape, patches, Places.of([len(patches)]), outlook)
-        elif self.settings.needs_visibility and not illuminated.is_cleared:  # so far few points have looked
-            illuminated = illuminated.cleared(Clearing(self.clearances, outlook))
+        lit_patches = self._saved.get(patch_scale)
+        if lit_patches is None:
+            lit_patches = self._light_by_lasers(params, shape, patches, PatchRegions.of([len(patches)]), wall_tiles)
+        elif self.settings.needs_visibility and not lit_patches.is_cleared:  # so far few points have looked
+            lit_patches = lit_patches.cleared(MaskQuery(self.masks, wall_tiles))
         if self.settings.lights_once and len(patches) <= MOST_KEPT:
             # a batch looks at two resolutions
-            others = [(other, lit) for other, lit in self._kept.items() if other != coarseness]
-            self._kept = dict([*others, (coarseness, illuminated)][-2:])
-        return lights_of(self.settings, transport, illuminated, shape.replicas, shape.lasers)
+            others = [(other, lit) for other, lit in self._saved.items() if other != patch_scale]
+            self._saved = dict([*others, (patch_scale, lit_patches)][-2:])
+        return pack_patches(self.settings, params, lit_patches, shape.replicas, shape.lasers)
 
-    def _illuminate(
-        self, transport: Transport, shape: HistogramShape, patches: Patches, places: Places, outlook: Outlook
-    ) -> Illuminated:
+    def _light_by_lasers(
+        self, params: LaunchParams, shape: HistogramShape, patches: Patches, places: PatchRegions, wall_tiles: WallTiles
+    ) -> LitPatches:
         is_near = self.tessellator.nearest < NEAR
         on_device = upload_patches(self.paths.built, patches, places, self.paths.options.seed, is_near)
-        return illuminate(self.settings, transport, on_device, Clearing(self.clearances, outlook), shape.lasers)
+        return light_patches(self.settings, params, on_device, MaskQuery(self.masks, wall_tiles), shape.lasers)
 
-    def _outlook(self, batch: Batch | Pilot, regions: list[int] | None = None) -> Outlook:
+    def _wall_tiles(self, batch: Batch | Pilot, regions: list[int] | None = None) -> WallTiles:
         """Return what patches are seen from: all points, or the sensor points of some regions."""
         built, capture = self.paths.built, self.paths.capture
         if regions is None or self.tessellator.regions is None:
-            return Outlook.of(built, capture, batch, with_lasers=not self.settings.has_one_laser)
+            return WallTiles.of(built, capture, batch, with_lasers=not self.settings.has_one_laser)
         labels = self.tessellator.regions.labels
         points = capture.sensor_grid.positions.reshape(-1, 3) / built.unit
         groups = [points[labels == label] for label in regions]
-        return Outlook.around(groups, count_sensors(capture, batch) // len(self.tessellator.regions.near))
+        return WallTiles.around(groups, count_sensors(capture, batch) // len(self.tessellator.regions.near))
 
-    def pair(self, batch: Batch | Pilot, fineness: float, passes: Passes | None = None) -> tuple[Gathered, Gathered]:
-        """Gather a batch at ``fineness`` and at the coarser resolution it is compared with."""
+    def pair(self, batch: Batch | Pilot, patch_scale: float, passes: Passes | None = None) -> tuple[Gathered, Gathered]:
+        """Gather a batch at ``patch_scale`` and at the coarser resolution it is compared with."""
         passes = passes or Passes()
-        coarse = self.gather(batch, self.coarser(fineness), passes.stage("coarse", 0, 1 / (1 + REFINEMENT)))
-        return coarse, self.gather(batch, fineness, passes.stage("fine", 1 / (1 + REFINEMENT), 1))
+        coarse = self.gather(batch, self.coarser(patch_scale), passes.stage("coarse", 0, 1 / (1 + REFINEMENT)))
+        return coarse, self.gather(batch, patch_scale, passes.stage("fine", 1 / (1 + REFINEMENT), 1))
 
-    def settle(self, pilot: Pilot, target: float) -> tuple[float, Gathered]:
+    def calibrate(self, pilot: Pilot, target: float) -> tuple[float, Gathered]:
         """Return the fineness whose estimated error is at most ``target``, and the pilot's third bounce at it.
 
         The error is that of the second and third bounce together.
         """
         second = self.paths.second_squares(pilot)
-        tried = [(self.gather(pilot, FIRST_COARSENESS), math.inf)]  # and its error, coarse to fine
-        fineness = self.finer(FIRST_COARSENESS, REFINEMENT)
+        levels = [(self.gather(pilot, COARSEST_SCALE), math.inf)]  # and its error, coarse to fine
+        patch_scale = self.finer(COARSEST_SCALE, REFINEMENT)
         while True:
-            fine = self.gather(pilot, fineness)
+            fine = self.gather(pilot, patch_scale)
             # None nearer: two that differ in few patches only differ by more than either errs, by how they are cut.
-            tried = tried[_last_at_most(tried, fine.n_patches / APART) :]
-            coarse = tried[0][0]
+            levels = levels[_last_at_most(levels, fine.n_patches / APART) :]
+            coarse = levels[0][0]
             error = estimated_error(coarse, fine, second)
-            coarser = self.coarser(fineness)
-            if error <= target and not math.isclose(coarse.coarseness, coarser, rel_tol=SAME):
+            coarser = self.coarser(patch_scale)
+            if error <= target and not math.isclose(coarse.patch_scale, coarser, rel_tol=SAME):
                 # as the render will estimate it, from the pair of resolutions that it has
                 error = max(error, estimated_error(self.gather(pilot, coarser), fine, second))
             needed = fine.n_patches * error / target
             # float32 path lengths and grazing contacts leave an error that no refinement takes away
-            earlier = tried[_last_at_most(tried, fine.n_patches / 2)][1]
+            earlier = levels[_last_at_most(levels, fine.n_patches / 2)][1]
             is_stuck = STUCK * earlier < error < ROUGH and fine.n_patches > 2 * coarse.n_patches
             in_vain = is_stuck or (error < ROUGH and needed > MAX_PATCHES)
             if error <= target or in_vain or 2 * fine.n_patches > MAX_PATCHES:
-                return fineness, fine
-            tried.append((fine, error))
-            fineness = self.finer(fineness, min(max(MARGIN * error / target, 1.25), REFINEMENT))
+                return patch_scale, fine
+            levels.append((fine, error))
+            patch_scale = self.finer(patch_scale, min(max(MARGIN * error / target, 1.25), REFINEMENT))
 
-    def finer(self, coarseness: float, factor: float) -> float:
+    def finer(self, patch_scale: float, factor: float) -> float:
         """Return a coarseness with at least ``factor`` times the patches (a mesh may be finer than asked for).
 
         Of hidden surfaces and wall each: if only one of them became finer, the error of the other would not show.
         """
-        counts, finer = self.tessellator.counts(coarseness), coarseness / math.sqrt(factor)
+        counts, finer = self.tessellator.counts(patch_scale), patch_scale / math.sqrt(factor)
         while any(
             0 < more < 0.9 * factor * count for more, count in zip(self.tessellator.counts(finer), counts, strict=True)
         ):
             finer *= 0.9
         return finer
 
-    def coarser(self, fineness: float) -> float:
-        """Return the coarseness that ``fineness`` is compared with: a third of the patches, or all there are."""
-        counts, coarser = self.tessellator.counts(fineness), fineness * math.sqrt(REFINEMENT)
-        while coarser < FIRST_COARSENESS and any(
+    def coarser(self, patch_scale: float) -> float:
+        """Return the coarseness that ``patch_scale`` is compared with: a third of the patches, or all there are."""
+        counts, coarser = self.tessellator.counts(patch_scale), patch_scale * math.sqrt(REFINEMENT)
+        while coarser < COARSEST_SCALE and any(
             less > count / REFINEMENT for less, count in zip(self.tessellator.counts(coarser), counts, strict=True)
         ):
-            coarser = min(1.1 * coarser, FIRST_COARSENESS)  # beyond it the law of the error's decrease does not hold
+            coarser = min(1.1 * coarser, COARSEST_SCALE)  # beyond it the law of the error's decrease does not hold
         return coarser
 
     def shape(self, batch: Batch | Pilot) -> HistogramShape:
@@ -298,23 +304,23 @@ class ThirdBounce:
         return replace(self.paths.shape(batch, 1), replicas=max(1, min(math.ceil(self.lanes / points), most)))
 
     def _lanes(self, batch: Batch | Pilot, shape: HistogramShape, lasers: NDArray[np.int64] | None = None) -> _Lanes:
-        transport = self.paths.transport(batch, replace(shape, replicas=1))
+        params = self.paths.launch_params(batch, replace(shape, replicas=1))
         indices, order = self.paths.sensor_indices(batch), self.paths.lane_order(batch)
         lane = dr.arange(mi.UInt32, shape.lanes)
-        transport = transport.of_lanes(dr.gather(mi.UInt32, on_device(mi.UInt32, order), lane % shape.sensors))
+        params = params.gather_lanes(dr.gather(mi.UInt32, on_device(mi.UInt32, order), lane % shape.sensors))
         replica = lane // shape.sensors
         dr.eval(lane, replica)
         if lasers is not None:
-            transport = replace(transport, n_lasers=on_device(mi.UInt32, np.tile(lasers[order], shape.replicas)))
+            params = replace(params, n_lasers=on_device(mi.UInt32, np.tile(lasers[order], shape.replicas)))
         regions = np.zeros(shape.lanes, np.int64)
         if self.tessellator.regions is not None:
             regions = np.tile(self.tessellator.regions.labels[indices][order], shape.replicas)
-        return _Lanes(transport, lane, replica, order, regions)
+        return _Lanes(params, lane, replica, order, regions)
 
 
-def _last_at_most(tried: list[tuple[Gathered, float]], n_patches: float) -> int:
+def _last_at_most(levels: list[tuple[Gathered, float]], n_patches: float) -> int:
     """Return the index of the finest resolution of at most so many patches, of the coarsest if all have more."""
-    return max((index for index, (gathered, _) in enumerate(tried) if gathered.n_patches <= n_patches), default=0)
+    return max((index for index, (gathered, _) in enumerate(levels) if gathered.n_patches <= n_patches), default=0)
 
 
 def estimated_error(coarse: Gathered, fine: Gathered, known_squares: float = 0.0) -> float:
@@ -331,7 +337,7 @@ def difference_divisor(coarse: Gathered, fine: Gathered) -> float:
     independent: sqrt(r^1.5 + 1). So are those of clusters, whose boxes lie elsewhere at every coarseness; they fall at
     least as fast, with the boxes' size: where small triangles cease to be merged there may be many more patches.
     """
-    ratio = min(fine.n_patches / coarse.n_patches, (coarse.coarseness / fine.coarseness) ** 2)
+    ratio = min(fine.n_patches / coarse.n_patches, (coarse.patch_scale / fine.patch_scale) ** 2)
     ratio = max(ratio, 1.0 + 1e-9)
     independent = math.sqrt(ratio**1.5 + 1)
     return (1 - fine.merged) * min(ratio - 1, independent) + fine.merged * independent

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import coo_matrix, csr_matrix
 
-from nlosrender.engine.virtual_lights.elements.subdivision import Cells, middles
+from nlosrender.engine.virtual_lights.elements.subdivision import Elements, middles
 from nlosrender.scene.pose import Float64
 
 GRID = 0.8  # edge of a box per size allowed
@@ -40,7 +40,7 @@ UInt64 = NDArray[np.uint64]
 
 
 @dataclass(frozen=True, eq=False)
-class Grains:
+class AreaMoments:
     """Cells, or groups of neighbouring ones that face along the same axis, as sums over their members.
 
     A box stands upright on the axis its members' normals are nearest to: a tilted or bent surface is cut along the
@@ -56,24 +56,24 @@ class Grains:
     slopes: Float64  # (n, 2) mean normals: their components across per that upright
     light: Float64  # (n, 9) area times geometric normal times shading normal, transposed
     boxes: Float64  # (n,) how many boxes of coarseness 1 they cover
-    stands: Int64  # (n,) a member, drawn by area
+    representative: Int64  # (n,) a member, drawn by area
 
     @classmethod
-    def of(cls, cells: Cells, normals: Float64, areas: Float64, allowed: Float64) -> Grains:
+    def of(cls, elements: Elements, normals: Float64, areas: Float64, allowed: Float64) -> AreaMoments:
         """Return cells as they are; parameters as for ``Merger``."""
-        centres, rows = middles(cells.corners), np.arange(len(areas))
+        centres, rows = middles(elements.corners), np.arange(len(areas))
         scales = _scales(allowed)
         upright = np.abs(normals).argmax(axis=1)
         along = normals[rows, upright]
-        light = (areas[:, None, None] * normals[:, :, None] * cells.shading_normals[:, None, :]).reshape(-1, 9)
+        light = (areas[:, None, None] * normals[:, :, None] * elements.shading_normals[:, None, :]).reshape(-1, 9)
         return cls(
-            cells.shapes,
+            elements.shapes,
             scales,
             # a patch of this size at distance d is up to a quarter of this off a linear delay, for all its members
-            allowed**2 / cells.distances,
+            allowed**2 / elements.distances,
             2 * upright + (along > 0),
             _in_box(centres, upright),
-            _place_moments(cells.corners, centres, areas),
+            _place_moments(elements.corners, centres, areas),
             _slopes(normals, upright),
             light,
             covered_boxes(normals, areas, allowed),
@@ -81,25 +81,25 @@ class Grains:
         )
 
     def __len__(self) -> int:
-        return len(self.stands)
+        return len(self.representative)
 
     @property
     def areas(self) -> Float64:
         """Areas (n,) [engine units squared]."""
         return self.places[:, 0]
 
-    def at(self, chosen: NDArray[np.integer | np.bool_]) -> Grains:
+    def at(self, chosen: NDArray[np.integer | np.bool_]) -> AreaMoments:
         """Return the grains that are ``chosen``."""
-        return Grains(*(getattr(self, field.name)[chosen] for field in fields(Grains)))
+        return AreaMoments(*(getattr(self, field.name)[chosen] for field in fields(AreaMoments)))
 
-    def merged(self, coarseness: float, generator: np.random.Generator) -> Grains:
-        """Return one grain per box, of the sizes allowed times ``coarseness``; ``generator`` draws its member."""
-        members = self._members(coarseness)
+    def merged(self, patch_scale: float, generator: np.random.Generator) -> AreaMoments:
+        """Return one grain per box, of the sizes allowed times ``patch_scale``; ``generator`` draws its member."""
+        members = self._members(patch_scale)
         first = members.indices[members.indptr[:-1]]
         places, light, facing = members @ self.places, members @ self.light, self.facing[first]
         upright = facing // 2
         normals = light.reshape(-1, 3, 3)[np.arange(len(first)), :, upright]  # weighted by their upright components
-        return Grains(
+        return AreaMoments(
             self.shapes[first],
             self.scales[first],
             self.levels[first],
@@ -109,24 +109,24 @@ class Grains:
             _slopes(normals, upright),
             light,
             members @ self.boxes,
-            self.stands[_drawn(members, self.areas, generator)],
+            self.representative[_drawn(members, self.areas, generator)],
         )
 
-    def _members(self, coarseness: float) -> csr_matrix:
+    def _members(self, patch_scale: float) -> csr_matrix:
         """Return which of n grains are in which of m boxes: ones in a matrix (m, n)."""
-        across, other, height = self.in_box.T / (coarseness * GRID * 2.0**self.scales)
+        across, other, height = self.in_box.T / (patch_scale * GRID * 2.0**self.scales)
         keys = [np.floor(across), np.floor(other), np.floor(height / TALL), self.shapes, self.scales, self.facing]
         codes, number = _numbered(keys)
-        is_rough = self._slope_variance(number) > (SLOPES * coarseness) ** 2 / 6  # of two axes, uniform in a class
+        is_rough = self._slope_variance(number) > (SLOPES * patch_scale) ** 2 / 6  # of two axes, uniform in a class
         if is_rough.any():  # there one normal does for some directions of lasers and sensor points only
-            keys += [np.where(is_rough[number], np.rint(slope / (SLOPES * coarseness)), 0) for slope in self.slopes.T]
+            keys += [np.where(is_rough[number], np.rint(slope / (SLOPES * patch_scale)), 0) for slope in self.slopes.T]
             codes, number = _numbered(keys)
-        off, level = self._off_plane(number), coarseness * self.levels
+        off, level = self._off_plane(number), patch_scale * self.levels
         is_uneven = np.bincount(number, self.areas * off**2) > np.bincount(number, self.areas * level**2) / 12
         if is_uneven.any():  # surfaces above one another: between them there is no light, nor at one time for both
             keys.append(np.where(is_uneven[number], np.rint(off / level), 0))
             codes, number = _numbered(keys)
-        is_sliver = np.bincount(number, self.boxes) < SLIVER * coarseness**2
+        is_sliver = np.bincount(number, self.boxes) < SLIVER * patch_scale**2
         total = np.bincount(number, self.areas)
         offsets = [np.bincount(number, self.areas * (place % 1)) / total - 0.5 for place in (across, other)]
         number = _without_slivers(codes, is_sliver, np.array(offsets))[number]
@@ -159,7 +159,7 @@ class BoxPlane:
 
     @classmethod
     def of(cls, places: Float64, upright: Int64) -> BoxPlane:
-        """Return the planes of sums (n, 10) as ``Grains.places``, with the axes (n,) that the boxes stand on."""
+        """Return the planes of sums (n, 10) as ``AreaMoments.places``, with the axes (n,) that the boxes stand on."""
         sums, rows = places[:, 1:] / np.maximum(places[:, :1], 1e-300), np.arange(len(places))
         axes = [(upright + 1) % 3, (upright + 2) % 3, upright]
         mean = np.stack([sums[rows, axis] for axis in axes], axis=1)
@@ -187,7 +187,7 @@ def _scales(allowed: Float64) -> Int64:
 def _in_box(vectors: Float64, upright: Int64) -> Float64:
     """Return the components (n, 3) of vectors along the two axes after ``upright``, and along it."""
     rows = np.arange(len(upright))
-    return np.stack([vectors[rows, (upright + turn) % 3] for turn in (1, 2, 0)], axis=1)
+    return np.stack([vectors[rows, (upright + phase) % 3] for phase in (1, 2, 0)], axis=1)
 
 
 def _slopes(normals: Float64, upright: Int64) -> Float64:
@@ -241,9 +241,9 @@ def _without_slivers(codes: UInt64, is_sliver: NDArray[np.bool_], offsets: Float
     neighbours = codes[slivers] + np.where(offsets[side, np.arange(len(slivers))] > 0, steps, -steps)
     beside = np.minimum(np.searchsorted(codes, neighbours), len(codes) - 1)
     joins = (codes[beside] == neighbours) & ~is_sliver[beside]
-    owner = np.arange(len(codes))
-    owner[slivers[joins]] = beside[joins]
-    return np.unique(owner, return_inverse=True)[1]
+    row_of_lane = np.arange(len(codes))
+    row_of_lane[slivers[joins]] = beside[joins]
+    return np.unique(row_of_lane, return_inverse=True)[1]
 
 
 def _drawn(members: csr_matrix, areas: Float64, generator: np.random.Generator) -> Int64:

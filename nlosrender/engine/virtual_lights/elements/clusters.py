@@ -19,9 +19,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from nlosrender.engine.virtual_lights.elements.area_moments import BoxPlane, Grains, Int64
+from nlosrender.engine.virtual_lights.elements.area_moments import AreaMoments, BoxPlane, Int64
 from nlosrender.engine.virtual_lights.elements.patches import Patches
-from nlosrender.engine.virtual_lights.elements.subdivision import Cells, middles
+from nlosrender.engine.virtual_lights.elements.subdivision import Elements, middles
 from nlosrender.scene.pose import Float64
 
 STEEPEST = 0.5  # cosine to the lasers, below which members may face away from them
@@ -37,7 +37,7 @@ class Merger:
 
     Parameters
     ----------
-    cells
+    elements
         Cells of all shapes.
     normals, areas
         (n, 3) and (n,) of the cells.
@@ -47,63 +47,63 @@ class Merger:
         (3,) middle of the laser points [engine units].
     """
 
-    def __init__(self, cells: Cells, normals: Float64, areas: Float64, allowed: Float64, light: Float64):
-        self.cells, self.normals, self.light = cells, normals, light
-        self._cells = Grains.of(cells, normals, areas, allowed)
-        self._grains: dict[float, Grains] = {}  # per coarseness
+    def __init__(self, elements: Elements, normals: Float64, areas: Float64, allowed: Float64, light: Float64):
+        self.elements, self.normals, self.light = elements, normals, light
+        self._element_moments = AreaMoments.of(elements, normals, areas, allowed)
+        self._moments_at: dict[float, AreaMoments] = {}  # per coarseness
 
     @property
     def boxes(self) -> Float64:
         """How many clusters the cells (n,) are at coarseness 1; their number goes with coarseness^-2."""
-        return self._cells.boxes
+        return self._element_moments.boxes
 
     def set_up(self) -> None:
         """Sum up the cells at all resolutions at which that leaves far fewer."""
-        self._grains_of(2.0**-FINER)
+        self._moments_of(2.0**-FINER)
 
-    def clusters(self, chosen: NDArray[np.bool_], coarseness: float, seed: int = 0) -> Patches:
+    def clusters(self, chosen: NDArray[np.bool_], patch_scale: float, seed: int = 0) -> Patches:
         """Return the clusters of the cells that are ``chosen``.
 
         Parameters
         ----------
         chosen
             (n,) which cells; at least one.
-        coarseness
+        patch_scale
             Scales the sizes allowed.
         seed
             Of the draw of the members that stand for their clusters.
         """
-        level = 2.0 ** (math.floor(math.log2(coarseness)) - FINER)
-        members = self._grains_of(level) if chosen.all() else self._cells.at(chosen)
-        merged = members.merged(coarseness, np.random.default_rng(seed))
-        footprint, stands = _Footprint.of(merged), merged.stands
-        areas, normals = _as_one(merged, self.light - footprint.mean)
-        barycentric = middles(self.cells.weights[stands])[:, 1:]
+        level = 2.0 ** (math.floor(math.log2(patch_scale)) - FINER)
+        members = self._moments_of(level) if chosen.all() else self._element_moments.at(chosen)
+        merged = members.merged(patch_scale, np.random.default_rng(seed))
+        parallelogram, representative = _ClusterParallelogram.of(merged), merged.representative
+        areas, normals = _as_one(merged, self.light - parallelogram.mean)
+        barycentric = middles(self.elements.weights[representative])[:, 1:]
         return Patches(
-            footprint.corners(),
+            parallelogram.corners(),
             areas,
-            footprint.mean,
+            parallelogram.mean,
             normals,
-            self.cells.shapes[stands],
-            self.cells.primitives[stands],
+            self.elements.shapes[representative],
+            self.elements.primitives[representative],
             barycentric,
             np.repeat(barycentric[:, None], 3, axis=1),
-            middles(self.cells.corners[stands]),
-            self.normals[stands],
+            middles(self.elements.corners[representative]),
+            self.normals[representative],
             np.ones(len(merged), bool),
         )
 
-    def _grains_of(self, coarseness: float) -> Grains:
+    def _moments_of(self, patch_scale: float) -> AreaMoments:
         """Return all cells, merged to a coarseness that is a power of two where that leaves far fewer."""
-        if WORTHWHILE * self.boxes.sum() > coarseness**2 * len(self._cells):
-            return self._cells
-        if coarseness not in self._grains:
-            finer = self._grains_of(coarseness / 2)
-            self._grains[coarseness] = finer.merged(coarseness, np.random.default_rng(1))
-        return self._grains[coarseness]
+        if WORTHWHILE * self.boxes.sum() > patch_scale**2 * len(self._element_moments):
+            return self._element_moments
+        if patch_scale not in self._moments_at:
+            finer = self._moments_of(patch_scale / 2)
+            self._moments_at[patch_scale] = finer.merged(patch_scale, np.random.default_rng(1))
+        return self._moments_at[patch_scale]
 
 
-def _as_one(merged: Grains, towards: Float64) -> tuple[Float64, Float64]:
+def _as_one(merged: AreaMoments, towards: Float64) -> tuple[Float64, Float64]:
     """Return the area (n,) and normal (n, 3) that stand for those of all members; ``towards`` (n, 3) the lasers."""
     matrices = merged.light.reshape(-1, 3, 3)
     axis, sign = merged.facing // 2, 2 * (merged.facing % 2) - 1
@@ -120,14 +120,14 @@ def _as_one(merged: Grains, towards: Float64) -> tuple[Float64, Float64]:
 
 
 @dataclass(frozen=True, eq=False)
-class _Footprint:
+class _ClusterParallelogram:
     """Where clusters lie: across the axes their boxes stand on, and on the best planes through their members."""
 
     upright: Int64  # (n,) these axes
     plane: BoxPlane
 
     @classmethod
-    def of(cls, merged: Grains) -> _Footprint:
+    def of(cls, merged: AreaMoments) -> _ClusterParallelogram:
         """Return where the members lie."""
         upright = merged.facing // 2
         return cls(upright, BoxPlane.of(merged.places, upright))
@@ -159,8 +159,8 @@ class _Footprint:
     def _from_box(self, vectors: Float64) -> Float64:
         """Return vectors (n, 3) given along the two axes after ``upright``, and along it."""
         rows, result = np.arange(len(vectors)), np.empty_like(vectors)
-        for turn, component in zip((1, 2, 0), vectors.T, strict=True):
-            result[rows, (self.upright + turn) % 3] = component
+        for phase, component in zip((1, 2, 0), vectors.T, strict=True):
+            result[rows, (self.upright + phase) % 3] = component
         return result
 
 

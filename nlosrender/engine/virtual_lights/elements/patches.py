@@ -7,7 +7,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 from numpy.typing import NDArray
 
-from nlosrender.engine.virtual_lights.elements.subdivision import Cells
+from nlosrender.engine.virtual_lights.elements.subdivision import Elements
 from nlosrender.scene.pose import Float64
 
 
@@ -50,17 +50,17 @@ class Patches:
         return cls(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
 
 
-def split_cells(cells: Cells, splits: NDArray[np.int64]) -> Patches:
+def split_cells(elements: Elements, splits: NDArray[np.int64]) -> Patches:
     """Cut every cell into ``splits`` squared similar triangles."""
-    normals = np.cross(cells.corners[:, 1] - cells.corners[:, 0], cells.corners[:, 2] - cells.corners[:, 0])
+    normals = np.cross(elements.corners[:, 1] - elements.corners[:, 0], elements.corners[:, 2] - elements.corners[:, 0])
     lengths = np.linalg.norm(normals, axis=1)
     parts = []
     for n in np.unique(splits):
-        owners = np.flatnonzero(splits == n)
+        row_points = np.flatnonzero(splits == n)
         weights = split_weights(int(n))  # (n^2, 3 corners, 3 barycentric)
-        corners = np.einsum("pkb,tbx->tpkx", weights, cells.corners[owners]).reshape(-1, 3, 3)
-        barycentric = np.einsum("pkb,tbx->tpkx", weights, cells.weights[owners])[..., 1:].reshape(-1, 3, 2)
-        repeated = np.repeat(owners, n * n)
+        corners = np.einsum("pkb,tbx->tpkx", weights, elements.corners[row_points]).reshape(-1, 3, 3)
+        barycentric = np.einsum("pkb,tbx->tpkx", weights, elements.weights[row_points])[..., 1:].reshape(-1, 3, 2)
+        repeated = np.repeat(row_points, n * n)
         units = normals[repeated] / lengths[repeated, None]
         parts.append(
             Patches(
@@ -68,8 +68,8 @@ def split_cells(cells: Cells, splits: NDArray[np.int64]) -> Patches:
                 lengths[repeated] / (2 * n * n),
                 corners.mean(axis=1),
                 units,
-                cells.shapes[repeated],
-                cells.primitives[repeated],
+                elements.shapes[repeated],
+                elements.primitives[repeated],
                 barycentric.mean(axis=1),
                 barycentric,
                 corners.mean(axis=1),

@@ -156,17 +156,17 @@ def _cylinder(shape: RoundShape, around: int, along: int) -> tuple[Patches, Floa
     first /= np.linalg.norm(first)
     second = np.cross(axis, first)
 
-    def point(turn: Float64, height: Float64) -> Float64:
+    def point(phase: Float64, height: Float64) -> Float64:
         """Return points at turns of the circumference and heights in [0, 1]."""
-        radial = np.cos(2 * np.pi * turn)[..., None] * first + np.sin(2 * np.pi * turn)[..., None] * second
+        radial = np.cos(2 * np.pi * phase)[..., None] * first + np.sin(2 * np.pi * phase)[..., None] * second
         return shape.centre + radius * radial + height[..., None] * shape.axis
 
     i, j = (index.ravel() for index in np.meshgrid(np.arange(around), np.arange(along)))
     # (two triangles, 3 corners, turn and height)
     steps = np.array([[[0, 0], [1, 0], [1, 1]], [[0, 0], [1, 1], [0, 1]]], dtype=np.float64)
-    turn, height = (i[:, None, None] + steps[..., 0]) / around, (j[:, None, None] + steps[..., 1]) / along
-    corners = point(turn, height).reshape(-1, 3, 3)
-    centres = point(turn.mean(axis=2), height.mean(axis=2)).reshape(-1, 3)
+    phase, height = (i[:, None, None] + steps[..., 0]) / around, (j[:, None, None] + steps[..., 1]) / along
+    corners = point(phase, height).reshape(-1, 3, 3)
+    centres = point(phase.mean(axis=2), height.mean(axis=2)).reshape(-1, 3)
     radial = centres - shape.centre
     radial -= (radial @ axis)[:, None] * axis
     count = len(corners)

@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nlosrender.capture.grids import Capture, PointGrid
-from nlosrender.engine.virtual_lights.elements.size_field import GradedCells
-from nlosrender.engine.virtual_lights.elements.subdivision import Cells, WallDistance, parted, quartered
+from nlosrender.engine.virtual_lights.elements.size_field import SizedElements
+from nlosrender.engine.virtual_lights.elements.subdivision import Elements, WallDistance, partition_by_size, subdivide
 
 BLOCKS = (8, 4, 2)  # regions along each side of the sensor grid, the first that leaves enough points in each
 LEAST_POINTS = 256  # of a region
@@ -29,23 +29,23 @@ class Regions:
     """Parts of the sensor grid, and the cells close to the wall as each of them needs them."""
 
     labels: NDArray[np.int64]  # (sensors,) region of each sensor point
-    near: tuple[GradedCells, ...]  # per region
-    shared: GradedCells  # farther away
+    near: tuple[SizedElements, ...]  # per region
+    shared: SizedElements  # farther away
 
-    def counts(self, coarseness: float) -> tuple[int, int]:
+    def counts(self, patch_scale: float) -> tuple[int, int]:
         """Return how many patches of hidden surfaces and of the wall one sensor point gathers, on average."""
         shares = np.bincount(self.labels, minlength=len(self.near)) / len(self.labels)
-        near = shares @ np.array([cells.counts(coarseness) for cells in self.near])
-        hidden, wall = (int(count) for count in near + self.shared.counts(coarseness))
+        near = shares @ np.array([elements.counts(patch_scale) for elements in self.near])
+        hidden, wall = (int(count) for count in near + self.shared.counts(patch_scale))
         return hidden, wall
 
-    def total(self, coarseness: float) -> int:
+    def total(self, patch_scale: float) -> int:
         """Return how many patches of all regions there are."""
-        return sum(sum(cells.counts(coarseness)) for cells in (self.shared, *self.near))
+        return sum(sum(elements.counts(patch_scale)) for elements in (self.shared, *self.near))
 
 
 def regions_of(
-    capture: Capture, unit: float, distance: WallDistance, triangles: Cells, whole: GradedCells
+    capture: Capture, unit: float, distance: WallDistance, triangles: Elements, whole: SizedElements
 ) -> Regions | None:
     """Return the regions that make the gather cheaper, or None where one set of patches does for all.
 
@@ -65,29 +65,30 @@ def regions_of(
     blocks = next((blocks for blocks in BLOCKS if capture.n_sensors >= blocks**2 * LEAST_POINTS), 1)
     # Beyond its own size a region sees about what its neighbours see: there cells of all points do.
     reach = max(capture.sensor_grid.size) / blocks / unit
-    wall_index = whole.grading.wall_index
-    small: Cells | None = None
+    wall_index = whole.size_field.wall_index
+    small: Elements | None = None
     while blocks > 1 and whole.share_if_far(reach / 2) <= WORTH:
         if small is None:  # may be many, and are the same whatever the reach
-            small, large = parted(triangles, distance, wall_index)
-        parts = (small, quartered(large, distance, wall_index, reach / 2))
-        if sum(np.count_nonzero(cells.distances < reach) for cells in parts) * blocks**2 <= MOST_CELLS:
+            small, large = partition_by_size(triangles, distance, wall_index)
+        parts = (small, subdivide(large, distance, wall_index, reach / 2))
+        if sum(np.count_nonzero(elements.distances < reach) for elements in parts) * blocks**2 <= MOST_CELLS:
             break
         reach /= 2  # what is nearest is cut finest
     else:
         return None  # too little to save
     close, far = (
-        Cells.joined([cells.at((cells.distances < reach) == is_near) for cells in parts]) for is_near in (True, False)
+        Elements.joined([elements.at((elements.distances < reach) == is_near) for elements in parts])
+        for is_near in (True, False)
     )
     grid = capture.sensor_grid
     rows, columns = (np.arange(n) * blocks // n for n in (grid.ny, grid.nx))
     near = []
     for row, column in np.ndindex(blocks, blocks):
         part = _part_of(capture, np.ix_(rows == row, columns == column))
-        own = quartered(close, WallDistance(part, unit), wall_index)
-        near.append(GradedCells(own, whole.grading))
+        own = subdivide(close, WallDistance(part, unit), wall_index)
+        near.append(SizedElements(own, whole.size_field))
     labels = (rows[:, None] * blocks + columns).reshape(-1)
-    regions = Regions(labels, tuple(near), GradedCells(far, whole.grading))
+    regions = Regions(labels, tuple(near), SizedElements(far, whole.size_field))
     cost = sum(regions.counts(1.0)) * capture.n_sensors + regions.total(1.0) * POINTS_PER_PATCH
     without = sum(whole.counts(1.0)) * (capture.n_sensors + POINTS_PER_PATCH)
     return regions if cost < WORTH * without else None

@@ -11,7 +11,7 @@ import numpy as np
 from nlosrender.engine.virtual_lights.elements.area_moments import covered_boxes
 from nlosrender.engine.virtual_lights.elements.clusters import Merger
 from nlosrender.engine.virtual_lights.elements.patches import Patches, split_cells
-from nlosrender.engine.virtual_lights.elements.subdivision import Cells, normals_and_areas
+from nlosrender.engine.virtual_lights.elements.subdivision import Elements, normals_and_areas
 from nlosrender.scene.pose import Float64
 
 # Engine units: of surfaces so near to a point, a dozen cells around its foot make up H. Their numbers of parts have to
@@ -21,7 +21,7 @@ MERGED = 0.5  # of the size allowed: smaller cells are merged
 
 
 @dataclass(frozen=True, eq=False)
-class Grading:
+class SizeField:
     """What decides the size of patches, besides the distance."""
 
     bin_width: float  # [engine units]
@@ -34,50 +34,50 @@ class Grading:
         return np.minimum(graded, 2 * np.sqrt(distance * self.bin_width))
 
 
-class GradedCells:
+class SizedElements:
     """Cells that are cut into equal parts, or merged where they are far smaller than need be.
 
     Parameters
     ----------
-    cells
+    elements
         Cells no longer than their distance from the points that the patches are for.
-    grading
+    size_field
         Decides the size of the patches.
     """
 
-    def __init__(self, cells: Cells, grading: Grading):
-        self.cells, self.grading = cells, grading
-        self.allowed = grading.allowed_size(cells.distances)
-        self._ratios = cells.sizes / self.allowed  # of the sizes to those allowed at coarseness 1
-        self.normals, self.areas = normals_and_areas(cells.corners)
-        wall = grading.wall_index
-        self.is_hidden = np.ones(len(cells.shapes), bool) if wall is None else cells.shapes != wall
+    def __init__(self, elements: Elements, size_field: SizeField):
+        self.elements, self.size_field = elements, size_field
+        self.allowed = size_field.allowed_size(elements.distances)
+        self._ratios = elements.sizes / self.allowed  # of the sizes to those allowed at coarseness 1
+        self.normals, self.areas = normals_and_areas(elements.corners)
+        wall = size_field.wall_index
+        self.is_hidden = np.ones(len(elements.shapes), bool) if wall is None else elements.shapes != wall
 
     def set_up(self) -> None:
         """Sum up the cells if some are merged at coarseness 1, the coarsest resolution there is."""
         if (self._ratios < MERGED).any():
             self.merger.set_up()
 
-    def patches(self, coarseness: float) -> list[Patches]:
-        """Return patches whose error is of order ``coarseness`` squared, in parts."""
-        is_small = self._ratios < MERGED * coarseness
-        parts = [self.merger.clusters(is_small, coarseness)] if is_small.any() else []
+    def patches(self, patch_scale: float) -> list[Patches]:
+        """Return patches whose error is of order ``patch_scale`` squared, in parts."""
+        is_small = self._ratios < MERGED * patch_scale
+        parts = [self.merger.clusters(is_small, patch_scale)] if is_small.any() else []
         if not is_small.all():
-            splits = np.ceil(self._ratios[~is_small] / coarseness).astype(np.int64)
-            parts.append(split_cells(self.cells.at(~is_small), splits))
+            splits = np.ceil(self._ratios[~is_small] / patch_scale).astype(np.int64)
+            parts.append(split_cells(self.elements.at(~is_small), splits))
         return parts
 
-    def counts(self, coarseness: float) -> tuple[int, int]:
+    def counts(self, patch_scale: float) -> tuple[int, int]:
         """Return about how many patches there would be of the hidden surfaces, and of a wall that sees itself.
 
         Exactly where none merge.
         """
-        hidden, wall = (count.at(coarseness) for count in self._counts)
+        hidden, wall = (count.at(patch_scale) for count in self._counts)
         return hidden, wall
 
     def share_if_far(self, distance: float) -> float:
         """Return how many of the patches were left, about, if no cell were nearer than ``distance`` to a point."""
-        larger = self.grading.allowed_size(np.maximum(self.cells.distances, distance))
+        larger = self.size_field.allowed_size(np.maximum(self.elements.distances, distance))
         return float((self.areas / larger**2).sum() / max((self.areas / self.allowed**2).sum(), 1e-300))
 
     @cached_property
@@ -89,7 +89,7 @@ class GradedCells:
     @cached_property
     def merger(self) -> Merger:
         """What makes clusters of the cells."""
-        return Merger(self.cells, self.normals, self.areas, self.allowed, self.grading.light)
+        return Merger(self.elements, self.normals, self.areas, self.allowed, self.size_field.light)
 
 
 class _CellCount:
@@ -108,8 +108,8 @@ class _CellCount:
         self._ratios = ratios[order]
         self._boxes = np.append(0.0, np.cumsum(boxes[order]))  # of all smaller cells
 
-    def at(self, coarseness: float) -> int:
+    def at(self, patch_scale: float) -> int:
         """Return the number of patches: one per box, per cell, or per part of a cell."""
-        merged, whole = np.searchsorted(self._ratios, [MERGED * coarseness, coarseness])
-        parts = np.ceil(self._ratios[whole:] / coarseness).astype(np.int64)
-        return math.ceil(self._boxes[merged] / coarseness**2) + int(whole - merged) + int((parts**2).sum())
+        merged, whole = np.searchsorted(self._ratios, [MERGED * patch_scale, patch_scale])
+        parts = np.ceil(self._ratios[whole:] / patch_scale).astype(np.int64)
+        return math.ceil(self._boxes[merged] / patch_scale**2) + int(whole - merged) + int((parts**2).sum())

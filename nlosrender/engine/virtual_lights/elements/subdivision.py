@@ -24,7 +24,7 @@ IN_PLANE = 1e-5  # cosine below which a cell of the wall is in the plane of a po
 
 
 @dataclass(frozen=True, eq=False)
-class Cells:
+class Elements:
     """Triangles, or quarters of quarters of them, no longer than their distance from any laser or sensor point."""
 
     corners: Float64  # (n, 3, 3) [engine units]
@@ -35,11 +35,11 @@ class Cells:
     sizes: Float64  # (n,) longest edge
     distances: Float64  # (n,) of the centre from the nearest laser or sensor point, at least LEAST
 
-    def at(self, chosen: NDArray[np.bool_]) -> Cells:
+    def at(self, chosen: NDArray[np.bool_]) -> Elements:
         """Return the cells that are ``chosen``."""
         if chosen.all():
             return self
-        return Cells(*(values[chosen] for values in self._arrays()))
+        return Elements(*(values[chosen] for values in self._arrays()))
 
     @property
     def shading_normals(self) -> Float64:
@@ -48,7 +48,7 @@ class Cells:
         return normals / np.maximum(np.linalg.norm(normals, axis=1), 1e-300)[:, None]
 
     @classmethod
-    def joined(cls, parts: list[Cells]) -> Cells:
+    def joined(cls, parts: list[Elements]) -> Elements:
         """Return the cells of all parts."""
         if len(parts) == 1:
             return parts[0]
@@ -145,29 +145,31 @@ class WallDistance:
         return distances[np.arange(len(points)), apart.argmax(axis=1)]
 
 
-def triangles_of_mesh(built: BuiltScene, index: int, mesh: mi.Mesh) -> Cells:
+def elements_of_mesh(built: BuiltScene, index: int, mesh: mi.Mesh) -> Elements:
     """Return the triangles of shape ``index`` that the wall may see lit, one cell each, at no distance yet."""
     corners, primitives = facing_triangles(built, mesh)
     count = len(corners)
     weights = np.broadcast_to(np.eye(3), corners.shape)
     shapes = np.full(count, index, np.uint32)
     shading = _shading_normals(mesh, corners, primitives)
-    return Cells(corners, weights, shading, shapes, primitives, longest_edges(corners), np.zeros(count))
+    return Elements(corners, weights, shading, shapes, primitives, longest_edges(corners), np.zeros(count))
 
 
-def parted(cells: Cells, distance: WallDistance, wall_index: int | None, least: float = 0.0) -> tuple[Cells, Cells]:
-    """Return the cells that ``quartered`` leaves as they are, with their distances, and those that it quarters."""
-    distances = _distances(cells, distance, wall_index)
-    large = cells.sizes > np.maximum(distances, least)
-    return replace(cells, distances=distances).at(~large), cells.at(large)
+def partition_by_size(
+    elements: Elements, distance: WallDistance, wall_index: int | None, least: float = 0.0
+) -> tuple[Elements, Elements]:
+    """Return the cells that ``subdivide`` leaves as they are, with their distances, and those that it quarters."""
+    distances = _distances(elements, distance, wall_index)
+    large = elements.sizes > np.maximum(distances, least)
+    return replace(elements, distances=distances).at(~large), elements.at(large)
 
 
-def quartered(cells: Cells, distance: WallDistance, wall_index: int | None, least: float = 0.0) -> Cells:
+def subdivide(elements: Elements, distance: WallDistance, wall_index: int | None, least: float = 0.0) -> Elements:
     """Quarter cells until none is longer than its distance from the nearest point.
 
     Parameters
     ----------
-    cells
+    elements
         Triangles or parts of them; their distances are not looked at.
     distance
         Tells them.
@@ -177,23 +179,23 @@ def quartered(cells: Cells, distance: WallDistance, wall_index: int | None, leas
     least
         No cell is quartered that is not longer than this [engine units].
     """
-    done: list[Cells] = []
-    while len(cells.sizes):
-        small, large = parted(cells, distance, wall_index, least)
+    done: list[Elements] = []
+    while len(elements.sizes):
+        small, large = partition_by_size(elements, distance, wall_index, least)
         done.append(small)
         if not len(large.sizes):
             break
-        corners = _quartered(large.corners)
-        cells = Cells(
+        corners = _similar_quarters(large.corners)
+        elements = Elements(
             corners,
-            _quartered(large.weights),
-            _quartered(large.shading),
+            _similar_quarters(large.weights),
+            _similar_quarters(large.shading),
             np.tile(large.shapes, 4),
             np.tile(large.primitives, 4),
             longest_edges(corners),
             np.zeros(len(corners)),
         )
-    return Cells.joined(done)
+    return Elements.joined(done)
 
 
 def _shading_normals(mesh: mi.Mesh, corners: Float64, primitives: NDArray[np.uint32]) -> Float64:
@@ -205,15 +207,15 @@ def _shading_normals(mesh: mi.Mesh, corners: Float64, primitives: NDArray[np.uin
     return at_vertices[np.asarray(parameters["faces"]).reshape(-1, 3)[primitives]]
 
 
-def _distances(cells: Cells, distance: WallDistance, wall_index: int | None) -> Float64:
-    centres = middles(cells.corners)
+def _distances(elements: Elements, distance: WallDistance, wall_index: int | None) -> Float64:
+    centres = middles(elements.corners)
     distances = np.empty(len(centres))
-    on_wall = cells.shapes == (-1 if wall_index is None else wall_index)
+    on_wall = elements.shapes == (-1 if wall_index is None else wall_index)
     distances[on_wall] = np.maximum(distance.out_of_plane(centres[on_wall]), NEAREST)
     hidden = np.flatnonzero(~on_wall)
     distances[hidden] = distance(centres[hidden])
     close = hidden[distances[hidden] < NEAREST]
-    distances[close] = distance.of_planes(centres[close], normals_and_areas(cells.corners[close])[0])
+    distances[close] = distance.of_planes(centres[close], normals_and_areas(elements.corners[close])[0])
     return distances
 
 
@@ -235,7 +237,7 @@ def middles(triangles: Float64) -> Float64:
     return (triangles[:, 0] + triangles[:, 1] + triangles[:, 2]) / 3
 
 
-def _quartered(triangles: Float64) -> Float64:
+def _similar_quarters(triangles: Float64) -> Float64:
     """Return the four similar parts (4 n, 3, 3) of every triangle."""
     a, b, c = (triangles[:, k] for k in range(3))
     ab, bc, ca = (a + b) / 2, (b + c) / 2, (c + a) / 2

@@ -2,7 +2,7 @@
 
 A patch of size h at distance d from the nearest laser or sensor point has an error of order (h/d)^2 in its geometry
 and of h^2/(4 d w) bins in its delay, with w the bin width: within a triangle the delay is taken as linear. One number,
-``coarseness``, scales the size allowed by both, so that the error falls with its square.
+``patch_scale``, scales the size allowed by both, so that the error falls with its square.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ from nlosrender.capture.grids import Capture
 from nlosrender.engine.virtual_lights.elements.patches import Patches
 from nlosrender.engine.virtual_lights.elements.round_shapes import RoundShape
 from nlosrender.engine.virtual_lights.elements.sensor_regions import regions_of
-from nlosrender.engine.virtual_lights.elements.size_field import GradedCells, Grading
-from nlosrender.engine.virtual_lights.elements.subdivision import Cells, WallDistance, quartered, triangles_of_mesh
+from nlosrender.engine.virtual_lights.elements.size_field import SizedElements, SizeField
+from nlosrender.engine.virtual_lights.elements.subdivision import Elements, WallDistance, elements_of_mesh, subdivide
 from nlosrender.scene.build import WALL_ID, BuiltScene
 from nlosrender.scene.round_surfaces import ROUND_PLUGINS
 
@@ -50,7 +50,7 @@ class Tessellator:
         self.built, self.capture = built, capture
         self.distance = WallDistance(capture, built.unit)
         self.reach = max(capture.sensor_grid.size) / (2 * built.unit)  # half the sensor grid's extent [engine units]
-        triangles: list[Cells] = []
+        triangles: list[Elements] = []
         self.round_shapes: list[RoundShape] = []
         self.wall_index: int | None = None  # of the wall among the scene's shapes, where it is cut as well
         for index, shape in enumerate(built.scene.shapes()):
@@ -59,41 +59,41 @@ class Tessellator:
                     continue
                 self.wall_index = index
             if shape.is_mesh():
-                triangles.append(triangles_of_mesh(built, index, shape))
+                triangles.append(elements_of_mesh(built, index, shape))
             else:
                 self.round_shapes.append(RoundShape.of(index, shape))
         light = capture.laser_grid.positions.reshape(-1, 3).mean(axis=0) / built.unit
-        self.grading = Grading(bin_width, self.wall_index, light)
-        joined = Cells.joined(triangles)
-        self.cells = quartered(joined, self.distance, self.wall_index)
-        whole = GradedCells(self.cells, self.grading)
+        self.size_field = SizeField(bin_width, self.wall_index, light)
+        joined = Elements.joined(triangles)
+        self.elements = subdivide(joined, self.distance, self.wall_index)
+        whole = SizedElements(self.elements, self.size_field)
         self.regions = regions_of(capture, built.unit, self.distance, joined, whole) if may_divide else None
         self.shared = whole if self.regions is None else self.regions.shared
         self._is_hidden = whole.is_hidden
-        self._kept = lru_cache(maxsize=2)(self._make)
+        self._saved = lru_cache(maxsize=2)(self._make)
 
     def set_up(self) -> None:
         """Sum up the cells that are merged at any resolution, if there are any."""
-        for cells in (self.shared, *(self.regions.near if self.regions else ())):
-            cells.set_up()
+        for elements in (self.shared, *(self.regions.near if self.regions else ())):
+            elements.set_up()
 
-    def patches(self, coarseness: float) -> Patches:
-        """Return patches whose error is of order ``coarseness`` squared; those of the last calls are kept if few.
+    def patches(self, patch_scale: float) -> Patches:
+        """Return patches whose error is of order ``patch_scale`` squared; those of the last calls are kept if few.
 
         Where there are regions, these are the patches that all of them share.
         """
-        if sum(self.shared.counts(coarseness)) > MOST_KEPT:
-            return self._make(coarseness)
-        return self._kept(coarseness)
+        if sum(self.shared.counts(patch_scale)) > MOST_KEPT:
+            return self._make(patch_scale)
+        return self._saved(patch_scale)
 
-    def regional_patches(self, coarseness: float, wanted: Sequence[int]) -> Iterator[tuple[list[int], list[Patches]]]:
+    def regional_patches(self, patch_scale: float, wanted: Sequence[int]) -> Iterator[tuple[list[int], list[Patches]]]:
         """Yield the ``wanted`` regions, and the patches close to the wall of each: as many as fit at once."""
         if self.regions is None:
             return
         labels: list[int] = []
         parts: list[Patches] = []
         for label in wanted:
-            patches = Patches.joined(self.regions.near[label].patches(coarseness))
+            patches = Patches.joined(self.regions.near[label].patches(patch_scale))
             if parts and sum(map(len, parts)) + len(patches) > MOST_AT_ONCE:
                 yield labels, parts
                 labels, parts = [], []
@@ -102,23 +102,23 @@ class Tessellator:
         if parts:
             yield labels, parts
 
-    def _make(self, coarseness: float) -> Patches:
-        on_round = [shape.patches(*self._allowed_on(shape, coarseness)) for shape in self.round_shapes]
-        return Patches.joined([*self.shared.patches(coarseness), *on_round])
+    def _make(self, patch_scale: float) -> Patches:
+        on_round = [shape.patches(*self._allowed_on(shape, patch_scale)) for shape in self.round_shapes]
+        return Patches.joined([*self.shared.patches(patch_scale), *on_round])
 
-    def count(self, coarseness: float) -> int:
+    def count(self, patch_scale: float) -> int:
         """Return about how many patches a sensor point would gather, on average; exactly where none merge."""
-        return sum(self.counts(coarseness))
+        return sum(self.counts(patch_scale))
 
-    def counts(self, coarseness: float) -> tuple[int, ...]:
+    def counts(self, patch_scale: float) -> tuple[int, ...]:
         """Return ``count`` of the hidden meshes, of a mesh wall that sees itself, and of each sphere and cylinder."""
-        on_round = (shape.count(*self._allowed_on(shape, coarseness)) for shape in self.round_shapes)
-        return (*(self.regions or self.shared).counts(coarseness), *on_round)
+        on_round = (shape.count(*self._allowed_on(shape, patch_scale)) for shape in self.round_shapes)
+        return (*(self.regions or self.shared).counts(patch_scale), *on_round)
 
     @property
     def nearest(self) -> float:
         """Distance from the points to the nearest hidden cell's centre, or round shape [engine units]."""
-        return min([float(self.cells.distances[self._is_hidden].min(initial=np.inf)), self.nearest_round])
+        return min([float(self.elements.distances[self._is_hidden].min(initial=np.inf)), self.nearest_round])
 
     @property
     def nearest_round(self) -> float:
@@ -131,7 +131,7 @@ class Tessellator:
         """Distance from the laser points to the nearest hidden cell's centre, or round shape [engine units]."""
         lasers = WallDistance(replace(self.capture, sensor_grid=self.capture.laser_grid), self.built.unit)
         on_round = [shape.nearest(lasers) for shape in self.round_shapes if shape.index != self.wall_index]
-        centres = self.cells.corners[self._is_hidden].mean(axis=1)
+        centres = self.elements.corners[self._is_hidden].mean(axis=1)
         return min([float(lasers(centres).min(initial=np.inf)) if len(centres) else math.inf, *on_round])
 
     @property
@@ -143,15 +143,15 @@ class Tessellator:
         """Return every round shape, and its cells, whose corners lie on it."""
         return [(shape, shape.patches(*self._allowed_on(shape, 1.0), raised=False)) for shape in self.round_shapes]
 
-    def _allowed_on(self, shape: RoundShape, coarseness: float) -> tuple[float, float]:
+    def _allowed_on(self, shape: RoundShape, patch_scale: float) -> tuple[float, float]:
         """Return the size of patches across a round shape, and along the axis of a cylinder, which is straight."""
         if shape.index == self.wall_index:
             # cos cos / r^2 varies over the radius only, however near: 1 / (4 radius^2) between points of a sphere
             nearest = abs(shape.radius)
         else:
             nearest = max(shape.nearest(self.distance), abs(shape.radius) / 8)
-        straight = float(self.grading.allowed_size(np.array([nearest]))[0])
-        return coarseness * min(straight, abs(shape.radius)), coarseness * straight
+        straight = float(self.size_field.allowed_size(np.array([nearest]))[0])
+        return patch_scale * min(straight, abs(shape.radius)), patch_scale * straight
 
 
 def can_tessellate(built: BuiltScene) -> bool:

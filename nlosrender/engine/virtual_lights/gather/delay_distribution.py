@@ -70,7 +70,7 @@ class Delays:
         return Delays(self.t0 + delay, self.t1 + delay, t2, self.t3 + delay)
 
 
-class _Shares:
+class _DelayCdf:
     """Shares of the bins that a patch covers."""
 
     def __init__(self, delays: Delays):
@@ -90,14 +90,14 @@ class _Shares:
             down = dr.select(delay < t2, ((delay - t0) + (delay - t1)) * self.height, down)
         return dr.select(delay < t1, up, down)
 
-    def of_block(self, below: mi.Float) -> tuple[list[mi.Float], mi.Float]:
+    def bin_fractions(self, below: mi.Float) -> tuple[list[mi.Float], mi.Float]:
         """Return the shares of the bins of a block that begins at 0, and of all up to its end; ``below`` lie before."""
         edges = [below, *(self.below(edge) for edge in range(1, BLOCK + 1))]
         return [right - left for left, right in pairwise(edges)], edges[-1]
 
 
 @dr.syntax
-def spread_patch(
+def deposit_patch(
     histogram: BlockHistogram,
     lane: mi.UInt32,
     laser: mi.UInt32,
@@ -127,14 +127,14 @@ def spread_patch(
     early, late = first < 0, last >= histogram.shape.n_bins
     spilled = active & (early | late)
     if dr.hint(spilled, exclude=[histogram, value, lane, laser]):
-        shares = _Shares(covered)
+        shares = _DelayCdf(covered)
         end = mi.Float(histogram.shape.n_bins - block * BLOCK)
         below = dr.select(early, shares.below(mi.Float(0)), 0)
         beyond = dr.select(late, 1 - shares.below(end), 0)
         histogram.deposit_outside(lane, laser, value * (below + beyond), spilled)
     more = active & (last >= 0) & (block < histogram.n_blocks)
     while dr.hint(more, exclude=[histogram, value, lane, laser]):
-        of_bins, below = _Shares(covered).of_block(below)
+        of_bins, below = _DelayCdf(covered).bin_fractions(below)
         histogram.deposit(lane, laser, block, of_bins, value, more)
         block += 1
         more = (covered.t3 > BLOCK) & (block < histogram.n_blocks)

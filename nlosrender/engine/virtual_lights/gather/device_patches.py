@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nlosrender.engine.launch.device_arrays import columns, on_device
-from nlosrender.engine.launch.morton import z_order
+from nlosrender.engine.launch.morton import morton_order
 from nlosrender.engine.launch.plain_diffuse import is_uniform_diffuse
 from nlosrender.engine.launch.recurrence import recurrence_steps
 from nlosrender.engine.path.laser_connections import off_the_surface
@@ -27,14 +27,14 @@ TEXTURE_SPLITS, FEW_PATCHES = (4, 12), 2**14
 
 
 @dataclass(frozen=True, eq=False)
-class Places:
+class PatchRegions:
     """Where patches belong: which region they are of, and their numbers in it."""
 
     regions: NDArray[np.int64]  # (n,) region of each patch, ascending
     numbers: NDArray[np.int64]  # (n,) of each patch within its region
 
     @classmethod
-    def of(cls, counts: Sequence[int]) -> Places:
+    def of(cls, counts: Sequence[int]) -> PatchRegions:
         """Return the places of ``counts`` patches per region, region after region."""
         regions = np.repeat(np.arange(len(counts)), counts)
         return cls(regions, np.concatenate([np.arange(count) for count in counts]))
@@ -93,10 +93,10 @@ class Curvature:
 class DevicePatches:
     """Patches on the device, engine units; one lane per patch."""
 
-    places: Places
+    places: PatchRegions
     number: mi.UInt32  # within its region: with the start, what decides the points its light is asked for
     start: mi.Vector2u  # of the low-discrepancy sequence of these points
-    remainder: mi.Vector3f  # of the centre, what float32 rounds off: close to the wall it is more than the distance
+    rounding_residual: mi.Vector3f  # float64 centre minus float32 centre: counts close to the wall
     is_near: bool  # some patch is so near to a laser or sensor point that the remainder counts
     corners: list[mi.Vector3f]  # three, from the centre
     curvature: Curvature | None  # None: all are flat
@@ -117,7 +117,7 @@ class DevicePatches:
         inside = point_inside(self.corners, u, v)
         if self.curvature is not None:
             inside = self.curvature.onto_surface(inside)
-        return self.remainder + dr.select(self.members.w > 0, self.members.xyz, inside)
+        return self.rounding_residual + dr.select(self.members.w > 0, self.members.xyz, inside)
 
     def offset_at(self, points: mi.Vector3f) -> mi.Vector3f:
         """Return the ray offset along the normal at ``points``, as ``points`` returns them.
@@ -133,7 +133,9 @@ class DevicePatches:
         return Surface(mi.Point3f(interaction.p + points), mi.Vector3f(interaction.n), others)
 
 
-def upload_patches(built: BuiltScene, patches: Patches, places: Places, seed: int, is_near: bool) -> DevicePatches:
+def upload_patches(
+    built: BuiltScene, patches: Patches, places: PatchRegions, seed: int, is_near: bool
+) -> DevicePatches:
     """Bring patches to the device, neighbours together, and evaluate their reflectance and shading frames.
 
     Parameters
@@ -148,14 +150,14 @@ def upload_patches(built: BuiltScene, patches: Patches, places: Places, seed: in
     is_near
         Whether some patch is so near to a laser or sensor point that float32 positions do not do.
     """
-    patches = patches.at(np.lexsort((z_order(patches.centres), places.regions)))
+    patches = patches.at(np.lexsort((morton_order(patches.centres), places.regions)))
     interaction = surface_at(
         built, patches.centres, patches.normals, patches.shapes, patches.primitives, patches.barycentric
     )
     reflectance = _mean_reflectance(built, patches, normal_reflectance(interaction))
     centre = np.array(interaction.p, np.float64).T
     from_rounded = patches.centres - centre
-    remainder = mi.Vector3f(to_points(from_rounded))
+    rounding_residual = mi.Vector3f(to_points(from_rounded))
     corners = [mi.Vector3f(to_points(patches.corners[:, k] - patches.centres)) for k in range(3)]
     areas = mi.Vector3f(to_points(patches.normals * patches.areas[:, None]))
     curvature = Curvature.of(built, patches)
@@ -169,13 +171,13 @@ def upload_patches(built: BuiltScene, patches: Patches, places: Places, seed: in
     dr.make_opaque(start)
     member_normals = mi.Vector3f(to_points(patches.member_normals))
     offset = mi.Vector3f(to_points(offset))
-    dr.eval(interaction, reflectance, remainder, corners, areas, curvature, members, member_normals, offset)
+    dr.eval(interaction, reflectance, rounding_residual, corners, areas, curvature, members, member_normals, offset)
     has_clusters = bool(patches.is_cluster.any())
     return DevicePatches(
         places,
         number,
         start,
-        remainder,
+        rounding_residual,
         is_near,
         corners,
         curvature,

@@ -12,11 +12,11 @@ import mitsuba as mi
 import numpy as np
 
 from nlosrender.engine.launch.device_arrays import on_device
-from nlosrender.engine.launch.launch_params import Transport
+from nlosrender.engine.launch.launch_params import LaunchParams
 from nlosrender.engine.launch.passes import Passes, PassSize, Snapshot
 from nlosrender.engine.virtual_lights.gather.block_histogram import BlockHistogram
 from nlosrender.engine.virtual_lights.gather.kernel import gather_third_bounce
-from nlosrender.engine.virtual_lights.gather.lighting import GatherSettings, Lights
+from nlosrender.engine.virtual_lights.gather.lighting import GatherSettings, PackedPatches
 
 FIRST_PAIRS = 2**25  # of patches with sensor and laser points in the first kernel, whose speed is not known
 
@@ -42,18 +42,20 @@ class GatherPasses:
             self._first_group, self._skipped = earlier.numbers["group"], earlier.numbers["skipped"]
         self._size = PassSize(max(1, FIRST_PAIRS // (histogram.shape.lanes * histogram.shape.lasers)))
 
-    def gather(self, transport: Transport, lights: Lights, lane: mi.UInt32, part: mi.UInt32, tile: mi.UInt64) -> None:
+    def gather(
+        self, params: LaunchParams, packed: PackedPatches, lane: mi.UInt32, part: mi.UInt32, tile: mi.UInt64
+    ) -> None:
         """Gather the next group; parameters as for ``gather_third_bounce``."""
         group, self._group = self._group, self._group + 1
         if group < self._first_group:
             return
-        longest = int(np.diff(np.array(lights.first)).max())
+        longest = int(np.diff(np.array(packed.first)).max())
         done = self._skipped if group == self._first_group else 0
         while done < longest:
             steps = min(self._size.steps, longest - done)
             self._size.begin()
             cut = (dr.opaque(mi.UInt32, number) for number in (done, steps))
-            gather_third_bounce(self._settings, transport, lights, self._histogram, lane, part, tile, *cut)
+            gather_third_bounce(self._settings, params, packed, self._histogram, lane, part, tile, *cut)
             dr.eval(self._histogram.sums, self._histogram.outside)
             dr.sync_thread()
             self._size.end()

@@ -12,17 +12,23 @@ import drjit as dr
 import mitsuba as mi
 
 from nlosrender.engine.launch.device_arrays import WallPoints
-from nlosrender.engine.launch.launch_params import Transport
+from nlosrender.engine.launch.launch_params import LaunchParams
 from nlosrender.engine.virtual_lights.gather.block_histogram import BlockHistogram
-from nlosrender.engine.virtual_lights.gather.delay_distribution import Delays, spread_patch
-from nlosrender.engine.virtual_lights.gather.lighting import ROWS, GatherSettings, Lights, four_corners, is_visible
+from nlosrender.engine.virtual_lights.gather.delay_distribution import Delays, deposit_patch
+from nlosrender.engine.virtual_lights.gather.lighting import (
+    ROWS,
+    GatherSettings,
+    PackedPatches,
+    four_corners,
+    is_visible,
+)
 
 
 @dr.syntax
 def gather_third_bounce(
     settings: GatherSettings,
-    transport: Transport,
-    lights: Lights,
+    params: LaunchParams,
+    packed: PackedPatches,
     histogram: BlockHistogram,
     lane: mi.UInt32,
     part: mi.UInt32,
@@ -36,27 +42,27 @@ def gather_third_bounce(
 
     Parameters
     ----------
-    settings, transport, lights
+    settings, params, packed
         What is gathered, and by whom.
     histogram, lane
-        Where to, and the row of each lane of ``transport``.
+        Where to, and the row of each lane of ``params``.
     part
-        The part of ``lights`` that each lane gathers.
+        The part of ``packed`` that each lane gathers.
     tile
-        The bit of the tile that its sensor point lies in, see ``Outlook``.
+        The bit of the tile that its sensor point lies in, see ``WallTiles``.
     skipped, most
         Opaque.
     """
-    built, sensors = transport.built, transport.sensors
+    built, sensors = params.built, params.sensors
     sensor, wall_bsdf = sensors.interaction, built.wall_bsdf
     context = mi.BSDFContext()
-    n_lasers, count = transport.n_lasers, lights.count
-    own_laser = transport.lasers.gather(transport.first_laser)
+    n_lasers, count = params.n_lasers, packed.count
+    own_laser = params.lasers.gather(params.first_laser)
 
-    end = dr.gather(mi.UInt32, lights.first, part + 1)
+    end = dr.gather(mi.UInt32, packed.first, part + 1)
 
     # ---- State ---------------------------------------------------------------------------------------------------
-    patch = dr.gather(mi.UInt32, lights.first, part) + skipped
+    patch = dr.gather(mi.UInt32, packed.first, part) + skipped
     end = dr.minimum(end, patch + most)
 
     while dr.hint(
@@ -64,8 +70,8 @@ def gather_third_bounce(
         exclude=[
             end,
             settings,
-            transport,
-            lights,
+            params,
+            packed,
             histogram,
             built,
             sensors,
@@ -76,13 +82,13 @@ def gather_third_bounce(
         ],
     ):
         # ---- The patch as the sensor point sees it -----------------------------------------------------------------
-        rows = [dr.gather(mi.Vector4f, lights.packed, patch * ROWS + k) for k in range(ROWS)]
+        rows = [dr.gather(mi.Vector4f, packed.packed, patch * ROWS + k) for k in range(ROWS)]
         a, b, c, centre, shown, offset = (mi.Point3f(row.x, row.y, row.z) for row in rows)
         from_sensor = centre - sensor.p
         areas = mi.Vector3f(rows[0].w, rows[1].w, rows[2].w)
         to_patch = from_sensor
-        if dr.hint(lights.remainder is not None, mode="scalar"):
-            to_patch = from_sensor + _remainder(lights, patch)
+        if dr.hint(packed.rounding_residual is not None, mode="scalar"):
+            to_patch = from_sensor + _rounding_residual(packed, patch)
         distance2 = dr.squared_norm(to_patch)
         direction = to_patch * dr.rsqrt(distance2)
         received = wall_bsdf.eval(context, sensor, sensor.to_local(direction))
@@ -90,22 +96,22 @@ def gather_third_bounce(
         active = dr.any(weight > 0)
         cosine = mi.Float(0)
         if dr.hint(settings.is_diffuse, mode="scalar"):
-            cosine = -dr.dot(dr.gather(mi.Normal3f, lights.shading, patch), direction)
+            cosine = -dr.dot(dr.gather(mi.Normal3f, packed.shading, patch), direction)
             active &= cosine > 0
 
         is_cluster = None
-        if dr.hint(lights.has_clusters, mode="scalar"):
+        if dr.hint(packed.has_clusters, mode="scalar"):
             is_cluster = rows[3].w > 0
 
         # ---- Visibility --------------------------------------------------------------------------------------------
         if dr.hint(settings.needs_visibility, mode="scalar"):
             # in front of the plane through the point that is looked at, not through the centre
             way = from_sensor + shown
-            clearance = dr.select(dr.dot(areas, way) < 0, dr.gather(mi.UInt64, lights.clearance, patch), 0)
-            active = is_visible(built, sensor, way, mi.Vector3f(offset), active, clearance, tile)
+            mask = dr.select(dr.dot(areas, way) < 0, dr.gather(mi.UInt64, packed.mask, patch), 0)
+            active = is_visible(built, sensor, way, mi.Vector3f(offset), active, mask, tile)
 
         # ---- Reflect towards the lasers and deposit ----------------------------------------------------------------
-        scale = transport.bins_per_unit
+        scale = params.bins_per_unit
         delays = mi.Vector4f(
             *(dr.norm(end - sensor.p) * scale + sensors.delay_fraction for end in four_corners(a, b, c))
         )
@@ -113,24 +119,24 @@ def gather_third_bounce(
             lit = own_laser.interaction
             value = weight * wall_bsdf.eval(context, lit, lit.to_local(direction)) / distance2
             if dr.hint(settings.is_diffuse, mode="scalar"):
-                value *= dr.gather(mi.Spectrum, lights.reflectance, patch) * cosine
+                value *= dr.gather(mi.Spectrum, packed.reflectance, patch) * cosine
             else:
-                value *= _reflected(lights, patch, direction, -direction, active)
+                value *= _reflected(packed, patch, direction, -direction, active)
             delays = 2 * delays + (own_laser.delay_fraction - sensors.delay_fraction)
             whole = own_laser.delay_bins + sensors.delay_bins
             _spread(histogram, lane, mi.UInt32(0), delays, whole, value, is_cluster, active)
-        elif dr.hint(transport.lasers_per_lane == 1, mode="scalar"):
+        elif dr.hint(params.lasers_per_lane == 1, mode="scalar"):
             seen = _SeenPatch(patch, weight, delays, is_cluster, direction, active)
-            _deposit(settings, lights, histogram, sensors, own_laser, lane, mi.UInt32(0), patch, seen)
+            _deposit(settings, packed, histogram, sensors, own_laser, lane, mi.UInt32(0), patch, seen)
         else:
             laser = mi.UInt32(0)
             while dr.hint(
                 laser < n_lasers,
-                exclude=[settings, transport, lights, histogram, sensors, weight, delays, direction, patch, count],
+                exclude=[settings, params, packed, histogram, sensors, weight, delays, direction, patch, count],
             ):
-                points = transport.lasers.gather(laser)
+                points = params.lasers.gather(laser)
                 seen = _SeenPatch(patch, weight, delays, is_cluster, direction, active)
-                _deposit(settings, lights, histogram, sensors, points, lane, laser, laser * count + patch, seen)
+                _deposit(settings, packed, histogram, sensors, points, lane, laser, laser * count + patch, seen)
                 laser += 1
         patch += 1
 
@@ -149,7 +155,7 @@ class _SeenPatch:
 
 def _deposit(
     settings: GatherSettings,
-    lights: Lights,
+    packed: PackedPatches,
     histogram: BlockHistogram,
     sensors: WallPoints,
     laser_points: WallPoints,
@@ -159,17 +165,17 @@ def _deposit(
     seen: _SeenPatch,
 ) -> None:
     """Deposit what a patch sends on from one laser; ``entry`` is the pair of patch and laser."""
-    value = seen.weight * dr.gather(mi.Spectrum, lights.arriving, entry)
+    value = seen.weight * dr.gather(mi.Spectrum, packed.arriving, entry)
     lit = seen.active & dr.any(value > 0)
     if not settings.is_diffuse:
-        centre = dr.gather(mi.Point3f, lights.interaction.p, seen.patch)
+        centre = dr.gather(mi.Point3f, packed.interaction.p, seen.patch)
         to_laser = laser_points.interaction.p - centre
-        if lights.remainder is not None:
-            to_laser -= _remainder(lights, seen.patch)
+        if packed.rounding_residual is not None:
+            to_laser -= _rounding_residual(packed, seen.patch)
         to_laser = dr.normalize(to_laser)
-        value *= _reflected(lights, seen.patch, seen.direction, to_laser, lit)
+        value *= _reflected(packed, seen.patch, seen.direction, to_laser, lit)
         lit &= dr.any(value > 0)
-    legs = dr.gather(mi.Vector4f, lights.delays, entry)
+    legs = dr.gather(mi.Vector4f, packed.delays, entry)
     delays = seen.delays + legs + laser_points.delay_fraction
     _spread(histogram, lane, laser, delays, laser_points.delay_bins + sensors.delay_bins, value, seen.is_cluster, lit)
 
@@ -189,19 +195,19 @@ def _spread(
         covered = Delays.of_triangle(delays.x, delays.y, delays.z)
     else:
         covered = Delays.of_either(is_cluster, delays)
-    spread_patch(histogram, lane, laser, covered, whole, value, active)
+    deposit_patch(histogram, lane, laser, covered, whole, value, active)
 
 
-def _remainder(lights: Lights, patch: mi.UInt32) -> mi.Vector3f:
+def _rounding_residual(packed: PackedPatches, patch: mi.UInt32) -> mi.Vector3f:
     """Return what float32 rounds off a patch's centre."""
-    row = dr.gather(mi.Vector4f, lights.remainder, patch)
+    row = dr.gather(mi.Vector4f, packed.rounding_residual, patch)
     return mi.Vector3f(row.x, row.y, row.z)
 
 
 def _reflected(
-    lights: Lights, patch: mi.UInt32, direction: mi.Vector3f, to_laser: mi.Vector3f, active: mi.Bool
+    packed: PackedPatches, patch: mi.UInt32, direction: mi.Vector3f, to_laser: mi.Vector3f, active: mi.Bool
 ) -> mi.Spectrum:
     """Return BSDF times the cosine towards the laser, of patches that are not Lambertian."""
-    si = dr.gather(mi.SurfaceInteraction3f, lights.interaction, patch)
+    si = dr.gather(mi.SurfaceInteraction3f, packed.interaction, patch)
     si.wi = si.to_local(-direction)
     return si.bsdf().eval(mi.BSDFContext(), si, si.to_local(to_laser), active)

@@ -9,10 +9,10 @@ import mitsuba as mi
 import numpy as np
 
 from nlosrender.engine.launch.device_arrays import on_device
-from nlosrender.engine.launch.launch_params import Transport
+from nlosrender.engine.launch.launch_params import LaunchParams
 from nlosrender.engine.path.laser_connections import off_the_wall
 from nlosrender.engine.virtual_lights.gather.device_patches import DevicePatches
-from nlosrender.engine.virtual_lights.visibility.masks import Clearances, Outlook
+from nlosrender.engine.virtual_lights.visibility.masks import VisibilityMasks, WallTiles
 from nlosrender.scene.build import BuiltScene
 
 ROWS = 6  # of four numbers each: what the gather reads of a patch
@@ -35,14 +35,14 @@ class GatherSettings:
 
 
 @dataclass(frozen=True, eq=False)
-class Lights:
+class PackedPatches:
     """What the gather's loop reads: patches that are lit, packed so that one load brings four numbers."""
 
     # 24 a patch: three corners, each with one component of normal times area; the centre, and 1 for a cluster; from it
     # to the point of the surface that shadow rays ask for, and 0; the ray offset along the normal there, and 0
     packed: mi.Float
-    clearance: mi.UInt64  # there, see ``Clearances.of``
-    remainder: mi.Float | None  # four a patch: what float32 rounds off the centre; None where that does not count
+    mask: mi.UInt64  # there, see ``VisibilityMasks.of``
+    rounding_residual: mi.Float | None  # four a patch: float64 minus float32 centre; None: negligible
     shading: mi.Normal3f  # shading normals
     interaction: mi.SurfaceInteraction3f  # at the centres; not read for Lambertian patches
     reflectance: mi.Spectrum  # confocal Lambertian patches: reflectance / pi
@@ -55,77 +55,77 @@ class Lights:
 
 
 @dataclass(frozen=True, eq=False)
-class Clearing:
+class MaskQuery:
     """What it takes to leave visibility rays out."""
 
-    clearances: Clearances
-    outlook: Outlook  # a rectangle per region of the patches
+    masks: VisibilityMasks
+    wall_tiles: WallTiles  # a rectangle per region of the patches
 
     @property
-    def is_worthwhile(self) -> bool:
+    def pays_off(self) -> bool:
         """Whether enough points look."""
-        return self.clearances.are_worthwhile(self.outlook.n_points)
+        return self.masks.pay_off(self.wall_tiles.n_points)
 
-    def of(self, patches: DevicePatches, seen_at: mi.Vector3f, active: mi.Bool) -> mi.UInt64:
-        """Return the clearance of patches where rays end, see ``Clearances.of``."""
+    def of(self, patches: DevicePatches, shadow_target: mi.Vector3f, active: mi.Bool) -> mi.UInt64:
+        """Return the clearance of patches where rays end, see ``VisibilityMasks.of``."""
         where = on_device(mi.UInt32, patches.places.regions)
-        return self.clearances.of(patches.surface(seen_at), self.outlook, where, active)
+        return self.masks.of(patches.surface(shadow_target), self.wall_tiles, where, active)
 
 
 @dataclass(frozen=True, eq=False)
-class Illuminated:
+class LitPatches:
     """Patches and what the lasers of a batch send them; those of confocal captures are lit as they are gathered."""
 
     patches: DevicePatches
-    arriving: mi.Spectrum  # index = laser * n_patches + patch; see ``Lights``
+    arriving: mi.Spectrum  # index = laser * n_patches + patch; see ``PackedPatches``
     is_lit: mi.Bool  # by any of the lasers
-    seen_at: mi.Vector3f  # from the centres to where sensor points look at them
-    clearance: mi.UInt64  # there, see ``Clearances.of``
+    shadow_target: mi.Vector3f  # from the centres to where sensor points look at them
+    mask: mi.UInt64  # there, see ``VisibilityMasks.of``
     is_cleared: bool  # it has been asked for: enough points look
 
-    def cleared(self, clearing: Clearing) -> Illuminated:
+    def cleared(self, mask_query: MaskQuery) -> LitPatches:
         """Return the same with clearances, if enough points look."""
-        if not clearing.is_worthwhile:
+        if not mask_query.pays_off:
             return self
-        return replace(self, clearance=clearing.of(self.patches, self.seen_at, self.is_lit), is_cleared=True)
+        return replace(self, mask=mask_query.of(self.patches, self.shadow_target, self.is_lit), is_cleared=True)
 
 
-def illuminate(
-    settings: GatherSettings, transport: Transport, patches: DevicePatches, clearing: Clearing, n_lasers: int
-) -> Illuminated:
+def light_patches(
+    settings: GatherSettings, params: LaunchParams, patches: DevicePatches, mask_query: MaskQuery, n_lasers: int
+) -> LitPatches:
     """Light patches.
 
     Parameters
     ----------
-    settings, transport
+    settings, params
         What the gather does and reads.
     patches
         All patches of a resolution.
-    clearing
+    mask_query
         Tells which visibility rays may be left out.
     n_lasers
         Lasers of the batch.
     """
     count = dr.width(patches.areas)
-    seen_at, all_lit = patches.points(patches.number), dr.full(mi.Bool, True, count)
-    dr.eval(seen_at)
-    lit = Illuminated(patches, mi.Spectrum(0), all_lit, seen_at, dr.zeros(mi.UInt64, count), is_cleared=False)
+    shadow_target, all_lit = patches.points(patches.number), dr.full(mi.Bool, True, count)
+    dr.eval(shadow_target)
+    lit = LitPatches(patches, mi.Spectrum(0), all_lit, shadow_target, dr.zeros(mi.UInt64, count), is_cleared=False)
     if settings.needs_visibility and not settings.has_one_laser:
-        lit = lit.cleared(clearing)
+        lit = lit.cleared(mask_query)
     if not settings.is_confocal:
-        lit = _illuminate(settings, transport, lit, clearing, n_lasers)
+        lit = _light_by_lasers(settings, params, lit, mask_query, n_lasers)
     if settings.needs_visibility and settings.has_one_laser:
-        lit = lit.cleared(clearing)
+        lit = lit.cleared(mask_query)
     return lit
 
 
-def lights_of(
-    settings: GatherSettings, transport: Transport, illuminated: Illuminated, slices: int, n_lasers: int
-) -> Lights:
+def pack_patches(
+    settings: GatherSettings, params: LaunchParams, lit_patches: LitPatches, slices: int, n_lasers: int
+) -> PackedPatches:
     """Return what the gather reads: the patches that are lit, in as many parts per region as there are ``slices``."""
-    patches, arriving, delays = illuminated.patches, illuminated.arriving, mi.Float(0)
+    patches, arriving, delays = lit_patches.patches, lit_patches.arriving, mi.Float(0)
     count = dr.width(patches.areas)
-    lit = dr.compress(illuminated.is_lit)
+    lit = dr.compress(lit_patches.is_lit)
     if not dr.width(lit):
         lit = mi.UInt32(0)  # all is dark: one dark patch, since arrays of no length cannot be read
     lit, first = (on_device(mi.UInt32, values) for values in patches.places.in_parts(np.array(lit.numpy()), slices))
@@ -134,33 +134,33 @@ def lights_of(
         n_lit = dr.opaque(mi.UInt32, dr.width(lit))  # as a constant it would be part of the kernel
         laser, patch = index // n_lit, dr.gather(mi.UInt32, lit, index % n_lit)
         arriving = dr.gather(mi.Spectrum, arriving, laser * dr.opaque(mi.UInt32, count) + patch)
-        points = dr.gather(mi.Point3f, transport.lasers.interaction.p, laser)
+        points = dr.gather(mi.Point3f, params.lasers.interaction.p, laser)
         ends = four_corners(*_corners(patches, patch))
-        delays = dr.ravel(mi.Vector4f(*(dr.norm(end - points) * transport.bins_per_unit for end in ends)))
+        delays = dr.ravel(mi.Vector4f(*(dr.norm(end - points) * params.bins_per_unit for end in ends)))
     a, b, c = _corners(patches, lit)
     areas, interaction = (
         dr.gather(mi.Vector3f, patches.areas, lit),
         dr.gather(mi.SurfaceInteraction3f, patches.interaction, lit),
     )
     is_cluster = dr.gather(mi.Vector4f, patches.members, lit).w
-    shown = dr.gather(mi.Vector3f, illuminated.seen_at, lit)
-    clearance = dr.gather(mi.UInt64, illuminated.clearance, lit)
-    offset = dr.gather(mi.Vector3f, patches.offset_at(illuminated.seen_at), lit)
+    shown = dr.gather(mi.Vector3f, lit_patches.shadow_target, lit)
+    mask = dr.gather(mi.UInt64, lit_patches.mask, lit)
+    offset = dr.gather(mi.Vector3f, patches.offset_at(lit_patches.shadow_target), lit)
     rows = [(a, areas.x), (b, areas.y), (c, areas.z), (interaction.p, is_cluster), (shown, 0), (offset, 0)]
     packed = dr.zeros(mi.Float, 4 * ROWS * dr.width(lit))
     lane = dr.arange(mi.UInt32, dr.width(lit))
     for k, (point, fourth) in enumerate(rows):
         dr.scatter(packed, mi.Vector4f(*point, fourth), lane * ROWS + k)
-    remainder = None
+    rounding_residual = None
     if patches.is_near:
-        rest = dr.gather(mi.Vector3f, patches.remainder, lit)
-        remainder = dr.ravel(mi.Vector4f(rest.x, rest.y, rest.z, 0))
+        rest = dr.gather(mi.Vector3f, patches.rounding_residual, lit)
+        rounding_residual = dr.ravel(mi.Vector4f(rest.x, rest.y, rest.z, 0))
     reflectance = dr.gather(mi.Spectrum, patches.reflectance, lit) * dr.inv_pi
-    dr.eval(packed, clearance, remainder, arriving, delays, interaction, reflectance)
-    return Lights(
+    dr.eval(packed, mask, rounding_residual, arriving, delays, interaction, reflectance)
+    return PackedPatches(
         packed,
-        clearance,
-        remainder,
+        mask,
+        rounding_residual,
         interaction.sh_frame.n,
         interaction,
         reflectance,
@@ -172,23 +172,23 @@ def lights_of(
     )
 
 
-def _illuminate(
-    settings: GatherSettings, transport: Transport, dark: Illuminated, clearing: Clearing, n_lasers: int
-) -> Illuminated:
+def _light_by_lasers(
+    settings: GatherSettings, params: LaunchParams, dark: LitPatches, mask_query: MaskQuery, n_lasers: int
+) -> LitPatches:
     """Light every patch by every laser: emission, distance, and the share of the patch that is not in shadow.
 
     Sensor points look where they did, or at a point that the only laser lights. Lambertian patches send light on.
     """
-    patches, seen_at, clearance = dark.patches, dark.seen_at, dark.clearance
-    built = transport.built
+    patches, shadow_target, mask = dark.patches, dark.shadow_target, dark.mask
+    built = params.built
     n_patches = dr.width(patches.areas)
     index = dr.arange(mi.UInt32, n_patches * n_lasers)
     divisor = dr.opaque(mi.UInt32, n_patches)
     patch, laser = index % divisor, index // divisor
-    points = transport.lasers.gather(laser)
+    points = params.lasers.gather(laser)
     lit = points.interaction
     to_rounded = dr.gather(mi.Point3f, patches.interaction.p, patch) - lit.p
-    to_patch = to_rounded + dr.gather(mi.Vector3f, patches.remainder, patch)
+    to_patch = to_rounded + dr.gather(mi.Vector3f, patches.rounding_residual, patch)
     distance2 = dr.squared_norm(to_patch)
     direction = to_patch * dr.rsqrt(distance2)
     arriving = built.wall_bsdf.eval(mi.BSDFContext(), lit, lit.to_local(direction)) / distance2
@@ -202,21 +202,21 @@ def _illuminate(
         active &= (cosine > 0) | mi.has_flag(flags, mi.BSDFFlags.BackSide)
     seen = mi.Float(1)
     if settings.needs_visibility and settings.has_one_laser:
-        seen, seen_at = _share_in_light(built, patches, lit, to_rounded, active)
+        seen, shadow_target = _share_in_light(built, patches, lit, to_rounded, active)
     elif settings.needs_visibility:
         # the very point that sensor points look at: what hides a part of a patch from both hides the same part
-        way = to_rounded + dr.gather(mi.Vector3f, seen_at, patch)
-        offset = dr.gather(mi.Vector3f, patches.offset_at(seen_at), patch)
-        tile = clearing.outlook.tile_bit(mi.UInt32(0), lit.p)
+        way = to_rounded + dr.gather(mi.Vector3f, shadow_target, patch)
+        offset = dr.gather(mi.Vector3f, patches.offset_at(shadow_target), patch)
+        tile = mask_query.wall_tiles.tile_bit(mi.UInt32(0), lit.p)
         is_before = dr.dot(dr.gather(mi.Vector3f, patches.areas, patch), way) < 0  # the plane through that point
-        clear = dr.select(is_before, dr.gather(mi.UInt64, clearance, patch), 0)
+        clear = dr.select(is_before, dr.gather(mi.UInt64, mask, patch), 0)
         seen = dr.select(is_visible(built, lit, way, offset, active, clear, tile), mi.Float(1), 0)
     arriving = dr.select(active, arriving * seen, 0)
     brightest = dr.zeros(mi.Float, n_patches)
     dr.scatter_reduce(dr.ReduceOp.Max, brightest, dr.max(arriving), patch)
     is_lit = brightest > 0
-    dr.eval(arriving, is_lit, seen_at)
-    return replace(dark, arriving=arriving, is_lit=is_lit, seen_at=seen_at)
+    dr.eval(arriving, is_lit, shadow_target)
+    return replace(dark, arriving=arriving, is_lit=is_lit, shadow_target=shadow_target)
 
 
 def _share_in_light(
@@ -249,19 +249,19 @@ def is_visible(
     way: mi.Vector3f,
     offset: mi.Vector3f,
     active: mi.Bool,
-    clearance: mi.UInt64 | None = None,
+    mask: mi.UInt64 | None = None,
     tile: mi.UInt64 | None = None,
 ) -> mi.Bool:
     """Return whether nothing lies on the way from a point of the wall to a point of a hidden surface.
 
     The shadow ray ends at the latter moved by ``offset``, the ray offset along the surface's normal, to the side that
-    faces the wall point. ``clearance`` is that of the surface point, and ``tile`` the bit of the tile the wall point
+    faces the wall point. ``mask`` is that of the surface point, and ``tile`` the bit of the tile the wall point
     lies in.
     """
     origin = off_the_wall(built, wall_point)
     direction = way - (origin - wall_point.p)
     direction -= offset * dr.sign(dr.dot(offset, direction))
-    asked = active if clearance is None else active & ((clearance & tile) == 0)
+    asked = active if mask is None else active & ((mask & tile) == 0)
     ray = mi.Ray3f(origin, direction, mi.Float(1), mi.Float(0), [])
     return active & ~(asked & built.scene.ray_test(ray, coherent=False, active=asked))
 

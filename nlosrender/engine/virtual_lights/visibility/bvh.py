@@ -11,7 +11,7 @@ import mitsuba as mi
 import numpy as np
 
 from nlosrender.engine.launch.device_arrays import on_device
-from nlosrender.engine.launch.morton import z_order
+from nlosrender.engine.launch.morton import morton_order
 from nlosrender.engine.launch.surface_sampler import triangles_of
 from nlosrender.engine.virtual_lights.elements.subdivision import middles, normals_and_areas
 from nlosrender.scene.pose import Float64
@@ -29,7 +29,7 @@ FACES_OF_BOX = np.array(
 
 
 @dataclass(frozen=True, eq=False)
-class OccluderTree:
+class Bvh:
     """A complete binary tree: box 1 holds all triangles, the children of box k are 2 k and 2 k + 1 [engine units]."""
 
     boxes: mi.Float  # eight a box: least and greatest corner; box 0 is none
@@ -38,10 +38,10 @@ class OccluderTree:
     n_leaves: mi.UInt32  # opaque
 
     @classmethod
-    def of(cls, shapes: Sequence[mi.Shape]) -> OccluderTree:
+    def of(cls, shapes: Sequence[mi.Shape]) -> Bvh:
         """Return the tree of meshes and of boxes around other shapes, cut along a space-filling curve."""
         triangles = np.concatenate([_triangles(shape) for shape in shapes])
-        order = np.argsort(z_order(middles(triangles)), kind="stable")
+        order = np.argsort(morton_order(middles(triangles)), kind="stable")
         order = np.append(order, np.repeat(order[-1], max(0, LEAF - len(order))))
         packed = np.empty((len(order), 3, 4), np.float32)
         packed[:, :, :3] = triangles = triangles[order]

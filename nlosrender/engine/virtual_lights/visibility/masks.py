@@ -25,7 +25,7 @@ from nlosrender.capture.grids import Capture
 from nlosrender.capture.plan import Batch
 from nlosrender.engine.launch.device_arrays import on_device
 from nlosrender.engine.launch.pilot_points import Pilot
-from nlosrender.engine.virtual_lights.visibility.bvh import LEAF, OccluderTree
+from nlosrender.engine.virtual_lights.visibility.bvh import LEAF, Bvh
 from nlosrender.scene.build import BuiltScene
 from nlosrender.scene.pose import Float64
 
@@ -50,21 +50,21 @@ class Rectangle(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Outlook:
+class WallTiles:
     """Rectangles of a planar wall that points are seen from, each in ``TILES`` x ``TILES`` tiles."""
 
     packed: mi.Float  # four a rectangle: least x and y, width and height of a tile [engine units]
     n_points: int  # look at each point from a rectangle: whether it is worth while to leave out rays
 
     @classmethod
-    def around(cls, groups: Sequence[Float64], n_points: int) -> Outlook:
+    def around(cls, groups: Sequence[Float64], n_points: int) -> WallTiles:
         """Return the rectangles around groups of wall points (n, 3) [engine units]."""
         least, most = (np.array([end(points[:, :2], axis=0) for points in groups]) for end in (np.min, np.max))
         sizes = (most - least + 2 * MARGIN) / TILES
         return cls(on_device(mi.Float, np.concatenate([least - MARGIN, sizes], axis=1).ravel()), n_points)
 
     @classmethod
-    def of(cls, built: BuiltScene, capture: Capture, batch: Batch | Pilot, *, with_lasers: bool = False) -> Outlook:
+    def of(cls, built: BuiltScene, capture: Capture, batch: Batch | Pilot, *, with_lasers: bool = False) -> WallTiles:
         """Return the rectangle around all sensor points, and all laser points if asked for."""
         grids = [capture.sensor_grid, *([capture.laser_grid] if with_lasers else [])]
         points = np.concatenate([grid.positions.reshape(-1, 3) / built.unit for grid in grids])
@@ -96,7 +96,7 @@ class Surface:
     others: mi.Vector3f  # more normals: nothing behind these planes hides the points from what lies in front of them
 
 
-class Clearances:
+class VisibilityMasks:
     """Tells from where nothing can hide points of the hidden geometry, before a planar wall.
 
     Parameters
@@ -109,44 +109,44 @@ class Clearances:
         self.built = built
 
     @functools.cached_property
-    def _tree(self) -> OccluderTree:
-        return OccluderTree.of(self.built.hidden_shapes)
+    def _tree(self) -> Bvh:
+        return Bvh.of(self.built.hidden_shapes)
 
     def set_up(self) -> None:
         """Make the tree."""
         _ = self._tree
 
-    def are_worthwhile(self, n_points: int) -> bool:
+    def pay_off(self, n_points: int) -> bool:
         """Return whether anything is known of what ``n_points`` wall points look at."""
         return self.built.wall.is_planar and n_points >= LEAST_POINTS
 
-    def of(self, surface: Surface, outlook: Outlook, where: mi.UInt32, active: mi.Bool) -> mi.UInt64:
+    def of(self, surface: Surface, wall_tiles: WallTiles, where: mi.UInt32, active: mi.Bool) -> mi.UInt64:
         """Return the bits of the tiles that each point is open to.
 
         Parameters
         ----------
         surface
             The points.
-        outlook, where
+        wall_tiles, where
             Rectangles, and from which of them each point is seen. Where few look from, nothing is known.
         active
             The others have none.
         """
-        if not self.are_worthwhile(outlook.n_points):
+        if not self.pay_off(wall_tiles.n_points):
             return dr.zeros(mi.UInt64, dr.width(surface.points))
         active = active & (surface.points.z > 0)
         for shape in self.built.hidden_shapes:
             if not shape.is_mesh():  # a point in its box may be hidden by the shape itself, however near
                 box = shape.bbox()
                 active = active & ~mi.BoundingBox3f(mi.Point3f(box.min), mi.Point3f(box.max)).contains(surface.points)
-        view = _View(surface, outlook.tiles(where))
+        view = _View(surface, wall_tiles.tiles(where))
         clear = dr.select(active, mi.UInt64(OF_ALL) & ~_hidden_tiles(self._tree, view, active), 0)
         dr.eval(clear)
         return clear
 
 
 @dr.syntax
-def _hidden_tiles(tree: OccluderTree, view: _View, active: mi.Bool) -> mi.UInt64:
+def _hidden_tiles(tree: Bvh, view: _View, active: mi.Bool) -> mi.UInt64:
     """Return the bits of the tiles from which some triangle may hide each point."""
     hidden = mi.UInt64(0)
     node = dr.select(active, mi.UInt32(1), 0)
@@ -238,9 +238,9 @@ class _View:
     def tiles_parted(self, corner: mi.Point3f, normal: mi.Vector3f) -> mi.UInt64:
         """Return the bits of the tiles that lie on the same side of planes as the points; of all for those in them."""
         height, (before, behind) = dr.dot(normal, self.points - corner), self._tiles_beside(corner, normal)
-        parted = dr.select(height > 0, before, behind)
+        partition_by_size = dr.select(height > 0, before, behind)
         # no ray crosses a plane that it begins in
-        return dr.select(dr.abs(height) <= self.rise, mi.UInt64(OF_ALL), parted)
+        return dr.select(dr.abs(height) <= self.rise, mi.UInt64(OF_ALL), partition_by_size)
 
     def _tiles_beside(self, point: mi.Point3f, normal: mi.Vector3f) -> tuple[mi.UInt64, mi.UInt64]:
         """Return the bits of the tiles that lie before planes, and behind them."""

@@ -19,11 +19,11 @@ from numpy.typing import NDArray
 
 from nlosrender.capture.bounces import FIRST_BOUNCE
 from nlosrender.engine.launch.device_arrays import WallPoints, on_device
-from nlosrender.engine.launch.launch_params import HIGHEST_SURVIVAL, LaneRandomness, Transport
-from nlosrender.engine.launch.time_gate import LATE_SURVIVAL, Deadline, Horizon, thinned_out
+from nlosrender.engine.launch.launch_params import HIGHEST_SURVIVAL, LaneRandomness, LaunchParams
+from nlosrender.engine.launch.time_gate import GATE_SURVIVAL, CaptureTimeGate, TimeGate, time_gate_roulette
 from nlosrender.engine.path.laser_connections import connection_segment, offset_origin
 from nlosrender.engine.virtual_lights.gather.device_patches import normal_reflectance, surface_at
-from nlosrender.engine.virtual_lights.vpls.sampler import Sites
+from nlosrender.engine.virtual_lights.vpls.sampler import Vpls
 from nlosrender.scene.build import BuiltScene
 from nlosrender.scene.pose import Float64
 
@@ -32,7 +32,7 @@ UNTRIED_SHARE = 0.2
 
 
 @dataclass(frozen=True, eq=False)
-class TriedLasers:
+class ProposalLasers:
     """Laser points by which the vertices of walks are judged, the same for every batch of a capture."""
 
     points: WallPoints
@@ -41,7 +41,7 @@ class TriedLasers:
 
 
 @dataclass(frozen=True, eq=False)
-class WalkEnds:
+class SubpathVertex:
     """One vertex of every walk, chosen in proportion to the light it is expected to bring; one lane per walk."""
 
     position: mi.Point3f
@@ -56,7 +56,7 @@ class WalkEnds:
 
 
 @dataclass(frozen=True, eq=False)
-class Impulses:
+class VplContributions:
     """Light that leaves sites at known delays; those of one site lie together.
 
     ``values`` and ``delays`` have index laser * count + impulse. Of confocal captures, whose sensor points each have a
@@ -64,7 +64,7 @@ class Impulses:
     """
 
     count: int
-    sites: NDArray[np.int64]  # (count,) the site each leaves, ascending
+    vpls: NDArray[np.int64]  # (count,) the site each leaves, ascending
     bounces: mi.UInt32  # (count,)
     values: mi.Spectrum  # radiance towards the sensor points, for the site's area
     delays: mi.Float  # from the laser point to the site [bins]
@@ -74,28 +74,28 @@ class Impulses:
 
 
 @dr.syntax
-def trace_walks(
+def trace_subpaths(
     built: BuiltScene,
-    sites: mi.SurfaceInteraction3f,
+    vpls: mi.SurfaceInteraction3f,
     reflectance: mi.Spectrum,
-    tried: TriedLasers,
+    proposal_lasers: ProposalLasers,
     max_bounces: int | None,
-    deadline: Deadline | None,
+    time_gate: TimeGate | None,
     randomness: LaneRandomness,
-) -> WalkEnds:
+) -> SubpathVertex:
     """Walk on from sites until roulette, an escape or ``max_bounces`` ends it.
 
     Parameters
     ----------
     built
         The scene.
-    sites, reflectance
+    vpls, reflectance
         Where the walks begin, one lane per walk.
-    tried
+    proposal_lasers
         Lasers by which vertices are judged.
     max_bounces
         Highest bounce; None for no limit.
-    deadline
+    time_gate
         After which light comes too late, per walk; None: none does.
     randomness
         One generator per walk.
@@ -106,18 +106,18 @@ def trace_walks(
 
     # ---- State -------------------------------------------------------------------------------------------------
     throughput = mi.Spectrum(reflectance)
-    direction = sites.sh_frame.to_world(mi.warp.square_to_cosine_hemisphere(square))
-    ray = mi.Ray3f(offset_origin(built, sites, direction), direction)
-    alive = dr.any(throughput > 0) & (dr.dot(direction, sites.n) > 0)
-    origin = mi.Point3f(sites.p)
+    direction = vpls.sh_frame.to_world(mi.warp.square_to_cosine_hemisphere(square))
+    ray = mi.Ray3f(offset_origin(built, vpls, direction), direction)
+    alive = dr.any(throughput > 0) & (dr.dot(direction, vpls.n) > 0)
+    origin = mi.Point3f(vpls.p)
     opl = mi.Float(0)  # optical path length from the site [engine units]
     bounce = mi.UInt32(FIRST_BOUNCE + 1)  # of a connection from the last vertex
     position, normal, shading, shape = mi.Point3f(0), mi.Normal3f(0), mi.Normal3f(0), mi.ShapePtr(wall)
     carried, chosen_opl, chosen_bounce = mi.Spectrum(0), mi.Float(0), mi.UInt32(0)
     expected, total = mi.Float(0), mi.Float(0)
-    is_thinned = mi.Bool(False)  # the walk can only find light that comes too late, and has survived that roulette
+    is_past_gate = mi.Bool(False)  # the walk can only find light that comes too late, and has survived that roulette
 
-    while dr.hint(alive, exclude=[built, scene, tried, sites, deadline]):
+    while dr.hint(alive, exclude=[built, scene, proposal_lasers, vpls, time_gate]):
         # ---- Intersect -------------------------------------------------------------------------------------------
         si = scene.ray_intersect(ray, mi.RayFlags.All, coherent=False, active=alive)
         alive = alive & si.is_valid()
@@ -125,8 +125,8 @@ def trace_walks(
         bounce += 1
 
         # ---- Thin out what comes after the window, once a walk -------------------------------------------------------
-        alive, is_thinned, throughput = thinned_out(
-            deadline, generator, alive, is_thinned, opl, si.p, si.shape == wall, throughput
+        alive, is_past_gate, throughput = time_gate_roulette(
+            time_gate, generator, alive, is_past_gate, opl, si.p, si.shape == wall, throughput
         )
 
         # ---- What the lasers would bring, were nothing between; a plane is dark to its own laser points -------------
@@ -138,14 +138,14 @@ def trace_walks(
         upright.wi = mi.Vector3f(0, 0, 1)
         leaving = throughput * bsdf.eval(context, upright, mi.Vector3f(0, 0, 1), hidden)
         lit = mi.Float(0)
-        for k in range(tried.count):
-            point = tried.points.gather(mi.UInt32(k))
-            lit += dr.mean(leaving * arriving(built, point, si.p, si.sh_frame.n)) / tried.count
-        if dr.hint(not tried.are_all, mode="scalar"):
-            away = dr.squared_norm(si.p - tried.points.gather(mi.UInt32(0)).interaction.p)
+        for k in range(proposal_lasers.count):
+            point = proposal_lasers.points.gather(mi.UInt32(k))
+            lit += dr.mean(leaving * arriving(built, point, si.p, si.sh_frame.n)) / proposal_lasers.count
+        if dr.hint(not proposal_lasers.are_all, mode="scalar"):
+            away = dr.squared_norm(si.p - proposal_lasers.points.gather(mi.UInt32(0)).interaction.p)
             lit += UNTRIED_SHARE * dr.mean(leaving) / away
-        if dr.hint(deadline is not None, mode="scalar"):
-            lit = dr.select(is_thinned, lit * LATE_SURVIVAL, lit)
+        if dr.hint(time_gate is not None, mode="scalar"):
+            lit = dr.select(is_past_gate, lit * GATE_SURVIVAL, lit)
         lit = dr.select(hidden, lit, 0)
         total += lit
         pick = (lit > 0) & (generator.next_float32(alive) * total < lit)
@@ -168,7 +168,7 @@ def trace_walks(
         origin = mi.Point3f(si.p)
         ray = mi.Ray3f(offset_origin(built, si, direction), direction)
 
-    return WalkEnds(position, normal, shading, shape, carried, chosen_opl, chosen_bounce, expected, total)
+    return SubpathVertex(position, normal, shading, shape, carried, chosen_opl, chosen_bounce, expected, total)
 
 
 def arriving(built: BuiltScene, laser: WallPoints, point: mi.Point3f, shading: mi.Normal3f) -> mi.Spectrum:
@@ -181,74 +181,76 @@ def arriving(built: BuiltScene, laser: WallPoints, point: mi.Point3f, shading: m
 
 
 @dataclass(frozen=True, eq=False)
-class WalkPlan:
+class SubpathPlan:
     """How many walks are made for a capture, and what of them is kept."""
 
     replicas: int  # independent sets of sites
-    sites: int  # per round and replica
-    walks: int  # per site
-    impulses: int  # kept per site, on average
+    vpls: int  # per round and replica
+    subpaths: int  # per site
+    contributions: int  # kept per site, on average
     max_bounces: int | None
     is_confocal: bool
-    horizon: Horizon | None  # beyond which light comes too late; None: none does
+    capture_gate: CaptureTimeGate | None  # beyond which light comes too late; None: none does
 
 
-def walk_back(plan: WalkPlan, transport: Transport, sites: Sites, tried: TriedLasers, seed: int) -> Impulses:
-    """Walk on from ``sites`` and return what the lasers of the batch send back along the walks.
+def vpl_contributions(
+    plan: SubpathPlan, params: LaunchParams, vpls: Vpls, proposal_lasers: ProposalLasers, seed: int
+) -> VplContributions:
+    """Walk on from ``vpls`` and return what the lasers of the batch send back along the walks.
 
     Parameters
     ----------
     plan
         Numbers of walks and impulses.
-    transport
+    params
         Scene and lasers.
-    sites
+    vpls
         Where the walks begin: of one replica after the other.
-    tried
+    proposal_lasers
         Lasers by which vertices are judged.
     seed
         Of the walks' random numbers.
     """
-    built = transport.built
-    surface = surface_at(built, sites.positions, sites.normals, sites.shapes, sites.primitives, sites.barycentric)
+    built = params.built
+    surface = surface_at(built, vpls.positions, vpls.normals, vpls.shapes, vpls.primitives, vpls.barycentric)
     reflectance = normal_reflectance(surface)
     dr.eval(surface, reflectance)
-    owner = dr.arange(mi.UInt32, len(sites) * plan.walks) // plan.walks
-    deadline = None
-    if plan.horizon is not None:
-        deadline = plan.horizon.deadline_from(np.repeat(sites.positions, plan.walks, axis=0))
-    ends = trace_walks(
+    row_of_lane = dr.arange(mi.UInt32, len(vpls) * plan.subpaths) // plan.subpaths
+    time_gate = None
+    if plan.capture_gate is not None:
+        time_gate = plan.capture_gate.of_points(np.repeat(vpls.positions, plan.subpaths, axis=0))
+    ends = trace_subpaths(
         built,
-        dr.gather(mi.SurfaceInteraction3f, surface, owner),
-        dr.gather(mi.Spectrum, reflectance, owner),
-        tried,
+        dr.gather(mi.SurfaceInteraction3f, surface, row_of_lane),
+        dr.gather(mi.Spectrum, reflectance, row_of_lane),
+        proposal_lasers,
         plan.max_bounces,
-        deadline,
-        LaneRandomness.seeded(seed, dr.arange(mi.UInt32, dr.width(owner))),
+        time_gate,
+        LaneRandomness.seeded(seed, dr.arange(mi.UInt32, dr.width(row_of_lane))),
     )
     dr.eval(ends)
-    walk, copies, share = _resample(ends, sites, plan, np.random.default_rng(seed))
-    if not len(walk):
-        return no_impulses()
+    subpath, copies, share = _resample(ends, vpls, plan, np.random.default_rng(seed))
+    if not len(subpath):
+        return no_contributions()
     if plan.is_confocal:
-        values, delays, lit = _unconnected(transport, ends, walk, copies * share)
+        values, delays, lit = _unconnected(params, ends, subpath, copies * share)
         n_lasers = 1
     else:
-        values, delays, lit = _connect(transport, ends, walk, copies * share)
-        n_lasers = transport.lasers_per_lane
-    kept = dr.compress(lit)
-    n_kept = dr.width(kept)
+        values, delays, lit = _connect(params, ends, subpath, copies * share)
+        n_lasers = params.lasers_per_lane
+    saved = dr.compress(lit)
+    n_kept = dr.width(saved)
     if not n_kept:
-        return no_impulses()
+        return no_contributions()
     index = dr.arange(mi.UInt32, n_kept * n_lasers)
     # opaque: no two rounds keep as many, and each number would be a kernel to compile
-    per_laser, found = dr.opaque(mi.UInt32, n_kept), dr.opaque(mi.UInt32, len(walk))
-    entry = index // per_laser * found + dr.gather(mi.UInt32, kept, index % per_laser)
-    chosen = walk[np.asarray(kept.numpy())]
+    per_laser, found = dr.opaque(mi.UInt32, n_kept), dr.opaque(mi.UInt32, len(subpath))
+    entry = index // per_laser * found + dr.gather(mi.UInt32, saved, index % per_laser)
+    chosen = subpath[np.asarray(saved.numpy())]
     end = on_device(mi.UInt32, chosen)
-    impulses = Impulses(
+    contributions = VplContributions(
         n_kept,
-        chosen // plan.walks,
+        chosen // plan.subpaths,
         dr.gather(mi.UInt32, ends.bounce, end),
         dr.gather(mi.Spectrum, values, entry),
         dr.gather(mi.Float, delays, entry),
@@ -256,17 +258,24 @@ def walk_back(plan: WalkPlan, transport: Transport, sites: Sites, tried: TriedLa
         dr.gather(mi.Normal3f, ends.shading, end),
         _ray_offset(built, ends, end),
     )
-    dr.eval(impulses.bounces, impulses.values, impulses.delays, impulses.ends, impulses.shading, impulses.offset)
-    return impulses
+    dr.eval(
+        contributions.bounces,
+        contributions.values,
+        contributions.delays,
+        contributions.ends,
+        contributions.shading,
+        contributions.offset,
+    )
+    return contributions
 
 
-def no_impulses() -> Impulses:
+def no_contributions() -> VplContributions:
     """Return what comes back when no walk finds light."""
     nothing = mi.UInt32(), mi.Spectrum(0), mi.Float(), mi.Point3f(), mi.Normal3f(), mi.Vector3f()
-    return Impulses(0, np.zeros(0, np.int64), *nothing)
+    return VplContributions(0, np.zeros(0, np.int64), *nothing)
 
 
-def _ray_offset(built: BuiltScene, ends: WalkEnds, index: mi.UInt32) -> mi.Vector3f:
+def _ray_offset(built: BuiltScene, ends: SubpathVertex, index: mi.UInt32) -> mi.Vector3f:
     """Return the ray offset of the ends of walks, on the side of their shading normals."""
     si = dr.zeros(mi.SurfaceInteraction3f, dr.width(index))
     si.p, si.n = dr.gather(mi.Point3f, ends.position, index), dr.gather(mi.Normal3f, ends.normal, index)
@@ -275,7 +284,7 @@ def _ray_offset(built: BuiltScene, ends: WalkEnds, index: mi.UInt32) -> mi.Vecto
 
 
 def _resample(
-    ends: WalkEnds, sites: Sites, plan: WalkPlan, generator: np.random.Generator
+    ends: SubpathVertex, vpls: Vpls, plan: SubpathPlan, generator: np.random.Generator
 ) -> tuple[NDArray[np.int64], Float64, Float64]:
     """Choose walks in proportion to what they bring to the sensor points, evenly along the sites.
 
@@ -284,10 +293,10 @@ def _resample(
     tuple
         Walks (n,) ascending, how often each was chosen, and the value of one choice: radiance per expected light.
     """
-    importance = np.repeat(sites.importance, plan.walks)
+    importance = np.repeat(vpls.importance, plan.subpaths)
     weights = ends.total.numpy().astype(np.float64) * importance
-    per_replica, count = plan.sites * plan.walks, plan.impulses * plan.sites
-    walks, copies, shares = [np.zeros(0, np.int64)], [np.zeros(0)], [np.zeros(0)]
+    per_replica, count = plan.vpls * plan.subpaths, plan.contributions * plan.vpls
+    subpaths, copies, shares = [np.zeros(0, np.int64)], [np.zeros(0)], [np.zeros(0)]
     for replica in range(plan.replicas):
         cumulative = np.cumsum(weights[replica * per_replica : (replica + 1) * per_replica])
         total = cumulative[-1]
@@ -296,35 +305,35 @@ def _resample(
         at = (np.arange(count) + generator.random()) * (total / count)
         # never one without weight: the first whose cumulative weight exceeds the number
         chosen = np.minimum(np.searchsorted(cumulative, at, side="right"), np.searchsorted(cumulative, total))
-        walk, repeats = np.unique(chosen + replica * per_replica, return_counts=True)
-        walks.append(walk)
+        subpath, repeats = np.unique(chosen + replica * per_replica, return_counts=True)
+        subpaths.append(subpath)
         copies.append(repeats.astype(np.float64))
-        shares.append(total / (count * plan.walks * importance[walk]))
-    return np.concatenate(walks), np.concatenate(copies), np.concatenate(shares)
+        shares.append(total / (count * plan.subpaths * importance[subpath]))
+    return np.concatenate(subpaths), np.concatenate(copies), np.concatenate(shares)
 
 
 def _unconnected(
-    transport: Transport, ends: WalkEnds, walk: NDArray[np.int64], scale: Float64
+    params: LaunchParams, ends: SubpathVertex, subpath: NDArray[np.int64], scale: Float64
 ) -> tuple[mi.Spectrum, mi.Float, mi.Bool]:
     """Return what chosen ends pass on of the light that will meet them there, its delay, and which pass on any."""
-    end = on_device(mi.UInt32, walk)
+    end = on_device(mi.UInt32, subpath)
     values = dr.gather(mi.Spectrum, ends.carried, end) / dr.gather(mi.Float, ends.expected, end)
     values *= on_device(mi.Float, scale)
-    delays = dr.gather(mi.Float, ends.opl, end) * transport.bins_per_unit
+    delays = dr.gather(mi.Float, ends.opl, end) * params.bins_per_unit
     dr.eval(values, delays)
     return values, delays, dr.any(values > 0)
 
 
 def _connect(
-    transport: Transport, ends: WalkEnds, walk: NDArray[np.int64], scale: Float64
+    params: LaunchParams, ends: SubpathVertex, subpath: NDArray[np.int64], scale: Float64
 ) -> tuple[mi.Spectrum, mi.Float, mi.Bool]:
     """Connect chosen ends to every laser; return values and delays (laser * n + walk), and which bring any light."""
-    built, n = transport.built, len(walk)
-    index = dr.arange(mi.UInt32, n * transport.lasers_per_lane)
+    built, n = params.built, len(subpath)
+    index = dr.arange(mi.UInt32, n * params.lasers_per_lane)
     per_laser = dr.opaque(mi.UInt32, n)
     at = index % per_laser
-    end = dr.gather(mi.UInt32, on_device(mi.UInt32, walk), at)
-    lasers = transport.lasers.gather(index // per_laser)
+    end = dr.gather(mi.UInt32, on_device(mi.UInt32, subpath), at)
+    lasers = params.lasers.gather(index // per_laser)
     position = dr.gather(mi.Point3f, ends.position, end)
     si = dr.zeros(mi.SurfaceInteraction3f, dr.width(index))
     si.p, si.n, si.shape = position, dr.gather(mi.Normal3f, ends.normal, end), dr.gather(mi.ShapePtr, ends.shape, end)
@@ -337,7 +346,7 @@ def _connect(
     segment = connection_segment(built, si, to_laser / distance, lasers.interaction)
     active &= ~built.scene.ray_test(segment, coherent=False, active=active)
     value = dr.select(active, value, 0)
-    delays = (dr.gather(mi.Float, ends.opl, end) + distance) * transport.bins_per_unit
+    delays = (dr.gather(mi.Float, ends.opl, end) + distance) * params.bins_per_unit
     lit = dr.zeros(mi.UInt32, n)
     dr.scatter(lit, mi.UInt32(1), at, active)  # of several lasers, all write the same; a reduction would know ``n``
     dr.eval(value, delays, lit)
