@@ -18,6 +18,14 @@ def bunny() -> Path:
     return BUNNY
 
 
+@pytest.fixture
+def backend() -> None:
+    """Grey Mitsuba on LLVM, whatever the test before has chosen; what imports Mitsuba may be imported after it."""
+    from nlosrender.engine.backend.start import start_backend
+
+    start_backend("llvm")
+
+
 def pytest_configure() -> None:
     """Make Ctrl-C arrive, also where the suite is run in the background: shells let such commands ignore it."""
     if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:

@@ -18,7 +18,8 @@ from support.rendering import flat_wall
 from support.varied_scenes import Stage
 
 from nlosrender.bench.meshes import grid_faces, write_ply
-from nlosrender.engine.backend.start import start_backend
+
+pytestmark = pytest.mark.usefixtures("backend")
 
 Item = dict[str, Any]
 NEVER = 10**12  # points
@@ -56,12 +57,6 @@ TRIED = {
     ("sphere", "single"),
     ("near the wall", "confocal"),
 }
-
-
-@pytest.fixture(autouse=True)
-def backend() -> None:
-    """Choose LLVM before anything imports Mitsuba."""
-    start_backend("llvm")
 
 
 def sheet(folder: Path, n: int, height: float, waves: float, **place: Any) -> Item:

@@ -13,16 +13,11 @@ from support.rendering import flat_wall
 from support.varied_scenes import Stage
 
 from nlosrender.bench.meshes import grid_faces, write_ply
-from nlosrender.engine.backend.start import start_backend
+
+pytestmark = pytest.mark.usefixtures("backend")
 
 Array = NDArray[np.float64]
 N_FINE = 70  # rows of squares of a fine sheet: 15 mm of 0.8 m, far below the size allowed at coarseness 1, 0.2 m
-
-
-@pytest.fixture(autouse=True)
-def backend() -> None:
-    """Choose LLVM before anything imports Mitsuba."""
-    start_backend("llvm")
 
 
 def sheet(folder: Path, n: int, waves: float = 0.05, name: str = "sheet.ply") -> dict[str, Any]:

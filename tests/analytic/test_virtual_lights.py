@@ -21,6 +21,8 @@ from support.rendering import Rendering, configured, flat_wall, render
 from nlosrender import pipeline
 from nlosrender.engine.backend.start import start_backend
 
+pytestmark = pytest.mark.usefixtures("backend")
+
 PLATE = {
     "type": "rectangle",
     "width": 0.8,
@@ -49,12 +51,6 @@ BINS = (0.6, 0.02, 160)
 EDGES = 0.6 + 0.02 * np.arange(161)
 LASERS = {"single": np.array([[[0.3, -0.2, 0.0]]]), "exhaustive": grid_points(2, 3, 1.5, 1.2)}
 SENSORS = grid_points(5, 3, 2.0, 1.6)
-
-
-@pytest.fixture(autouse=True)
-def backend() -> None:
-    """Choose LLVM before anything imports Mitsuba."""
-    start_backend("llvm")
 
 
 def start(config: dict):

@@ -8,23 +8,20 @@ from pathlib import Path
 
 import h5py
 import pytest
+from support.render_processes import plate_scene
 from typer.testing import CliRunner
 
 from nlosrender.cli.app import app
 from nlosrender.errors import EXIT_BAD_INPUT, ConfigError
 
-SCENE = """
-scene:
-  relay_wall: {type: rectangle, width: 2.0, height: 1.6}
-  hidden_geometry:
-    - {type: rectangle, width: 0.5, height: 0.4, center: [0.1, 0, 0.9], normal: [0, 0, -1]}
+SCENE = plate_scene("""\
 capture:
   scan_type: SCAN
   sensor_grid: {nx: 4, ny: 3}
   LASERS
 time_axis: {bin_width_opl: 0.05, n_bins: auto}
 render: {max_bounces: 4, spp: 64}
-"""
+""")
 VIEW = """
 scene:
   hidden_geometry: [{type: rectangle, width: 0.5, height: 0.4, center: [0, 0, 0.9], normal: [0, 0, -1]}]

@@ -4,49 +4,28 @@ from __future__ import annotations
 
 import json
 import random
-import resource
 import shutil
 import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
-from contextlib import suppress
+from collections.abc import Iterator
 from pathlib import Path
 
 import h5py
 import numpy as np
 import pytest
+from support.render_processes import INTERRUPTED, N_UNITS, PARTIAL, ended, report_of, start_render, wait_for_units
 
-from nlosrender.files.journal import read_records
 from nlosrender.files.partial_capture import PartialCapture
-from nlosrender.files.unit_log import UnfinishedRender
-
-# 14 units of a fraction of a tenth of a second
-SCENE = """
-scene:
-  relay_wall: {type: rectangle, width: 2.0, height: 1.6}
-  hidden_geometry:
-    - {type: rectangle, width: 0.5, height: 0.4, center: [0.1, 0, 0.9], normal: [0, 0, -1]}
-capture:
-  scan_type: exhaustive
-  sensor_grid: {nx: 4, ny: 3}
-  laser_grid: {nx: 2, ny: 7}
-  account_first_and_last_bounces: false
-time_axis: {start_opl: 1.6, bin_width_opl: 0.01, n_bins: 300}
-render: {max_bounces: 4, engine: path, spp: SPP, memory_limit: 402MB}
-output: {path: a.hdf5}
-"""
-SPP = 4_000
-N_UNITS = 14
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with a configuration and what an uninterrupted render makes of it, ``whole.hdf5``."""
     folder = tmp_path_factory.mktemp("scale")
-    (folder / "scene.yaml").write_text(SCENE.replace("SPP", str(SPP)))
-    report = json.loads(finished(start(folder, "-o", "whole.hdf5", "--json")))
+    (folder / "scene.yaml").write_text(INTERRUPTED)
+    report = report_of(start_render(folder, "-o", "whole.hdf5", "--json"))
     assert report["units"] == N_UNITS
     return folder
 
@@ -57,38 +36,6 @@ def fresh(folder: Path) -> Iterator[Path]:
     yield folder
     (folder / "a.hdf5").unlink(missing_ok=True)
     shutil.rmtree(folder / ".a.hdf5.partial", ignore_errors=True)
-
-
-def start(folder: Path, *options: str, limit: Callable[[], None] | None = None) -> subprocess.Popen[str]:
-    command = [sys.executable, "-m", "nlosrender", "render", "scene.yaml", *options]
-    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
-    return subprocess.Popen(command, cwd=folder, text=True, preexec_fn=limit, **pipes)
-
-
-def ended(process: subprocess.Popen[str]) -> tuple[int, str]:
-    """Exit code and what was printed on stderr."""
-    _, errors = process.communicate(timeout=120)
-    assert "Traceback" not in errors
-    return process.returncode, errors
-
-
-def finished(process: subprocess.Popen[str]) -> str:
-    """What a process that ends well has printed."""
-    output, errors = process.communicate(timeout=120)
-    assert process.returncode == 0, errors
-    return output
-
-
-def wait_for_units(folder: Path, process: subprocess.Popen[str], count: int) -> int:
-    """Wait until so many units are noted as finished, or the process ends; return how many are."""
-    partial, units = folder / ".a.hdf5.partial", 0
-    while process.poll() is None and units < count:
-        time.sleep(0.002)
-        if not any(partial.glob("samples.*")):  # a journal alone is what a finished render was killed over
-            continue
-        with suppress(FileNotFoundError):  # not yet, or no longer
-            units = len(UnfinishedRender.from_records(read_records(partial / "journal")).tally.units)
-    return units
 
 
 def assert_whole(folder: Path) -> None:
@@ -109,7 +56,7 @@ def test_killed_at_random_moments(fresh: Path, kills: int) -> None:
     rng = random.Random(kills)
     saved = done = 0
     while done < kills:
-        process = start(fresh)
+        process = start_render(fresh)
         reached = wait_for_units(fresh, process, rng.randint(saved, min(saved + 2, N_UNITS)))
         time.sleep(rng.uniform(0, 0.06))
         process.send_signal(signal.SIGKILL)
@@ -122,23 +69,23 @@ def test_killed_at_random_moments(fresh: Path, kills: int) -> None:
             continue
         assert reached >= saved or process.returncode == -signal.SIGKILL
         saved = max(saved, reached)
-    report = json.loads(finished(start(fresh, "--json")))
+    report = report_of(start_render(fresh, "--json"))
     assert report["resumed_units"] >= saved
     assert_whole(fresh)
-    assert not (fresh / ".a.hdf5.partial").exists()
+    assert not (fresh / PARTIAL).exists()
 
 
 def test_a_journal_without_its_samples_means_nothing(fresh: Path) -> None:
     """Killed after the output was put in place, before the journal was gone: the next render begins anew."""
-    partial = fresh / ".a.hdf5.partial"
-    process = start(fresh)
+    partial = fresh / PARTIAL
+    process = start_render(fresh)
     assert wait_for_units(fresh, process, 1) >= 1
     journal = (partial / "journal").read_bytes()
     process.communicate(timeout=120)
     (fresh / "a.hdf5").unlink()
     partial.mkdir()
     (partial / "journal").write_bytes(journal)
-    report = json.loads(finished(start(fresh, "--json")))
+    report = report_of(start_render(fresh, "--json"))
     assert report["resumed_units"] == 0
     assert_whole(fresh)
     assert not partial.exists()
@@ -147,7 +94,7 @@ def test_a_journal_without_its_samples_means_nothing(fresh: Path) -> None:
 @pytest.mark.parametrize("number", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.slow)])
 def test_a_stop_saves_and_is_gone_on_from(fresh: Path, number: signal.Signals) -> None:
     """Ctrl-C, or a batch system's notice: the unit is finished, exit code 130, and the same command goes on."""
-    process = start(fresh)
+    process = start_render(fresh)
     reached = wait_for_units(fresh, process, 4)
     process.send_signal(number)
     code, errors = ended(process)
@@ -155,7 +102,7 @@ def test_a_stop_saves_and_is_gone_on_from(fresh: Path, number: signal.Signals) -
     assert f"stopped by {number.name}; " in errors
     assert "The same command goes on from there." in errors
     assert not (fresh / "a.hdf5").exists()
-    report = json.loads(finished(start(fresh, "--resume", "--json")))
+    report = report_of(start_render(fresh, "--resume", "--json"))
     assert reached + 1 <= report["resumed_units"] < N_UNITS  # the unit in flight was finished
     assert_whole(fresh)
 
@@ -165,15 +112,12 @@ def test_a_full_disk_keeps_what_is_finished(fresh: Path) -> None:
     shutil.copy(fresh / "whole.hdf5", fresh / "a.hdf5")
     whole = (fresh / "whole.hdf5").stat().st_size
 
-    def small_disk() -> None:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (whole * 2 // 3, resource.RLIM_INFINITY))
-
-    code, errors = ended(start(fresh, limit=small_disk))
+    code, errors = ended(start_render(fresh, file_limit=whole * 2 // 3))
     assert code == 5, errors
     assert "a.hdf5: cannot be written: File too large. Free some space" in errors
     assert "units are finished and saved" in errors
     assert (fresh / "a.hdf5").read_bytes() == (fresh / "whole.hdf5").read_bytes()
-    report = json.loads(finished(start(fresh, "--json")))
+    report = report_of(start_render(fresh, "--json"))
     assert 0 < report["resumed_units"] < N_UNITS
     assert_whole(fresh)
 
@@ -182,20 +126,17 @@ def test_a_full_disk_keeps_what_is_finished(fresh: Path) -> None:
 def test_a_disk_without_any_space_leaves_nothing(fresh: Path) -> None:
     """Where nothing could be saved nothing is left, and the exit code is that of a failure."""
 
-    def tiny_disk() -> None:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (1000, resource.RLIM_INFINITY))
-
-    code, errors = ended(start(fresh, limit=tiny_disk))
+    code, errors = ended(start_render(fresh, file_limit=1000))
     assert code == 1
     assert "a.hdf5: cannot be written" in errors
     assert not (fresh / "a.hdf5").exists()
-    assert not (fresh / ".a.hdf5.partial").exists()
+    assert not (fresh / PARTIAL).exists()
 
 
 def test_two_renders_into_one_file(fresh: Path) -> None:
     """The second one is refused with a clear message, and the first does not notice."""
     with PartialCapture.claim(fresh / "a.hdf5", {}):
-        code, errors = ended(start(fresh, "--overwrite"))
+        code, errors = ended(start_render(fresh, "--overwrite"))
     assert code == 3
     assert "a.hdf5: another render is writing it now" in errors
 
@@ -204,7 +145,7 @@ def test_two_renders_into_one_file(fresh: Path) -> None:
 def test_shards_from_a_shell(fresh: Path) -> None:
     """The documented loop: shards, then merge; a missing shard ends with exit code 3 and its name."""
     for number in (1, 2):
-        finished(start(fresh, "-o", f"part{number}.hdf5", "--shard", f"{number}/2", "--quiet"))
+        report_of(start_render(fresh, "-o", f"part{number}.hdf5", "--shard", f"{number}/2", "--json"))
     command = [sys.executable, "-m", "nlosrender", "merge", "-o", "a.hdf5"]
     done = subprocess.run([*command, "part2.hdf5"], cwd=fresh, text=True, capture_output=True, check=False)
     assert (done.returncode, "missing: lasers 0:7" in done.stderr) == (3, True)
@@ -226,6 +167,6 @@ def test_shards_from_a_shell(fresh: Path) -> None:
 )
 def test_parts_that_make_no_sense(fresh: Path, options: tuple[str, ...], code: int, message: str) -> None:
     """Slips of the pen are usage errors; parts that the capture does not have are refused before the render."""
-    found, errors = ended(start(fresh, *options))
+    found, errors = ended(start_render(fresh, *options))
     assert found == code
     assert message in errors

@@ -9,13 +9,10 @@ from pathlib import Path
 
 import h5py
 import pytest
+from support.render_processes import plate_scene
 
 LIMIT = 600e6
-SCENE = """
-scene:
-  relay_wall: {type: rectangle, width: 2.0, height: 1.6}
-  hidden_geometry:
-    - {type: rectangle, width: 0.5, height: 0.4, center: [0.1, 0, 0.9], normal: [0, 0, -1]}
+SCENE = plate_scene("""\
 capture:
   scan_type: exhaustive
   sensor_grid: {nx: 32, ny: 24}
@@ -23,7 +20,7 @@ capture:
 time_axis: {bin_width_opl: 0.003, n_bins: 2048}
 render: {max_bounces: 3, engine: ENGINE, spp: SPP, target_error: ERROR, memory_limit: 600MB}
 output: {path: a.hdf5}
-"""
+""")
 # what the process itself says of its largest resident set, once the command is done
 MEASURED = (
     "import resource, sys; from nlosrender.cli.app import app\n"

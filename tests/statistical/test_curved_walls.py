@@ -12,7 +12,7 @@ from support.agreement import relative_l2
 from support.engine_sums import assert_alike, energies, group_sums
 from support.rendering import flat_wall, render
 from support.varied_scenes import Stage, ball, diffuse, plate
-from support.wall_meshes import flat, globe, sheet, wavy, write_ply
+from support.wall_meshes import flat, globe, sheet, wavy, write_uv_ply
 
 from nlosrender.engine.backend.start import start_backend
 
@@ -54,7 +54,7 @@ def compare(
     start_backend("llvm")
     from nlosrender.engine.path.engine import Budget
 
-    write_ply(folder / "waves.ply", *sheet(wavy(2.0, 1.6, 0.1), 12, 10))
+    write_uv_ply(folder / "waves.ply", *sheet(wavy(2.0, 1.6, 0.1), 12, 10))
     stage = Stage.of(scene(name, scan, max_bounces=max_bounces), folder)
     assert stage.engine.name == "virtual_lights"
     assert stage.engine.further is not None or max_bounces == 3
@@ -89,7 +89,7 @@ def test_engines_agree_on_curved_walls(name: str, scan: str, tmp_path: Path) -> 
 @pytest.mark.parametrize("engine", ["path", "virtual_lights"])
 def test_a_flat_mesh_wall_has_the_bits_of_the_rectangle(engine: str, tmp_path: Path) -> None:
     """Both engines know that a flat mesh is a plane, and give the same numbers on it."""
-    write_ply(tmp_path / "flat.ply", *sheet(flat(2.0, 1.6), 4, 3))
+    write_uv_ply(tmp_path / "flat.ply", *sheet(flat(2.0, 1.6), 4, 3))
     goal = {"spp": 512} if engine == "path" else {"spp": None, "target_error": 0.05}
     config = flat_wall(NEAR, engine=engine, max_bounces=4, **goal)
     rectangle = render(config)
@@ -108,7 +108,7 @@ def test_a_finer_and_finer_globe_becomes_the_sphere(tmp_path: Path) -> None:
     sphere = render(config).bounce(3)
     errors = []
     for columns in (12, 36):
-        write_ply(tmp_path / "globe.ply", *sheet(globe(radius), columns + 1, columns // 2 + 1))
+        write_uv_ply(tmp_path / "globe.ply", *sheet(globe(radius), columns + 1, columns // 2 + 1))
         mesh = {"type": "mesh", "filename": "globe.ply", "flip_normals": True, "width": 2 * np.pi * radius, **GREY}
         config["scene"]["relay_wall"] = {**mesh, "height": 2 * radius}
         errors.append(relative_l2(render(config, folder=tmp_path).bounce(3) - sphere, sphere))
@@ -122,7 +122,7 @@ def test_points_on_the_edges_of_a_mesh_wall_are_said(tmp_path: Path) -> None:
     start_backend("llvm")
     from nlosrender.engine.preflight.scene_warnings import scene_warnings
 
-    write_ply(tmp_path / "waves.ply", *sheet(wavy(2.0, 1.6, 0.1), 12, 10))
+    write_uv_ply(tmp_path / "waves.ply", *sheet(wavy(2.0, 1.6, 0.1), 12, 10))
     config = scene("waves", "single")
     assert not [text for text in scene_warnings(Stage.of(config, tmp_path).engine) if "edges" in text]
     config["capture"]["sensor_grid"]["nx"] = 3
@@ -135,7 +135,7 @@ def test_points_on_the_edges_of_a_mesh_wall_are_said(tmp_path: Path) -> None:
 )
 def test_auto_takes_the_engine_that_is_quicker(name: str, engine: str, tmp_path: Path) -> None:
     """Round walls are cut into few cells; the edges of a mesh wall take very many, and a reason is given."""
-    write_ply(tmp_path / "waves.ply", *sheet(wavy(2.0, 1.6, 0.1), 12, 10))
+    write_uv_ply(tmp_path / "waves.ply", *sheet(wavy(2.0, 1.6, 0.1), 12, 10))
     chosen = Stage.of(scene(name, "single", "auto"), tmp_path).engine
     assert chosen.name == engine
     assert ("curved wall" if engine == "virtual_lights" else "a mesh that sees itself") in chosen.reason

@@ -10,22 +10,14 @@ from support.agreement import assert_agrees
 from support.quadrature import Array, Cells, Setup, cylinder_cells, grid_points, sphere_cells, third_bounces
 from support.rendering import flat_wall, render
 
+from nlosrender.bench.meshes import write_ply
+
 REPLICAS = 32
 BINS = (0.7, 0.05, 40)
 EDGES = 0.7 + 0.05 * np.arange(41)
 CENTER, RADIUS, HEIGHT = [0.2, -0.1, 0.7], 0.25, 0.5
 SPHERE = {"type": "sphere", "center": CENTER, "radius": RADIUS}
 CYLINDER = {"type": "cylinder", "center": CENTER, "radius": RADIUS, "height": HEIGHT, "axis": [0, 1, 0]}
-
-
-def write_ply(filename: Path, vertices: Array, faces: Array) -> None:
-    """An ASCII .ply of triangles."""
-    header = f"ply\nformat ascii 1.0\nelement vertex {len(vertices)}\n"
-    header += "".join(f"property float {axis}\n" for axis in "xyz")
-    header += f"element face {len(faces)}\nproperty list uchar int vertex_indices\nend_header\n"
-    rows = [" ".join(f"{x:.9g}" for x in vertex) for vertex in vertices]
-    rows += ["3 " + " ".join(map(str, face)) for face in faces]
-    filename.write_text(header + "\n".join(rows) + "\n")
 
 
 def mesh_of_revolution(profile: Array, n: int) -> tuple[Array, Array]:

@@ -9,6 +9,8 @@ from support.rendering import configured, flat_wall, render
 
 from nlosrender.engine.backend.start import start_backend
 
+pytestmark = pytest.mark.usefixtures("backend")
+
 PLATE = {
     "type": "rectangle",
     "width": 0.8,
@@ -19,12 +21,6 @@ PLATE = {
 }
 BEHIND = {**PLATE, "center": [0.0, 0.1, 1.1], "normal": [0, 0, -1], "width": 1.2}
 TINY_LAUNCHES = 1e-9  # seconds: one path per lane and launch after the first
-
-
-@pytest.fixture(scope="module", autouse=True)
-def backend() -> None:
-    """Dr.Jit picks its LLVM when it is imported."""
-    start_backend("llvm", colored=False)
 
 
 def path_engine(config: dict):

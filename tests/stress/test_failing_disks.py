@@ -4,13 +4,8 @@ with a broken file."""
 from __future__ import annotations
 
 import random
-import resource
 import shutil
 import signal
-import subprocess
-import sys
-import time
-from contextlib import suppress
 from pathlib import Path
 
 import h5py
@@ -19,47 +14,10 @@ import pytest
 from conftest import Ledger
 from PIL import Image
 from scipy.io import loadmat
+from support.render_processes import INTERRUPTED, N_UNITS, PARTIAL, ended, start, wait_for_units
 
-from nlosrender.files.journal import read_records
-from nlosrender.files.unit_log import UnfinishedRender
-
-SCENE = """
-scene:
-  relay_wall: {type: rectangle, width: 2.0, height: 1.6}
-  hidden_geometry:
-    - {type: rectangle, width: 0.5, height: 0.4, center: [0.1, 0, 0.9], normal: [0, 0, -1]}
-capture:
-  scan_type: exhaustive
-  sensor_grid: {nx: 4, ny: 3}
-  laser_grid: {nx: 2, ny: 7}
-  account_first_and_last_bounces: false
-time_axis: {start_opl: 1.6, bin_width_opl: 0.01, n_bins: 300}
-render: {max_bounces: 4, engine: path, spp: 4000, memory_limit: 402MB}
-output: {path: a.hdf5}
-"""
-N_UNITS = 14  # of a fraction of a tenth of a second
 PLACES = 30
 SIZES = (0, 2_000, 12_000, 25_000)  # bytes that a file may have
-
-
-def process(folder: Path, *arguments: object, limit: int | None = None) -> subprocess.Popen[str]:
-    """Start ``nlosrender`` in a folder, with a bound on the size of files: writes beyond it fail as on a full disk."""
-
-    def bounded() -> None:
-        if limit is not None:
-            resource.setrlimit(resource.RLIMIT_FSIZE, (limit, resource.RLIM_INFINITY))
-
-    command = [sys.executable, "-m", "nlosrender", *map(str, arguments)]
-    return subprocess.Popen(
-        command, cwd=folder, text=True, preexec_fn=bounded, stdout=subprocess.PIPE, stderr=subprocess.PIPE
-    )
-
-
-def ended(running: subprocess.Popen[str]) -> tuple[int, str]:
-    """Exit code and what was said on stderr."""
-    _, errors = running.communicate(timeout=300)
-    assert "Traceback" not in errors
-    return running.returncode, errors
 
 
 def contents(path: Path) -> dict[str, object]:
@@ -74,18 +32,11 @@ def contents(path: Path) -> dict[str, object]:
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with a configuration, what an undisturbed render makes of it, and its two halves."""
     folder = tmp_path_factory.mktemp("disks")
-    (folder / "scene.yaml").write_text(SCENE)
+    (folder / "scene.yaml").write_text(INTERRUPTED)
     for options in (("-o", "whole.hdf5"), ("-o", "1.hdf5", "--shard", "1/2"), ("-o", "2.hdf5", "--shard", "2/2")):
-        code, errors = ended(process(folder, "render", "scene.yaml", "--quiet", *options))
+        code, errors = ended(start(folder, "render", "scene.yaml", "--quiet", *options))
         assert code == 0, errors
     return folder
-
-
-def units_noted(folder: Path) -> int:
-    """How many units the journal has; 0 while there is none."""
-    with suppress(FileNotFoundError):
-        return len(UnfinishedRender.from_records(read_records(folder / ".a.hdf5.partial/journal")).tally.units)
-    return 0
 
 
 def damage(partial: Path, rng: random.Random) -> str:
@@ -111,20 +62,18 @@ def test_stopped_killed_and_damaged_at_random_places(folder: Path, ledger: Ledge
     refused = []
     for seed in range(PLACES):
         rng = random.Random(seed)
-        running = process(folder, "render", "scene.yaml", "--quiet")
-        aim = rng.randint(1, N_UNITS - 3)
-        while running.poll() is None and units_noted(folder) < aim:
-            time.sleep(0.002)
+        running = start(folder, "render", "scene.yaml", "--quiet")
+        wait_for_units(folder, running, rng.randint(1, N_UNITS - 3))
         number = rng.choice([signal.SIGKILL, signal.SIGTERM])
         running.send_signal(number)
         ended(running)
-        output, partial = folder / "a.hdf5", folder / ".a.hdf5.partial"
+        output, partial = folder / "a.hdf5", folder / PARTIAL
         done = "nothing" if output.exists() else damage(partial, rng)
-        code, errors = ended(process(folder, "render", "scene.yaml", "--quiet"))
+        code, errors = ended(start(folder, "render", "scene.yaml", "--quiet"))
         fault = ""
         if code == 0:
             fault = "" if contents(output) == whole else "another file"
-            check, _ = ended(process(folder, "info", "a.hdf5", "--check"))
+            check, _ = ended(start(folder, "info", "a.hdf5", "--check"))
             fault = fault or ("info --check" if check else "")
         elif "a.hdf5" not in errors or output.exists():
             fault = f"exit code {code}: {errors}"
@@ -165,12 +114,12 @@ def test_a_full_disk(name: str, folder: Path, ledger: Ledger) -> None:
     nothing else is left but what a render goes on with."""
     target = folder / name
     target.unlink(missing_ok=True)
-    code, errors = ended(process(folder, *WRITERS[name]))
+    code, errors = ended(start(folder, *WRITERS[name]))
     assert code == 0, errors
     before, present = target.read_bytes(), sorted(folder.iterdir())
     full = 0
     for limit in SIZES:
-        code, errors = ended(process(folder, *WRITERS[name], limit=limit))
+        code, errors = ended(start(folder, *WRITERS[name], file_limit=limit))
         fault = "" if is_whole(target) else "a broken file"
         if code != 0:
             full += 1

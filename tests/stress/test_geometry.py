@@ -11,6 +11,7 @@ from stressed import BOTH, Array, noise_of, relative_difference, scene
 from support.rendering import Rendering, configured, render
 
 from nlosrender import pipeline
+from nlosrender.bench.meshes import write_ply
 from nlosrender.errors import ConfigError
 
 TWO_SIDED = {"type": "twosided", "inner": {"type": "diffuse", "reflectance": 1.0}}
@@ -18,14 +19,9 @@ QUAD = np.array([[-0.3, -0.2, 0.0], [0.3, -0.2, 0.0], [0.3, 0.2, 0.0], [-0.3, 0.
 TOWARDS_WALL = np.array([[0, 2, 1], [0, 3, 2]])
 
 
-def write_ply(path: Path, vertices: Array, faces: np.ndarray) -> Path:
-    """Write a binary .ply file of triangles."""
-    header = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(vertices)}\n"
-    header += "".join(f"property float {axis}\n" for axis in "xyz")
-    header += f"element face {len(faces)}\nproperty list uchar uint vertex_indices\nend_header\n"
-    records = np.zeros(len(faces), dtype=[("n", "u1"), ("indices", "<u4", 3)])
-    records["n"], records["indices"] = 3, faces
-    path.write_bytes(header.encode() + np.asarray(vertices, "<f4").tobytes() + records.tobytes())
+def saved(path: Path, vertices: Array, faces: np.ndarray) -> Path:
+    """Write a mesh; return its path."""
+    write_ply(path, vertices, faces)
     return path
 
 
@@ -77,8 +73,8 @@ def variants() -> dict[str, tuple[Array, np.ndarray]]:
 @pytest.mark.parametrize("variant", variants())
 def test_needless_parts_of_a_mesh_change_nothing(variant: str, engine: str, tmp_path: Path, ledger: Ledger) -> None:
     """Triangles without area, doubles, and vertices nobody uses are not there."""
-    plain = of_mesh(write_ply(tmp_path / "plain.ply", QUAD, TOWARDS_WALL), engine)
-    other = of_mesh(write_ply(tmp_path / "other.ply", *variants()[variant]), engine)
+    plain = of_mesh(saved(tmp_path / "plain.ply", QUAD, TOWARDS_WALL), engine)
+    other = of_mesh(saved(tmp_path / "other.ply", *variants()[variant]), engine)
     assert plain.mean.sum() > 0
     ledger.check(
         f"needless parts of a mesh change nothing ({engine})", relative_difference(other.mean, plain.mean), 1e-6
@@ -89,8 +85,8 @@ def test_needless_parts_of_a_mesh_change_nothing(variant: str, engine: str, tmp_
 def test_the_winding_of_a_two_sided_mesh_does_not_matter(engine: str, tmp_path: Path, ledger: Ledger) -> None:
     """Some faces turned round, on a two-sided material: the same light."""
     turned = np.array([[0, 2, 1], [0, 2, 3]])
-    plain = of_mesh(write_ply(tmp_path / "plain.ply", QUAD, TOWARDS_WALL), engine, TWO_SIDED)
-    other = of_mesh(write_ply(tmp_path / "other.ply", QUAD, turned), engine, TWO_SIDED)
+    plain = of_mesh(saved(tmp_path / "plain.ply", QUAD, TOWARDS_WALL), engine, TWO_SIDED)
+    other = of_mesh(saved(tmp_path / "other.ply", QUAD, turned), engine, TWO_SIDED)
     # the corners of a triangle change places, and so do the samples on it
     allowed = noise_of(plain, other)
     ledger.check(f"mixed winding, two-sided ({engine})", relative_difference(other.mean, plain.mean), allowed)
@@ -100,8 +96,8 @@ def test_the_winding_of_a_two_sided_mesh_does_not_matter(engine: str, tmp_path: 
 @pytest.mark.parametrize("engine", BOTH)
 def test_slivers_are_the_surface_they_cover(engine: str, tmp_path: Path, ledger: Ledger) -> None:
     """A plate of 100_000 slivers of 0.4 m x 6 micrometres, 7e4 : 1 (float32 has no thinner ones that tile)."""
-    plain = of_mesh(write_ply(tmp_path / "plain.ply", QUAD, TOWARDS_WALL), engine)
-    other = of_mesh(write_ply(tmp_path / "other.ply", *strips(100_000)), engine)
+    plain = of_mesh(saved(tmp_path / "plain.ply", QUAD, TOWARDS_WALL), engine)
+    other = of_mesh(saved(tmp_path / "other.ply", *strips(100_000)), engine)
     allowed = noise_of(plain, other)
     ledger.check(f"slivers of 7e4:1 ({engine})", relative_difference(other.mean, plain.mean), allowed)
     deviation = abs(other.mean.sum() / plain.mean.sum() - 1)
@@ -112,8 +108,8 @@ def test_slivers_are_the_surface_they_cover(engine: str, tmp_path: Path, ledger:
 def test_one_sliver_of_a_million_to_one_harms_nothing(engine: str, tmp_path: Path, ledger: Ledger) -> None:
     """A triangle of 0.6 m x 0.6 micrometres beside the plate adds 5e-7 of its area."""
     vertices = np.concatenate([QUAD, [[-0.3, 0.25, 0.0], [0.3, 0.25, 0.0], [0.3, 0.25 + 6e-7, 0.0]]])
-    plain = of_mesh(write_ply(tmp_path / "plain.ply", QUAD, TOWARDS_WALL), engine)
-    other = of_mesh(write_ply(tmp_path / "other.ply", vertices, np.concatenate([TOWARDS_WALL, [[4, 6, 5]]])), engine)
+    plain = of_mesh(saved(tmp_path / "plain.ply", QUAD, TOWARDS_WALL), engine)
+    other = of_mesh(saved(tmp_path / "other.ply", vertices, np.concatenate([TOWARDS_WALL, [[4, 6, 5]]])), engine)
     allowed = noise_of(plain, other)
     ledger.check(f"a sliver of 1e6:1 beside a plate ({engine})", relative_difference(other.mean, plain.mean), allowed)
 
@@ -123,10 +119,10 @@ def test_one_sliver_of_a_million_to_one_harms_nothing(engine: str, tmp_path: Pat
 def test_surfaces_that_cross_in_one_mesh_are_those_of_two(engine: str, tmp_path: Path, ledger: Ledger) -> None:
     """Non-manifold and self-intersecting: two crossing plates in one file or in two."""
     turn = np.array([[0.6, 0, 0.8], [0, 1, 0], [-0.8, 0, 0.6]])
-    first = write_ply(tmp_path / "first.ply", QUAD, TOWARDS_WALL)
-    second = write_ply(tmp_path / "second.ply", QUAD @ turn.T, TOWARDS_WALL)
+    first = saved(tmp_path / "first.ply", QUAD, TOWARDS_WALL)
+    second = saved(tmp_path / "second.ply", QUAD @ turn.T, TOWARDS_WALL)
     both = np.concatenate([QUAD, QUAD @ turn.T]), np.concatenate([TOWARDS_WALL, TOWARDS_WALL + 4])
-    joined = of_mesh(write_ply(tmp_path / "both.ply", *both), engine, TWO_SIDED)
+    joined = of_mesh(saved(tmp_path / "both.ply", *both), engine, TWO_SIDED)
     items = [
         {"type": "mesh", "filename": str(path), "translate": [0.1, 0.0, 0.9], "face_normals": True, "bsdf": TWO_SIDED}
         for path in (first, second)
@@ -145,8 +141,8 @@ def test_millions_of_triangles_are_the_surface_they_cover(
     cells: tuple[int, int], engine: str, tmp_path: Path, ledger: Ledger
 ) -> None:
     """1 and 5 million triangles of one plate: the plate."""
-    plain = of_mesh(write_ply(tmp_path / "plain.ply", QUAD, TOWARDS_WALL), engine)
-    other = of_mesh(write_ply(tmp_path / "other.ply", *grid(*cells)), engine)
+    plain = of_mesh(saved(tmp_path / "plain.ply", QUAD, TOWARDS_WALL), engine)
+    other = of_mesh(saved(tmp_path / "other.ply", *grid(*cells)), engine)
     allowed = noise_of(plain, other)
     law = f"{2 * cells[0] * cells[1]:_} triangles are the plate they tile ({engine})"
     ledger.check(law, relative_difference(other.mean, plain.mean), allowed)
@@ -185,7 +181,7 @@ def test_impossible_meshes_are_errors_that_name_what_is_wrong(
 ) -> None:
     """The first vertex or face that cannot be is in the message."""
     with pytest.raises(ConfigError, match=message):
-        of_mesh(write_ply(tmp_path / "bad.ply", vertices, faces), "path")
+        of_mesh(saved(tmp_path / "bad.ply", vertices, faces), "path")
 
 
 @pytest.mark.parametrize("engine", BOTH)
@@ -195,7 +191,7 @@ def test_an_item_on_top_of_another_counts_once(engine: str, tmp_path: Path, ledg
     halves = np.concatenate([QUAD, beside]), np.concatenate([TOWARDS_WALL[:, [2, 0, 1]], TOWARDS_WALL + 4])
     place = {"type": "mesh", "translate": [0.1, 0.0, 0.9], "face_normals": True}
     first, both = (
-        place | {"filename": str(write_ply(tmp_path / f"{name}.ply", *mesh))}
+        place | {"filename": str(saved(tmp_path / f"{name}.ply", *mesh))}
         for name, mesh in (("first", (QUAD, TOWARDS_WALL)), ("both", halves))
     )
     grey = {"bsdf": {"type": "diffuse", "reflectance": 0.25}}

@@ -47,7 +47,7 @@ def sheet(surface: Surface, columns: int, rows: int) -> tuple[Array, Array, NDAr
     return np.stack(surface(u, v), axis=1), np.stack([u, v], axis=1), faces
 
 
-def write_ply(path: Path, vertices: Array, uvs: Array | None, faces: NDArray[np.int64]) -> str:
+def write_uv_ply(path: Path, vertices: Array, uvs: Array | None, faces: NDArray[np.int64]) -> str:
     """Write a mesh as ASCII .ply; return its name."""
     names = ["x", "y", "z"] + ([] if uvs is None else ["u", "v"])
     rows = vertices if uvs is None else np.concatenate([vertices, uvs], axis=1)

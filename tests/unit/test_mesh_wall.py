@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from support.rendering import configured, flat_wall
-from support.wall_meshes import flat, globe, sheet, wavy, write_obj, write_ply
+from support.wall_meshes import flat, globe, sheet, wavy, write_obj, write_uv_ply
 
 from nlosrender.capture.grids import build_capture
 from nlosrender.errors import ConfigError
@@ -24,7 +24,7 @@ WIDTH, HEIGHT = 2.0, 1.6
 
 def wall_of(folder: Path, surface: Any, columns: int = 7, rows: int = 5, suffix: str = "ply", **keys: Any) -> MeshWall:
     """Write a sheet and read it as a wall."""
-    write = write_ply if suffix == "ply" else write_obj
+    write = write_uv_ply if suffix == "ply" else write_obj
     name = write(folder / f"wall.{suffix}", *sheet(surface, columns, rows))
     pose: dict[str, Any] = {"scale": 1.0, "rotate_deg": (0, 0, 0), "translate": (0, 0, 0), "flip_normals": False}
     config = {**pose, "width": None, "height": None, **keys}
@@ -34,7 +34,7 @@ def wall_of(folder: Path, surface: Any, columns: int = 7, rows: int = 5, suffix:
 def refused(folder: Path, vertices: Any, uvs: Any, faces: Any, **capture: Any) -> str:
     """Return what a config with this mesh as its wall is told."""
     config = flat_wall(capture=capture)
-    name = write_ply(folder / "wall.ply", vertices, uvs, faces)
+    name = write_uv_ply(folder / "wall.ply", vertices, uvs, faces)
     config["scene"]["relay_wall"] = {"type": "mesh", "filename": name}
     with pytest.raises(ConfigError) as caught:
         place_scene(configured(config, folder=folder))
@@ -74,7 +74,7 @@ def test_a_pose_moves_the_wall_and_leaves_its_frame(tmp_path: Path) -> None:
 def test_a_mirrored_wall_keeps_its_front(tmp_path: Path) -> None:
     """Scales along the axes, one of them negative: points and normals are those of the wall, mirrored and stretched."""
     scale = np.array([-1.0, 1.5, 1.0])
-    name = write_ply(tmp_path / "wall.ply", *sheet(wavy(WIDTH, HEIGHT, 0.1), 7, 5))
+    name = write_uv_ply(tmp_path / "wall.ply", *sheet(wavy(WIDTH, HEIGHT, 0.1), 7, 5))
     here, there = (
         mesh_wall_from_config(configured(_mesh_wall(name, scale=factors), folder=tmp_path).scene.wall)  # type: ignore[arg-type]
         for factors in (1.0, scale.tolist())
@@ -170,7 +170,7 @@ def test_a_grid_point_in_a_hole_is_named(tmp_path: Path) -> None:
 def test_a_grid_larger_than_the_mesh_is_refused_with_its_key(tmp_path: Path) -> None:
     """Only the file tells how large a mesh wall is: a grid beyond it is a mistake in the configuration all the same."""
     config = flat_wall(capture={"sensor_grid": {"nx": 3, "ny": 2, "width": 2.5}})
-    name = write_ply(tmp_path / "wall.ply", *sheet(flat(WIDTH, HEIGHT), 4, 3))
+    name = write_uv_ply(tmp_path / "wall.ply", *sheet(flat(WIDTH, HEIGHT), 4, 3))
     config["scene"]["relay_wall"] = {"type": "mesh", "filename": name}
     validated = configured(config, folder=tmp_path)
     wall, _ = place_scene(validated)
@@ -208,7 +208,7 @@ def strips(sliver: float) -> tuple[Any, Any, Any]:
 def test_a_point_on_a_sliver_is_refused_before_the_render(sliver: float, tmp_path: Path) -> None:
     """float32 turns a triangle of 1.6 m x 1 nm any way: nothing of it can be lit, and the mistake is the mesh's."""
     config = flat_wall(sensors=(8, 7), capture={"laser_point": [0, 0], "sensor_grid": {"nx": 8, "ny": 7, "width": 1}})
-    config["scene"]["relay_wall"] = {"type": "mesh", "filename": write_ply(tmp_path / "wall.ply", *strips(sliver))}
+    config["scene"]["relay_wall"] = {"type": "mesh", "filename": write_uv_ply(tmp_path / "wall.ply", *strips(sliver))}
     validated = configured(config, folder=tmp_path)
     wall, _ = place_scene(validated)
     with pytest.raises(ConfigError, match=r"too fine at wall coordinates .* a sliver .* Remove slivers") as caught:

@@ -9,15 +9,10 @@ import pytest
 from numpy.typing import NDArray
 from support.triangle_soup import mesh_of
 
-from nlosrender.engine.backend.start import start_backend
+pytestmark = pytest.mark.usefixtures("backend")
+
 
 Array = NDArray[np.float64]
-
-
-@pytest.fixture(autouse=True)
-def backend() -> None:
-    """Choose LLVM before anything imports Mitsuba."""
-    start_backend("llvm")
 
 
 def tree_of(triangles: Array) -> Any:

@@ -7,16 +7,11 @@ import pytest
 
 from nlosrender.capture.limits import refuse_wide_kernel
 from nlosrender.capture.time_axis import TimeAxis
-from nlosrender.engine.backend.start import start_backend
 from nlosrender.errors import ConfigError
 
+pytestmark = pytest.mark.usefixtures("backend")
+
 WIDTHS = (0.3, 1.0, 2.0, 4.7, 12.0)
-
-
-@pytest.fixture(scope="module", autouse=True)
-def backend() -> None:
-    """Choose Dr.Jit's LLVM before it is imported."""
-    start_backend()
 
 
 @pytest.mark.parametrize("width", WIDTHS)
