@@ -1,4 +1,4 @@
-"""What is illuminated and measured: laser and sensor points on the relay wall, and the legs to them."""
+"""Laser and sensor points on the relay wall, and the legs to them."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ class Capture:
 
     scan_type: str  # single, confocal, exhaustive or line_of_sight
     sensor_grid: PointGrid  # line_of_sight: the pixels, on the image plane
-    laser_grid: PointGrid  # confocal: the sensor grid itself; line_of_sight: one point that means nothing
+    laser_grid: PointGrid  # confocal: the sensor grid itself; line_of_sight: one unused point
     laser_position: Float64  # (3,) m
     sensor_position: Float64  # (3,) m
     account_first_and_last_bounces: bool
@@ -81,6 +81,11 @@ class Capture:
     def n_sensors(self) -> int:
         """Number of sensor points."""
         return self.sensor_grid.ny * self.sensor_grid.nx
+
+    @property
+    def lasers_per_sensor(self) -> int:
+        """Number of laser points that each sensor point is measured for: of confocal captures only its own."""
+        return self.n_lasers if self.scan_type == "exhaustive" else 1
 
     @property
     def is_line_of_sight(self) -> bool:
@@ -132,37 +137,17 @@ def point_grid(wall: RelayWall, nx: int, ny: int, width: float | None = None, he
     for name, extent, limit in (("width", width, wall.width), ("height", height, wall.height)):
         if not 0 < extent <= limit * (1 + EDGE_TOLERANCE):
             raise ValueError(f"grid {name}: got {extent:g} m, need > 0 and <= {limit:g} m, the wall's")
-    x = _cell_centres(nx) * width
-    y = _cell_centres(ny) * height
+    x, y = _cell_centres(nx) * width, _cell_centres(ny) * height
     return _grid_at(wall, np.stack(np.meshgrid(x, y, indexing="xy"), axis=-1), (width, height))
 
 
 def single_point(wall: RelayWall, xy: ArrayLike) -> PointGrid:
-    """Return the 1 x 1 grid of one point at wall coordinates ``xy`` (2,) [m]; its size is (0, 0).
-
-    Raises
-    ------
-    ValueError
-        The point is off the wall.
-    """
+    """Return the 1 x 1 grid of one point at wall coordinates ``xy`` (2,) [m]; ValueError off the wall."""
     return _grid_at(wall, np.asarray(xy, dtype=np.float64).reshape(1, 1, 2), (0.0, 0.0))
 
 
 def build_capture(capture_config: CaptureConfig, wall: RelayWall) -> Capture:
-    """Build the capture of a configuration.
-
-    Parameters
-    ----------
-    capture_config
-        ``capture``; device positions in scene coordinates [m]. A position of None is the wall's default: 1 m in front
-        of its centre, or the middle of a sphere or cylinder lit from within.
-    wall
-        The relay wall.
-
-    Returns
-    -------
-    Capture
-        In the wall's local frame.
+    """Build the capture of a configuration, in the wall's local frame.
 
     Raises
     ------

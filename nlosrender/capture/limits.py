@@ -7,30 +7,18 @@ from nlosrender.capture.time_axis import TimeAxis
 from nlosrender.config.capture import CaptureConfig
 from nlosrender.errors import ConfigError, Problem
 
-POINT_BYTES = 640  # per grid point: positions, normals, coordinates, distances to the corners of a box, copies
+# 80 float64 per grid point: position, normal, uv, wall coordinates (10) and their copies, leg (1), and the difference
+# to eight corners of a box, squared and summed (56)
+POINT_BYTES = 640
 MAX_SAMPLES = 2**40  # 4 TiB of float32 per bounce
-MAX_BATCHES = 1_000_000
-INT32_MAX = 2**31 - 1  # the file holds the number of bins as a 32-bit integer
+MAX_BATCHES = 1_000_000  # at 0.1 s each more than a day
+MAX_INT32 = 2**31 - 1  # the file holds the number of bins as a 32-bit integer
 
 
 def refuse_impossible_grids(capture_config: CaptureConfig, memory_limit: int) -> None:
-    """Refuse grids, or a camera's pixels, whose positions alone do not fit the memory.
-
-    Parameters
-    ----------
-    capture_config
-        ``capture``.
-    memory_limit
-        Bytes the render may take.
-
-    Raises
-    ------
-    ConfigError
-        They do not fit.
-    """
+    """Raise ConfigError for grids or pixels whose positions alone take more than ``memory_limit`` bytes."""
     points, sensors = _words(capture_config)
-    grids = {sensors: capture_config.sensor_grid, "capture.laser_grid": capture_config.laser_grid}
-    for key, grid in grids.items():
+    for key, grid in ((sensors, capture_config.sensor_grid), ("capture.laser_grid", capture_config.laser_grid)):
         if grid is not None and grid.n_points * POINT_BYTES > memory_limit:
             message = (
                 f"{grid.nx} x {grid.ny} {points} take {grid.n_points * POINT_BYTES / 1e9:.3g} GB for their positions "
@@ -40,19 +28,9 @@ def refuse_impossible_grids(capture_config: CaptureConfig, memory_limit: int) ->
 
 
 def refuse_wide_kernel(kernel_opl: float, time_axis: TimeAxis) -> None:
-    """Refuse a temporal kernel wider than the time window, which would carry most light out of it.
+    """Raise ConfigError for a temporal kernel of full width ``kernel_opl`` [m] wider than the time window.
 
-    Parameters
-    ----------
-    kernel_opl
-        Full width of the kernel [m]; 0: none.
-    time_axis
-        The bins.
-
-    Raises
-    ------
-    ConfigError
-        It is wider; its work grows with its width in bins, and would never end.
+    It would carry most light out of the window, and its work grows with its width in bins.
     """
     window = time_axis.end_opl - time_axis.start_opl
     if kernel_opl > window:
@@ -71,10 +49,8 @@ def refuse_impossible_samples(
     ----------
     capture_config
         ``capture``.
-    rows_per_pair
-        Histogram rows per (sensor, laser): bounce slots times channels.
-    n_bins
-        Bins per row.
+    rows_per_pair, n_bins
+        Histogram rows per (sensor, laser), which are bounce slots times channels; bins per row.
     memory_limit
         Bytes a batch may take.
 
@@ -85,22 +61,26 @@ def refuse_impossible_samples(
     """
     points, sensors = _words(capture_config)
     pairs = capture_config.sensor_grid.n_points * capture_config.n_lasers
-    if n_bins > INT32_MAX:
-        message = f"got {n_bins}, need at most {INT32_MAX}. Use wider bins or a later start."
-        raise ConfigError(Problem("", "time_axis.n_bins", message))
-    if pairs * n_bins > MAX_SAMPLES:
+    smallest = pairs * rows_per_pair * (n_bins + 1) * (2 * BYTES_PER_SUM + BYTES_OF_STATISTICS)
+    if n_bins > MAX_INT32:
+        key, message = "time_axis.n_bins", f"got {n_bins}, need at most {MAX_INT32}. Use wider bins or a later start."
+    elif pairs * n_bins > MAX_SAMPLES:
         counted = points if capture_config.is_line_of_sight else "pairs of laser and sensor points"
         message = f"{pairs:_} {counted} with {n_bins:_} bins each are more than 2**40 samples. "
-        raise ConfigError(Problem("", sensors, f"{message}Use fewer {points} or bins."))
-    smallest = pairs * rows_per_pair * (n_bins + 1) * (2 * BYTES_PER_SUM + BYTES_OF_STATISTICS)
-    if smallest > MAX_BATCHES * memory_limit:
-        message = (
-            f"the capture takes {smallest / 1e12:.3g} TB in all, more than {MAX_BATCHES:_} batches of the "
-            f"{memory_limit / 1e6:.0f} MB that render.memory_limit leaves. Raise it, or use fewer {points} or bins."
+        key, message = sensors, f"{message}Use fewer {points} or bins."
+    elif smallest > MAX_BATCHES * memory_limit:
+        key, message = (
+            sensors,
+            (
+                f"the capture takes {smallest / 1e12:.3g} TB in all, more than {MAX_BATCHES:_} batches of the "
+                f"{memory_limit / 1e6:.0f} MB that render.memory_limit leaves. Raise it, or use fewer {points} or bins."
+            ),
         )
-        raise ConfigError(Problem("", sensors, message))
+    else:
+        return
+    raise ConfigError(Problem("", key, message))
 
 
 def _words(capture_config: CaptureConfig) -> tuple[str, str]:
-    """Return what sensor points are called, and the key that says how many there are."""
+    """Return what sensor points are called, and the key that sets their number."""
     return ("pixels", "capture.camera") if capture_config.is_line_of_sight else ("points", "capture.sensor_grid")

@@ -1,7 +1,7 @@
-"""Which part of a capture is rendered: a range of laser points for a range of strips of the sensor grid.
+"""The part of a capture that is rendered: a range of laser points for a range of strips of the sensor grid.
 
 The file stores the histograms of a storage tile of sensor points in one chunk. A strip is one row of a storage tile,
-the smallest piece of the sensor grid that is dealt out. Strips are counted tile after tile, so that a range of them
+the smallest piece of the sensor grid that a shard can have. Strips are counted tile after tile, so that a range of them
 touches as few tiles as possible. Both ranges depend on the capture alone, not on the machine.
 """
 
@@ -31,7 +31,7 @@ class Tiling:
         return self.ny * -(-self.nx // self.columns)
 
     def everything(self, n_lasers: int) -> Part:
-        """Return the part that is the whole capture, with so many laser points for every sensor point."""
+        """Return the part that is the whole capture, with ``n_lasers`` laser points for every sensor point."""
         return Part((0, n_lasers), (0, self.n_strips))
 
     def tiles(self) -> Iterator[Tile]:
@@ -62,11 +62,11 @@ class Part:
         return f"lasers {self.lasers[0]}:{self.lasers[1]}, strips {self.strips[0]}:{self.strips[1]}"
 
     def share_of(self, whole: Part) -> float:
-        """Return which share of the pairs of laser and sensor points is in this part, about."""
-        mine, all_of_them = (
+        """Return about which share of the pairs of laser and sensor points is in this part; strips differ in length."""
+        n_own, n_whole = (
             (part.lasers[1] - part.lasers[0]) * (part.strips[1] - part.strips[0]) for part in (self, whole)
         )
-        return mine / all_of_them
+        return n_own / n_whole
 
     def as_json(self) -> dict[str, object]:
         """Return the ranges as lists."""
@@ -74,13 +74,7 @@ class Part:
 
     @classmethod
     def from_json(cls, stored: Mapping[str, object]) -> Part:
-        """Undo ``as_json``.
-
-        Raises
-        ------
-        ValueError
-            It is not what ``as_json`` returns.
-        """
+        """Undo ``as_json``; ValueError for anything that it does not return."""
         return cls(_range(stored.get("lasers")), _range(stored.get("strips")))
 
 
@@ -97,7 +91,7 @@ class Selection:
         return "the whole capture" if self.lasers is None else f"--lasers {self.lasers[0]}:{self.lasers[1]}"
 
     def part(self, n_lasers: int, tiling: Tiling) -> Part:
-        """Return the part of a capture that is meant.
+        """Return the part of a capture that is selected.
 
         Shards are ranges of laser points of nearly equal length, or of strips when there are fewer lasers than shards.
 
@@ -127,17 +121,17 @@ class Selection:
         if not 1 <= number <= count:
             raise OptionError(f"{self}: need I/N with 1 <= I <= N.")
         if count <= n_lasers:
-            return Part(_dealt(n_lasers, number, count), everything.strips)
+            return Part(_shard(n_lasers, number, count), everything.strips)
         if count > tiling.n_strips:
-            most = max(n_lasers, tiling.n_strips)
-            raise OptionError(f"{self}: this capture can be cut into at most {most} shards.")
-        return Part(everything.lasers, _dealt(tiling.n_strips, number, count))
+            limit = max(n_lasers, tiling.n_strips)
+            raise OptionError(f"{self}: this capture can be cut into at most {limit} shards.")
+        return Part(everything.lasers, _shard(tiling.n_strips, number, count))
 
 
 WHOLE = Selection()
 
 
-def _dealt(length: int, number: int, count: int) -> Range:
+def _shard(length: int, number: int, count: int) -> Range:
     return length * (number - 1) // count, length * number // count
 
 

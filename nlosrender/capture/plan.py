@@ -1,7 +1,7 @@
-"""The order of work: units of sensor and laser points, in batches that fit the memory at hand.
+"""The order of work: work items of sensor and laser points, in batches that fit the memory at hand.
 
-A unit is rendered, written and noted as finished at once. What a lane computes depends on its sensor point alone, so
-how a capture is cut changes no bit of it.
+A work item is rendered, written and recorded as finished at once. What a lane computes depends on its sensor point
+alone, so how a capture is cut changes no bit of it.
 """
 
 from __future__ import annotations
@@ -10,19 +10,18 @@ import math
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
-from nlosrender.capture.bounces import LINE_OF_SIGHT
 from nlosrender.capture.grids import Capture
 from nlosrender.capture.part import WHOLE, Part, Selection, Tiling
 from nlosrender.capture.tile import Tile, joined, runs
 from nlosrender.errors import ConfigError, Problem
 
 BYTES_PER_SUM = 8  # a float64 sum per replica and bin
-MOST_SUMS = 2**32 - 1  # of a batch: Dr.Jit indexes with 32 bits
+MAX_SUMS = 2**32 - 1  # of a batch: Dr.Jit indexes with 32 bits
 # mean and variance on the device and their host copies in memory and file order (56), and the float32 copies of the
-# unit before, which is being written (8)
+# work item before, which is being written (8)
 BYTES_OF_STATISTICS = 64
-BYTES_OF_ASSEMBLY = 24  # mean and variance of a unit that is put together from batches, and its float32 copies
-MAX_ITEM_SAMPLES = 2**26  # of a unit at most, whatever the memory: what an interruption can cost stays bounded
+BYTES_OF_ASSEMBLY = 24  # mean and variance of a work item assembled from batches (16), and its float32 copies (8)
+MAX_ITEM_SAMPLES = 2**26  # whatever the memory: 256 MB of float32, so that an interruption costs little
 
 
 @dataclass(frozen=True)
@@ -50,7 +49,7 @@ class WorkItem:
 
 @dataclass(frozen=True)
 class Plan:
-    """How a capture, or a part of it, is cut into units."""
+    """How a capture, or a part of it, is cut into work items."""
 
     work_items: tuple[WorkItem, ...]
     replicas: int  # independent copies of every sensor point's estimate, >= 2
@@ -60,8 +59,8 @@ class Plan:
 
     @property
     def batches(self) -> tuple[Batch, ...]:
-        """The batches of all units."""
-        return tuple(batch for unit in self.work_items for batch in unit.batches)
+        """The batches of all work items."""
+        return tuple(batch for item in self.work_items for batch in item.batches)
 
 
 def plan_capture(
@@ -76,16 +75,14 @@ def plan_capture(
     max_item_samples: int = MAX_ITEM_SAMPLES,
     min_items: int = 1,
 ) -> Plan:
-    """Cut a capture into units.
+    """Cut a capture into work items.
 
     Parameters
     ----------
     capture
         What is measured.
-    rows_per_pair
-        Histogram rows per (sensor, laser): bounce slots times channels.
-    n_bins
-        Bins per row.
+    rows_per_pair, n_bins
+        Histogram rows per (sensor, laser), which are bounce slots times channels; bins per row.
     lanes
         Number of lanes that keeps the backend busy; small grids get more replicas per sensor point.
     memory_limit
@@ -94,10 +91,8 @@ def plan_capture(
         Rows and columns of sensor points that share a chunk of the file.
     selection
         The part that is rendered.
-    max_item_samples
-        Samples of a unit at most.
-    min_items
-        Cut into so many units; but a unit is at least a storage tile with one laser.
+    max_item_samples, min_items
+        Bounds on the size and number of work items; but each is at least a storage tile with one laser.
 
     Raises
     ------
@@ -108,27 +103,27 @@ def plan_capture(
     row = rows_per_pair * (n_bins + 1)
     pair = row * (BYTES_PER_SUM * replicas + BYTES_OF_STATISTICS)
     tiling = Tiling(capture.sensor_grid.ny, capture.sensor_grid.nx, *storage_tile)
-    part = selection.part(capture.n_lasers if capture.scan_type == "exhaustive" else 1, tiling)
+    part = selection.part(capture.lasers_per_sensor, tiling)
     cell = storage_tile[0] * storage_tile[1]
-    pairs = min(memory_limit // pair, MOST_SUMS // (replicas * row))
-    if pairs < cell:  # units of several batches
-        pairs = min(pairs, (memory_limit - cell * row * BYTES_OF_ASSEMBLY) // pair)
-    if pairs < 1:
+    fitting = min(memory_limit // pair, MAX_SUMS // (replicas * row))
+    if fitting < cell:  # work items of several batches
+        fitting = min(fitting, (memory_limit - cell * row * BYTES_OF_ASSEMBLY) // pair)
+    if fitting < 1:
         needed = pair + (cell * row * BYTES_OF_ASSEMBLY if cell > 1 else 0)
-        one = "one pixel" if capture.scan_type == LINE_OF_SIGHT else "one sensor point with one laser"
+        one = "one pixel" if capture.is_line_of_sight else "one sensor point with one laser"
         message = (
             f"{one} needs {needed / 1e6:.0f} MB but {memory_limit / 1e6:.0f} MB are left for it. Raise it, or use "
             f"fewer bins ({n_bins}) or bounces."
         )
         raise ConfigError(Problem("", "render.memory_limit", message))
+    wanted = max_item_samples // row
+    if min_items > 1:  # only then: the part's share is rounded, and would cut a small rest off a single work item
+        share = part.share_of(tiling.everything(capture.lasers_per_sensor))
+        wanted = min(wanted, round(capture.n_sensors * capture.lasers_per_sensor * share) // min_items)
+    busy = math.ceil(lanes / replicas)
+    work_items = tuple(_work_items(capture, tiling, part, fitting, max(1, wanted), busy))
     confocal = capture.scan_type == "confocal"
-    enough = max_item_samples // row
-    everything = tiling.everything(capture.n_lasers if capture.scan_type == "exhaustive" else 1)
-    of_part = round(capture.n_sensors * (1 if confocal else capture.n_lasers) * part.share_of(everything))
-    if min_items > 1:  # the share is not exact: of one unit it would cut a crumb
-        enough = min(enough, of_part // min_items)
-    work_items = tuple(_work_items(capture, tiling, part, pairs, max(1, enough), math.ceil(lanes / replicas)))
-    largest = max(b.sensors.size * (1 if confocal else b.lasers.size) for unit in work_items for b in unit.batches)
+    largest = max(b.sensors.size * (1 if confocal else b.lasers.size) for item in work_items for b in item.batches)
     return Plan(work_items, replicas, largest * pair, tiling, part)
 
 
@@ -141,63 +136,58 @@ def replicas_for(lanes: int, n_sensors: int) -> int:
     return replicas + replicas % 2
 
 
-def _work_items(
-    capture: Capture, tiling: Tiling, part: Part, fitting: int, enough: int, busy: int
-) -> Iterator[WorkItem]:
-    """Yield the units: first sensor points to keep ``busy`` lanes, then lasers, then more sensor points.
-
-    ``fitting`` pairs of a sensor and a laser point fit the memory; more than ``enough`` are not asked for.
-    """
-    pairs, n_lasers = min(fitting, enough), part.lasers[1] - part.lasers[0]
-    for sensors in joined(tiling.cells(part.strips), max(pairs // n_lasers, min(busy, pairs))):
-        if capture.scan_type == "confocal":
-            yield WorkItem(sensors, sensors, tuple(Batch(tile, tile) for tile in _cut(sensors, fitting)))
-            continue
-        for lasers in runs(*part.lasers, capture.laser_grid.nx, max(1, pairs // sensors.size)):
-            pieces = _cut(sensors, fitting // lasers.size)
-            yield WorkItem(sensors, lasers, tuple(Batch(tile, lasers) for tile in pieces))
-
-
-def _cut(sensors: Tile, most: int) -> Iterator[Tile]:
-    """Yield a tile whole, or in pieces of at most ``most`` points where it has more."""
-    rows, columns = sensors.shape
-    for tile in tiles(rows, columns, most):
-        yield Tile(sensors.y0 + tile.y0, sensors.y0 + tile.y1, sensors.x0 + tile.x0, sensors.x0 + tile.x1)
-
-
-def tiles(ny: int, nx: int, most: int) -> Iterator[Tile]:
-    """Cut a grid of ``ny`` x ``nx`` points into tiles of at most ``most`` points: whole rows, or parts of one row."""
-    return runs(0, ny * nx, nx, most)
-
-
 def remaining_items(plan: Plan, confocal: bool, finished: Iterable[tuple[Tile, Tile]]) -> list[WorkItem]:
-    """Return what is left to do when the (sensors, lasers) of ``finished`` are done.
+    """Return the work that is left when the (sensors, lasers) of ``finished`` are done.
 
-    The units of an earlier run may have been cut otherwise, for another memory; a unit that is done in part is taken
-    apart into storage tiles and single lasers, which never are.
+    An earlier run may have cut the capture otherwise, for another memory; a work item that is done in part is taken
+    apart into storage tiles with single lasers, which no run cuts.
     """
     done = set(finished)
     left: list[WorkItem] = []
-    for unit in plan.work_items:
-        if (unit.sensors, unit.lasers) in done:
+    for item in plan.work_items:
+        if (item.sensors, item.lasers) in done:
             continue
-        touching = [pair for pair in done if pair[0].overlaps(unit.sensors) and pair[1].overlaps(unit.lasers)]
+        touching = [pair for pair in done if pair[0].overlaps(item.sensors) and pair[1].overlaps(item.lasers)]
         if not touching:
-            left.append(unit)
+            left.append(item)
             continue
-        for small in _apart(plan, unit, confocal):
+        for small in _smallest_items(plan, item, confocal):
             if not any(s.contains(small.sensors) and b.contains(small.lasers) for s, b in touching):
                 left.append(small)
     return left
 
 
-def _apart(plan: Plan, unit: WorkItem, confocal: bool) -> Iterator[WorkItem]:
-    """Yield a unit's storage tiles with one laser each."""
-    most = max(batch.sensors.size for batch in unit.batches)
-    for cell in plan.tiling.cells(plan.part.strips):
-        if not unit.sensors.contains(cell):
+def _work_items(
+    capture: Capture, tiling: Tiling, part: Part, fitting: int, wanted: int, busy: int
+) -> Iterator[WorkItem]:
+    """Yield the work items: first sensor points to keep ``busy`` lanes, then lasers, then more sensor points.
+
+    ``fitting`` pairs of a sensor and a laser point fit the memory of a batch, ``wanted`` make a work item.
+    """
+    pairs, n_lasers = min(fitting, wanted), part.lasers[1] - part.lasers[0]
+    for sensors in joined(tiling.cells(part.strips), max(pairs // n_lasers, min(busy, pairs))):
+        if capture.scan_type == "confocal":
+            yield _work_item(sensors, None, fitting)
             continue
-        y_range, x_range = range(unit.lasers.y0, unit.lasers.y1), range(unit.lasers.x0, unit.lasers.x1)
-        for laser in [cell] if confocal else [Tile(y, y + 1, x, x + 1) for y in y_range for x in x_range]:
-            pieces = _cut(cell, most)
-            yield WorkItem(cell, laser, tuple(Batch(tile, tile if confocal else laser) for tile in pieces))
+        for lasers in runs(*part.lasers, capture.laser_grid.nx, max(1, pairs // sensors.size)):
+            yield _work_item(sensors, lasers, fitting // lasers.size)
+
+
+def _smallest_items(plan: Plan, item: WorkItem, confocal: bool) -> Iterator[WorkItem]:
+    """Yield a work item's storage tiles with one laser each."""
+    max_points = max(batch.sensors.size for batch in item.batches)
+    for cell in plan.tiling.cells(plan.part.strips):
+        if item.sensors.contains(cell):
+            y_range, x_range = range(item.lasers.y0, item.lasers.y1), range(item.lasers.x0, item.lasers.x1)
+            for laser in [None] if confocal else [Tile(y, y + 1, x, x + 1) for y in y_range for x in x_range]:
+                yield _work_item(cell, laser, max_points)
+
+
+def _work_item(sensors: Tile, lasers: Tile | None, max_points: int) -> WorkItem:
+    """Return a work item in batches of at most ``max_points`` sensor points; lasers None: confocal."""
+    y0, x0, (rows, columns) = sensors.y0, sensors.x0, sensors.shape
+    pieces = (
+        Tile(y0 + tile.y0, y0 + tile.y1, x0 + tile.x0, x0 + tile.x1)
+        for tile in runs(0, rows * columns, columns, max_points)
+    )
+    return WorkItem(sensors, lasers or sensors, tuple(Batch(piece, lasers or piece) for piece in pieces))

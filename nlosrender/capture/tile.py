@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 
 
@@ -40,41 +40,33 @@ class Tile:
         return rows and self.x0 < other.x1 and other.x0 < self.x1
 
 
-def runs(first: int, last: int, nx: int, most: int) -> Iterator[Tile]:
-    """Cut the flat indices [first, last) of a grid with ``nx`` columns into tiles of at most ``most`` points.
+def runs(first: int, last: int, nx: int, max_points: int) -> Iterator[Tile]:
+    """Cut the flat indices [first, last) of a grid with ``nx`` columns into tiles of at most ``max_points``.
 
     A tile is whole rows, or part of one row; together they keep the order of the indices.
     """
     while first < last:
         y, x = divmod(first, nx)
-        points = min(most, last - first)
+        points = min(max_points, last - first)
         rows, columns = (points // nx, nx) if x == 0 and points >= nx else (1, min(points, nx - x))
-        tile = Tile(y, y + rows, x, x + columns)
-        yield tile
-        first += tile.size
+        yield Tile(y, y + rows, x, x + columns)
+        first += rows * columns
 
 
-def joined(cells: Iterable[Tile], most: int) -> list[Tile]:
-    """Join neighbours among ``cells`` into tiles of at most ``most`` points; a larger cell stays as it is.
+def joined(cells: Iterable[Tile], max_points: int) -> list[Tile]:
+    """Join neighbours among ``cells`` into tiles of at most ``max_points``; a larger cell stays as it is.
 
-    Cells come row of cells after row of cells. Along a row they are joined first, then such rows of equal width.
+    Cells come row of cells after row of cells. They are joined along a row first, then such rows of equal width.
     """
-    rows: list[Tile] = []
-    for cell in cells:
-        before = rows[-1] if rows else None
-        if before and (before.y0, before.y1, before.x1) == (cell.y0, cell.y1, cell.x0):
-            wider = Tile(before.y0, before.y1, before.x0, cell.x1)
-            if wider.size <= most:
-                rows[-1] = wider
-                continue
-        rows.append(cell)
-    blocks: list[Tile] = []
-    for row in rows:
-        before = blocks[-1] if blocks else None
-        if before and (before.x0, before.x1, before.y1) == (row.x0, row.x1, row.y0):
-            taller = Tile(before.y0, row.y1, before.x0, before.x1)
-            if taller.size <= most:
-                blocks[-1] = taller
-                continue
-        blocks.append(row)
-    return blocks
+    rows = _merged(cells, max_points, lambda a, b: (a.y0, a.y1, a.x1) == (b.y0, b.y1, b.x0))
+    return _merged(rows, max_points, lambda a, b: (a.x0, a.x1, a.y1) == (b.x0, b.x1, b.y0))
+
+
+def _merged(tiles: Iterable[Tile], max_points: int, adjoin: Callable[[Tile, Tile], bool]) -> list[Tile]:
+    merged: list[Tile] = []
+    for tile in tiles:
+        if merged and adjoin(merged[-1], tile) and merged[-1].size + tile.size <= max_points:
+            first = merged.pop()
+            tile = Tile(first.y0, tile.y1, first.x0, tile.x1)
+        merged.append(tile)
+    return merged

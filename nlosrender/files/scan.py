@@ -17,7 +17,7 @@ from nlosrender.files.layout import ZNLOS_FROM_LOCAL, Float64
 from nlosrender.files.reader import StoredCapture
 from nlosrender.files.stored_header import StoredHeader, intensity
 from nlosrender.files.stored_points import FLATNESS, Numbers
-from nlosrender.scene.hidden_geometry import Bounds, box_corners
+from nlosrender.scene.bounding_box import Bounds, box_corners
 from nlosrender.scene.pose import euler_xyz
 
 Float32 = NDArray[np.float32]

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from nlosrender.capture.arrivals import latest_arrival
 from nlosrender.capture.bounces import BounceAxis, first_bounce_of
 from nlosrender.capture.grids import Capture, build_capture
 from nlosrender.capture.limits import refuse_impossible_grids, refuse_impossible_samples, refuse_wide_kernel
@@ -100,7 +101,8 @@ def describe_capture(config: Config, wall: RelayWall, built: BuiltScene | BuiltV
     """Stage 3: laser and sensor points, legs and bins."""
     refuse_impossible_grids(config.capture, config.render.memory_limit_bytes or physical_memory())
     capture = build_capture(config.capture, wall)
-    time_axis = resolve_time_axis(config.time_axis, capture, wall, built.hidden_bounds, config.render.max_bounces)
+    latest = latest_arrival(capture, wall, built.hidden_bounds, config.render.max_bounces)
+    time_axis = resolve_time_axis(config.time_axis, latest)
     refuse_wide_kernel(config.render.temporal_kernel_opl, time_axis)
     return capture, time_axis
 

@@ -15,15 +15,10 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from nlosrender.scene.bounding_box import Bounds, box_corners, joined_bounds
 from nlosrender.scene.coincident import PASSES, Overlap, coincident_disks, moved_apart, overlaps
 from nlosrender.scene.double_faces import without_double_faces
-from nlosrender.scene.hidden_geometry import (
-    Bounds,
-    ShapeDescription,
-    Surface,
-    box_corners,
-    joined_bounds,
-)
+from nlosrender.scene.hidden_geometry import ShapeDescription, Surface
 from nlosrender.scene.materials import area_emitter, check_surface, first_line, load_bsdf, medium_warnings, rejected
 from nlosrender.scene.mesh_attributes import VERTEX_COLOR, attribute_uses
 from nlosrender.scene.mesh_report import MeshReport

@@ -6,13 +6,14 @@ files stay files with the matrix that brings them to the local frame; the scene 
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
+from nlosrender.scene.bounding_box import Bounds, bounds_of, box_corners
 from nlosrender.scene.letters import letters_mesh
 from nlosrender.scene.mesh_normals import Normals
 from nlosrender.scene.pictures import has_picture, readable, round_plugin, upright_bsdf
@@ -28,7 +29,6 @@ if TYPE_CHECKING:
 
 MESH_PLUGINS = ("ply", "obj")
 _TO_WALL, _UP = (0.0, 0.0, -1.0), (0.0, 1.0, 0.0)  # default front and up of hidden items, in the scene
-Bounds = tuple[Float64, Float64]  # smallest and largest coordinates, (3,) and (3,) m
 Radiance = float | tuple[float, float, float]  # grey or [r, g, b], W m^-2 sr^-1
 
 
@@ -67,8 +67,7 @@ class ShapeDescription:
         if box is None:
             return None
         to_world = np.asarray(self.description.get("to_world", np.eye(4)), dtype=np.float64)
-        corners = box_corners(box) @ to_world[:3, :3].T + to_world[:3, 3]
-        return corners.min(axis=0), corners.max(axis=0)
+        return bounds_of(box_corners(box) @ to_world[:3, :3].T + to_world[:3, 3])
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,29 +125,6 @@ def hidden_surfaces(
         name = item.name or f"{item.type}-{index}"
         surfaces.append(Surface(name, key, shape, bsdf, getattr(item, "radiance", None)))
     return tuple(surfaces)
-
-
-def bounds(surfaces: Iterable[Surface]) -> Bounds | None:
-    """Return a box around all surfaces whose extent is known without reading files [m, local frame]; None if none is.
-
-    ``Surface.bounds`` tells which are not: their boxes must be joined in once the files are loaded (``joined_bounds``).
-    """
-    return joined_bounds(surface.bounds() for surface in surfaces)
-
-
-def joined_bounds(boxes: Iterable[Bounds | None]) -> Bounds | None:
-    """Return the box around all boxes that are not None; None when there is none."""
-    known = [box for box in boxes if box is not None]
-    if not known:
-        return None
-    return np.min([low for low, _ in known], axis=0), np.max([high for _, high in known], axis=0)
-
-
-def box_corners(box: Bounds) -> Float64:
-    """Return the eight corners of a box, (8, 3) [m]."""
-    low, high = box
-    choice = np.stack(np.meshgrid([0, 1], [0, 1], [0, 1], indexing="ij"), axis=-1).reshape(-1, 3)
-    return np.where(choice == 0, low, high)
 
 
 def _shape(item: HiddenItemConfig, wall: HasPose) -> TriangleMesh | MeshFile | ShapeDescription:

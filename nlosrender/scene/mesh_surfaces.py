@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING
 
 from nlosrender.config.bsdf_table import TRANSMITTING
 from nlosrender.errors import ConfigError, Problem
+from nlosrender.scene.bounding_box import box_corners
 from nlosrender.scene.file_mesh import FileMesh
-from nlosrender.scene.hidden_geometry import MeshFile, ShapeDescription, Surface, box_corners, hidden_surfaces
+from nlosrender.scene.hidden_geometry import MeshFile, ShapeDescription, Surface, hidden_surfaces
 from nlosrender.scene.mesh_file import read_mesh_file
 from nlosrender.scene.mesh_normals import with_normals
 from nlosrender.scene.mesh_report import MeshReport, mesh_report

@@ -12,16 +12,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from nlosrender.config.emitters import PointLamp, SpotLamp
+from nlosrender.scene.bounding_box import Bounds, box_corners, joined_bounds
 from nlosrender.scene.build import load_surface, shape_bounds
 from nlosrender.scene.camera import ImagePlane, image_plane
-from nlosrender.scene.hidden_geometry import (
-    Bounds,
-    ShapeDescription,
-    Surface,
-    box_corners,
-    hidden_surfaces,
-    joined_bounds,
-)
+from nlosrender.scene.hidden_geometry import ShapeDescription, Surface, hidden_surfaces
 from nlosrender.scene.materials import check_surface, medium_warnings, mitsuba_spectrum, rejected
 from nlosrender.scene.mesh_report import MeshReport
 from nlosrender.scene.mesh_surfaces import read_surfaces

@@ -15,9 +15,10 @@ from nlosrender.config.fields import LONGEST, SHORTEST
 from nlosrender.config.mitsuba_xml import image_files, read_mitsuba_xml
 from nlosrender.config.xml_shapes import named, placement, shape_parameters
 from nlosrender.config.xml_tree import numbered_text, place_of
+from nlosrender.scene.bounding_box import box_corners
 from nlosrender.scene.build import load_flat_serialized, shape_bounds
 from nlosrender.scene.file_mesh import FileMesh
-from nlosrender.scene.hidden_geometry import MESH_PLUGINS, ShapeDescription, box_corners
+from nlosrender.scene.hidden_geometry import MESH_PLUGINS, ShapeDescription
 from nlosrender.scene.images import check_image
 from nlosrender.scene.materials import first_line, rejected
 from nlosrender.scene.mesh_file import read_mesh_file

@@ -5,14 +5,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from nlosrender.scene.hidden_geometry import (
-    MeshFile,
-    ShapeDescription,
-    Surface,
-    bounds,
-    hidden_surfaces,
-    joined_bounds,
-)
+from nlosrender.scene.bounding_box import joined_bounds
+from nlosrender.scene.hidden_geometry import MeshFile, ShapeDescription, Surface, hidden_surfaces
 from nlosrender.scene.pose import Pose, euler_xyz
 from nlosrender.scene.relay_wall import RectangleWall
 from nlosrender.scene.transforms import transform_matrix
@@ -217,6 +211,6 @@ def test_joint_bounds_skip_what_only_a_file_knows():
     ball = ShapeDescription({"type": "sphere", "center": [-1, 0, 0], "radius": 0.5})
     file = MeshFile("bunny.ply", np.eye(4))
     surfaces = [Surface("s", "k", shape, BSDF) for shape in (flat, file, ball)]
-    np.testing.assert_allclose(bounds(surfaces), [[-1.5, -0.5, -0.5], [1, 2, 1]])
-    assert bounds(surfaces[1:2]) is None
+    np.testing.assert_allclose(joined_bounds(surface.bounds() for surface in surfaces), [[-1.5, -0.5, -0.5], [1, 2, 1]])
+    assert joined_bounds(surface.bounds() for surface in surfaces[1:2]) is None
     assert joined_bounds([]) is None

@@ -11,11 +11,10 @@ from nlosrender.capture.plan import (
     BYTES_OF_ASSEMBLY,
     BYTES_OF_STATISTICS,
     BYTES_PER_SUM,
-    MOST_SUMS,
+    MAX_SUMS,
     Plan,
     plan_capture,
     remaining_items,
-    tiles,
 )
 from nlosrender.capture.tile import Tile, joined, runs
 from nlosrender.errors import ConfigError
@@ -35,7 +34,7 @@ def capture(scan_type: str) -> Capture:
 @pytest.mark.parametrize(("ny", "nx", "most"), [(3, 5, 1), (3, 5, 4), (3, 5, 5), (3, 5, 11), (3, 5, 100), (1, 1, 1)])
 def test_tiles_cover_a_grid_once(ny, nx, most):
     """No point is left out, none is done twice, no tile is too large."""
-    cut = list(tiles(ny, nx, most))
+    cut = list(runs(0, ny * nx, nx, most))
     points = list(itertools.chain.from_iterable(tile.flat_indices(nx) for tile in cut))
     assert sorted(points) == list(range(ny * nx))
     assert all(1 <= tile.size <= most for tile in cut)
@@ -81,7 +80,7 @@ def test_a_batch_stays_within_32_bit_indices():
     """Dr.Jit indexes with 32 bits: more memory than that does not make larger batches."""
     plan = plan_capture(capture("exhaustive"), rows_per_pair=6, n_bins=10**7, lanes=8, memory_limit=10**15)
     largest = max(batch.sensors.size * batch.lasers.size for batch in plan.batches)
-    assert largest * plan.replicas * 6 * (10**7 + 1) <= MOST_SUMS
+    assert largest * plan.replicas * 6 * (10**7 + 1) <= MAX_SUMS
     assert len(plan.batches) > 1
 
 
@@ -108,7 +107,7 @@ def pairs_of(unit) -> set[tuple[int, int]]:
 def test_units_are_whole_storage_tiles(scan_type, pairs, shard):
     """Each chunk of the file is filled by one unit, and a unit's batches cover it once, within the memory."""
     plan = planned(scan_type, pairs, Selection(shard=shard))
-    cells = list(plan.tiling.elements(plan.part.strips))
+    cells = list(plan.tiling.cells(plan.part.strips))
     covered = [0] * len(cells)
     for unit in plan.work_items:
         inside = [cell for cell in cells if unit.sensors.contains(cell)]

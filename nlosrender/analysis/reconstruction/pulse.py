@@ -13,7 +13,7 @@ import numpy as np
 from nlosrender.errors import OptionError
 from nlosrender.files.layout import Float64
 from nlosrender.files.scan import Scan
-from nlosrender.scene.hidden_geometry import Bounds
+from nlosrender.scene.bounding_box import Bounds
 
 DEFAULT_CYCLES = 5.0
 REACH = 3.0  # standard deviations at which the pulse is cut, in time and in frequency: it is down to 1.1 % there

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from nlosrender.analysis.reconstruction.pulse import Pulse
 from nlosrender.files.layout import Float64
 from nlosrender.files.scan import Float32, Scan
-from nlosrender.scene.hidden_geometry import Bounds, box_corners
+from nlosrender.scene.bounding_box import Bounds, box_corners
 
 Complex64 = NDArray[np.complex64]
 

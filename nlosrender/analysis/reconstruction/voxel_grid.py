@@ -10,7 +10,7 @@ import numpy as np
 from nlosrender.errors import FileError, OptionError
 from nlosrender.files.layout import Float64
 from nlosrender.files.scan import Scan
-from nlosrender.scene.hidden_geometry import Bounds
+from nlosrender.scene.bounding_box import Bounds
 
 DEFAULT_VOXELS = 128  # along the longest edge
 MARGIN = 0.15  # of the longest edge of the hidden geometry's box, on every side

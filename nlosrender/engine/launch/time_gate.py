@@ -15,13 +15,13 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from nlosrender.capture.arrivals import distance_to_box, latest_of_bounce
+from nlosrender.capture.arrivals import latest_of_bounce
 from nlosrender.capture.bounces import BounceAxis
 from nlosrender.capture.grids import Capture, PointGrid
 from nlosrender.capture.time_axis import TimeAxis
 from nlosrender.engine.launch.device_arrays import columns, on_device
+from nlosrender.scene.bounding_box import Bounds, distance_to_box
 from nlosrender.scene.build import BuiltScene
-from nlosrender.scene.hidden_geometry import Bounds
 from nlosrender.scene.pose import Float64
 
 GATE_SURVIVAL = 1 / 8  # chance of a path to go on once all its light comes after the window

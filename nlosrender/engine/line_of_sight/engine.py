@@ -10,7 +10,7 @@ import mitsuba as mi
 import numpy as np
 
 from nlosrender.capture.grids import Capture
-from nlosrender.capture.plan import MOST_SUMS, Batch
+from nlosrender.capture.plan import MAX_SUMS, Batch
 from nlosrender.capture.time_axis import TimeAxis
 from nlosrender.engine.launch.histogram import DeviceHistogram, Histogram, HistogramShape
 from nlosrender.engine.launch.launch_params import LaneRandomness
@@ -105,7 +105,7 @@ class LineOfSightEngine:
             The batch is too large for 32-bit indices, or the result is not finite.
         """
         shape = self.shape(batch, self.n_slots)
-        if shape.size > MOST_SUMS:
+        if shape.size > MAX_SUMS:
             raise RenderError(
                 f"a batch of {shape.size:.2e} sums is more than 32-bit indices reach; lower render.memory_limit"
             )

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from nlosrender.capture.bounces import THIRD_BOUNCE, BounceAxis
 from nlosrender.capture.grids import Capture
-from nlosrender.capture.plan import MOST_SUMS, Batch
+from nlosrender.capture.plan import MAX_SUMS, Batch
 from nlosrender.capture.time_axis import TimeAxis
 from nlosrender.engine.launch.device_arrays import laser_points, on_device, sensor_points
 from nlosrender.engine.launch.energy_contrasts import no_contrasts
@@ -178,7 +178,7 @@ class PathEngine:
         """
         bounces = self.options.bounces
         shape = self.shape(batch, self.n_slots)
-        if shape.size > MOST_SUMS:
+        if shape.size > MAX_SUMS:
             raise RenderError(
                 f"a batch of {shape.size:.2e} sums is more than 32-bit indices reach; lower render.memory_limit"
             )

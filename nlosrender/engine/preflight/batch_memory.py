@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 from nlosrender.capture.bounces import LINE_OF_SIGHT
 from nlosrender.capture.grids import Capture
-from nlosrender.capture.plan import BYTES_PER_SUM, MOST_SUMS, Batch, Plan
+from nlosrender.capture.plan import BYTES_PER_SUM, MAX_SUMS, Batch, Plan
 from nlosrender.engine.backend.start import PROCESS_BYTES, batch_memory, physical_memory, scene_memory
 from nlosrender.engine.engines import Engine
 from nlosrender.engine.preflight.omitted_work import traces_paths
@@ -32,7 +32,7 @@ def batch_bytes(engine: Engine, plan: Plan) -> int:
     gathered = 0
     if isinstance(engine, VirtualLightEngine):
         gathered = BlockHistogram.entries(engine.third.shape(largest))
-    if max(entries, gathered) > MOST_SUMS:
+    if max(entries, gathered) > MAX_SUMS:
         raise RenderError(
             f"a batch of {max(entries, gathered):.2e} sums is more than 32-bit indices reach; lower render.memory_limit"
         )
