@@ -94,7 +94,7 @@ def test_strips_are_dealt_tile_after_tile(header_of: Callable) -> None:
 
     tiling = tiling_of(header_of("single"))
     assert (tiling.rows, tiling.columns, tiling.n_strips) == (2, 3, 8)
-    cells = [(c.y0, c.y1, c.x0, c.x1) for c in tiling.elements((1, 6))]
+    cells = [(c.y0, c.y1, c.x0, c.x1) for c in tiling.cells((1, 6))]
     assert cells == [(1, 2, 0, 3), (0, 2, 3, 5), (2, 4, 0, 3)]
 
 

@@ -45,7 +45,7 @@ def part_of(header: CaptureHeader, selection: Selection) -> Part:
 
 def units_of(header: CaptureHeader, part: Part) -> Iterator[tuple[Tile, Tile]]:
     """Storage tiles with one laser each: (sensors, lasers)."""
-    for cell in tiling_of(header).elements(part.strips):
+    for cell in tiling_of(header).cells(part.strips):
         for laser in runs(*part.lasers, header.sizes["laser_x"], 1):
             yield cell, cell if header.confocal else laser
 

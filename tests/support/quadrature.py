@@ -136,7 +136,7 @@ class Setup:
 
 def contributions(setup: Setup, laser: Array, sensor: Array) -> tuple[Array, Array]:
     """Value [J m^-2 sr^-1] and optical path length [m] of every cell for one pair of points."""
-    cells = setup.elements
+    cells = setup.cells
     wall_normal = Z if setup.wall_normal is None else setup.wall_normal
     value = cells.areas * setup.energy
     opl = np.full(len(value), setup.laser_leg + setup.sensor_leg)
