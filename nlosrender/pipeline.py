@@ -1,8 +1,8 @@
 """THE MAP: a capture from its configuration to its file, as one list of stages. Read this first.
 
 configuration (``config/``) -> scene, capture and plan, engine (``rendering/set_up.py``, which lists these stages)
--> work items, one after the other, rendered and written (``rendering/local.py`` in this process,
-``rendering/dask_executor.py`` on a cluster) -> one file (``files/partial_capture.py``).
+-> work items, one after the other, rendered and written (``rendering/local_executor.py``, or
+``dask_executor.py`` on a cluster) -> one file (``files/partial/partial_capture.py``).
 Mitsuba and Dr.Jit are imported only when a render starts, after the backend has been chosen.
 """
 
@@ -18,18 +18,19 @@ from nlosrender.capture.plan import remaining_items, replicas_for
 from nlosrender.config.document import Config
 from nlosrender.config.load import config_hash, config_to_dict
 from nlosrender.config.warnings import config_warnings
+from nlosrender.files.atomic_write import check_writable
+from nlosrender.files.file_kinds import CAPTURE
 from nlosrender.files.identity import capture_identity, files_read, identity_attributes
-from nlosrender.files.kinds import CAPTURE
-from nlosrender.files.part_attributes import part_attributes
-from nlosrender.files.partial_capture import PartialCapture
+from nlosrender.files.partial.partial_capture import PartialCapture
+from nlosrender.files.parts.part_attributes import part_attributes
 from nlosrender.files.provenance import provenance_attributes
-from nlosrender.files.replacement import check_writable
 from nlosrender.rendering.dask_executor import render_on_cluster
 from nlosrender.rendering.dask_worker import Job
-from nlosrender.rendering.local import render_units, resumable
+from nlosrender.rendering.local_executor import render_items, resumable
 from nlosrender.rendering.outcome import Outcome, missing_light
+from nlosrender.rendering.process_layout import ONE_PROCESS
+from nlosrender.rendering.render_report import Progress, RenderReport, Stopwatch, Warn, Warnings, Watch
 from nlosrender.rendering.render_warnings import render_warnings
-from nlosrender.rendering.report import Progress, RenderReport, Stopwatch, Warn, Warnings, Watch
 from nlosrender.rendering.set_up import (
     calibrated_budget,
     describe_capture,
@@ -41,7 +42,6 @@ from nlosrender.rendering.set_up import (
     set_up_engine,
     started_backend,
 )
-from nlosrender.rendering.sharing import ALONE
 
 if TYPE_CHECKING:
     from nlosrender.rendering.dask_cluster import Cluster
@@ -81,16 +81,16 @@ def render_capture(
     progress
         Called now and then with the share of the work done.
     warn
-        Called with every warning, before the first unit.
+        Called with every warning, before the first work item.
     selection
         The part that is rendered.
     resume
         None: go on with an unfinished render of the same capture where there is one; True: there has to be one;
         False: start anew.
     cluster
-        Who renders the units; None: this process. The file is the same.
+        Who renders the work items; None: this process. The file is the same.
     watch
-        Called with how many units are finished: before the first one, and after each.
+        Called with how many work items are finished: before the first one, and after each.
     strict
         Refuse to render where light is missing that no technique samples.
 
@@ -113,20 +113,20 @@ def render_capture(
         The render stopped half-way; the same call goes on from there.
     """
     stopwatch, warnings = Stopwatch(), Warnings(warn)
-    warnings.say(config_warnings(config))
+    warnings.emit(config_warnings(config))
     resolved, output = config_to_dict(config), config.output
     with stopwatch.stage("scene"):
         check_writable(output.path, CAPTURE, files_read(resolved))
         backend = started_backend(config)
-    sharing = ALONE if cluster is None else cluster.sharing
+    sharing = ONE_PROCESS if cluster is None else cluster.sharing
     replicas = replicas_for(backend.lanes, config.capture.sensor_grid.n_points)
     identity = capture_identity(resolved, str(selection), backend.variant, replicas)
     with PartialCapture.claim(output.path, identity, resume) as partial:
         with stopwatch.stage("scene"):
             plan, engine, header = set_up_engine(config, backend, selection, sharing)
             unsampled = missing_light(engine, strict)
-            warnings.say(paths.warning for paths in unsampled)
-            warnings.say(render_warnings(config, backend, plan, engine, header, sharing))
+            warnings.emit(paths.warning for paths in unsampled)
+            warnings.emit(render_warnings(config, backend, plan, engine, header, sharing))
         with stopwatch.stage("render"):
             budget = calibrated_budget(config, engine)
         with resumable(partial) as stop:
@@ -134,24 +134,24 @@ def render_capture(
                 resolved, config_hash(config), engine=engine.name, seed=config.render.seed, meshes=engine.built.meshes
             )
             partial.open(header, provenance | identity_attributes(identity), output.compression, output.variance)
-            warnings.say(partial.damage)
-            earlier = len(partial.tally.units)
-            units = remaining_items(plan, header.confocal, partial.tally.units)
+            warnings.emit(partial.damage)
+            earlier = len(partial.tally.items)
+            items = remaining_items(plan, header.confocal, partial.tally.items)
             if cluster is None:
-                render = functools.partial(render_units, units, engine, budget, partial, stop)
+                render = functools.partial(render_items, items, engine, budget, partial, stop)
             else:
                 job = Job(config, selection, identity, backend.name, sharing)
-                render = functools.partial(render_on_cluster, units, job, budget, partial, stop, cluster)
+                render = functools.partial(render_on_cluster, items, job, budget, partial, stop, cluster)
             render(
                 store_variance=output.variance,
                 stopwatch=stopwatch,
                 progress=progress,
-                warn=lambda text: warnings.say([text]),
+                warn=lambda text: warnings.emit([text]),
                 watch=(lambda standing: watch(replace(standing, error=None))) if unsampled else watch,
             )
             tally = partial.tally
             outcome = Outcome.of(config.render, engine, unsampled, tally.sums)
-            warnings.say(outcome.warnings)
+            warnings.emit(outcome.warnings)
             results = outcome.attributes(stopwatch.report(), is_whole=selection == WHOLE)
             if selection != WHOLE:
                 results |= part_attributes(plan.part, plan.tiling, tally)
@@ -162,7 +162,7 @@ def render_capture(
         reason=engine.reason,
         variant=backend.variant,
         part=None if selection == WHOLE else str(plan.part),
-        units=earlier + len(units),
+        units=earlier + len(items),
         resumed_units=earlier,
         samples=tally.sums.samples or 0,
         error_estimate=outcome.stated_error,
@@ -171,7 +171,7 @@ def render_capture(
         n_bins=header.n_bins,
         n_triangles=engine.built.n_triangles,
         seconds=stopwatch.report(),
-        warnings=tuple(warnings.said),
+        warnings=tuple(warnings.emitted),
         unsampled_paths=outcome.missing,
         zero_because=outcome.zero_because,
         error_estimate_per_bounce=outcome.known_per_bounce(tally.sums.errors_per_bounce(outcome.bounces)),

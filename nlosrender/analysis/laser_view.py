@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nlosrender.errors import FileError
-from nlosrender.files.reader import StoredCapture
-from nlosrender.files.stored_header import intensity
+from nlosrender.files.reading.reader import StoredCapture
+from nlosrender.files.reading.stored_header import intensity
 
 Float64 = NDArray[np.float64]
 

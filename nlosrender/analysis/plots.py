@@ -37,11 +37,11 @@ from nlosrender.capture.bounces import FILE_BOUNCES, LINE_OF_SIGHT
 from nlosrender.config.encodable import encodable
 from nlosrender.constants import opl_to_seconds
 from nlosrender.errors import OptionError
-from nlosrender.files.kinds import PICTURES
+from nlosrender.files.atomic_write import check_writable, replacing
+from nlosrender.files.file_kinds import PICTURES
 from nlosrender.files.layout import data_unit
-from nlosrender.files.reader import StoredCapture, open_capture
-from nlosrender.files.replacement import check_writable, replacing
-from nlosrender.files.stored_header import StoredHeader
+from nlosrender.files.reading.reader import StoredCapture, open_capture
+from nlosrender.files.reading.stored_header import StoredHeader
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING
 from nlosrender.config.document import Config
 from nlosrender.config.warnings import config_warnings
 from nlosrender.engine.backend.start import scene_memory
-from nlosrender.files.size import FileSize
+from nlosrender.files.size_estimate import FileSize
 from nlosrender.readable import readable_duration
 from nlosrender.rendering.outcome import missing_light
+from nlosrender.rendering.render_report import Warnings
 from nlosrender.rendering.render_warnings import expected_file_size, render_warnings
-from nlosrender.rendering.report import Warnings
 from nlosrender.rendering.set_up import set_up_engine, started_backend
 from nlosrender.scene.mesh_report import MeshReport
 
@@ -74,12 +74,12 @@ def plan_render(config: Config) -> RenderPlan:
 
     begun = time.perf_counter()
     warnings = Warnings(lambda text: None)
-    warnings.say(config_warnings(config))
+    warnings.emit(config_warnings(config))
     backend = started_backend(config)
     plan, engine, header = set_up_engine(config, backend)
     unsampled = missing_light(engine)
-    warnings.say(paths.warning for paths in unsampled)
-    warnings.say(render_warnings(config, backend, plan, engine, header))
+    warnings.emit(paths.warning for paths in unsampled)
+    warnings.emit(render_warnings(config, backend, plan, engine, header))
     set_up_seconds = time.perf_counter() - begun
 
     render, capture, time_axis = config.render, engine.capture, engine.time_axis
@@ -88,7 +88,7 @@ def plan_render(config: Config) -> RenderPlan:
     rendering = estimate_render_time(engine, plan, budget, backend.lanes)
     size = expected_file_size(config, header, engine, rendering.lit_shares)
     seconds = None if rendering.seconds is None else rendering.seconds + set_up_seconds + size.write_seconds
-    warnings.say(duration_warnings(config, seconds))
+    warnings.emit(duration_warnings(config, seconds))
     return RenderPlan(
         engine=engine.name,
         reason=engine.reason,
@@ -111,7 +111,7 @@ def plan_render(config: Config) -> RenderPlan:
         units=len(plan.work_items),
         seconds_per_unit=None if rendering.seconds is None else rendering.seconds / len(plan.work_items),
         estimate_basis=rendering.basis,
-        warnings=tuple(warnings.said),
+        warnings=tuple(warnings.emitted),
         meshes=engine.built.meshes,
         unsampled_paths=tuple(paths.summary for paths in unsampled),
     )

@@ -10,9 +10,9 @@ from pathlib import Path
 
 from nlosrender.constants import opl_to_seconds
 from nlosrender.errors import FileError
-from nlosrender.files.part_attributes import UNSAMPLED, ZERO, text_list
-from nlosrender.files.reader import read_header
-from nlosrender.files.stored_header import StoredHeader
+from nlosrender.files.parts.part_attributes import UNSAMPLED, ZERO, text_list
+from nlosrender.files.reading.reader import read_header
+from nlosrender.files.reading.stored_header import StoredHeader
 
 
 def summarise(path: str | Path) -> dict[str, object]:

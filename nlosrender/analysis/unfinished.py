@@ -5,10 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 
 from nlosrender.errors import FileError
-from nlosrender.files.journal import read_records
-from nlosrender.files.partial_folder import JOURNAL
-from nlosrender.files.reader import explained_read
-from nlosrender.files.unit_log import UnfinishedRender
+from nlosrender.files.partial.journal import read_records
+from nlosrender.files.partial.partial_folder import JOURNAL
+from nlosrender.files.partial.work_item_log import JournalState
+from nlosrender.files.reading.reader import explained_read
 
 
 def is_unfinished(path: str | Path) -> bool:
@@ -33,19 +33,19 @@ def summarise_unfinished(folder: str | Path) -> dict[str, object]:
     """
     folder = Path(folder)
     with explained_read(folder):
-        state = UnfinishedRender.from_records(read_records(folder / JOURNAL))
+        state = JournalState.from_records(read_records(folder / JOURNAL))
     if not state.first:
         raise FileError(f"{folder}: nothing has been rendered into it yet")
     tally, identity = state.tally, state.first["identity"]
     confocal = identity["config"].get("capture", {}).get("scan_type") == "confocal"
-    pairs = sum(sensors.size * (1 if confocal else lasers.size) for sensors, lasers in tally.units)
+    pairs = sum(sensors.size * (1 if confocal else lasers.size) for sensors, lasers in tally.items)
     error = tally.sums.error_estimate
     return {
         "file": str(folder),
         "unfinished": True,
         "name": identity["config"].get("name"),
         "part": identity.get("part"),
-        "finished_units": len(tally.units),
+        "finished_units": len(tally.items),
         "finished_pairs": pairs,
         "size_of_chunks": tally.n_bytes,
         "error_estimate": error if error < float("inf") else None,

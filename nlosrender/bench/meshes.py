@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from nlosrender.files.kinds import PLY
-from nlosrender.files.replacement import replacing
+from nlosrender.files.atomic_write import replacing
+from nlosrender.files.file_kinds import PLY
 
 FACE = np.dtype([("count", "u1"), ("corners", "<u4", 3)])
 

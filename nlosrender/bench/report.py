@@ -6,8 +6,8 @@ import json
 from pathlib import Path
 from typing import Any
 
-from nlosrender.files.kinds import PNG, REPORT
-from nlosrender.files.replacement import replacing
+from nlosrender.files.atomic_write import replacing
+from nlosrender.files.file_kinds import PNG, REPORT
 
 FAR = "never"
 NOTABLE = 0.1  # of the CPU time: setting up the engine is shown apart

@@ -1,4 +1,4 @@
-"""The order of work: work items of sensor and laser points, in batches that fit the memory at hand.
+"""The order of work: items of sensor and laser points, in batches that fit the memory at hand.
 
 A work item is rendered, written and recorded as finished at once. What a lane computes depends on its sensor point
 alone, so how a capture is cut changes no bit of it.

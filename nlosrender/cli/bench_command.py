@@ -76,8 +76,8 @@ def bench(
 def _outputs(output: Path) -> tuple[Path, Path]:
     """Return the names of report and plot, once it is sure that they can be written: before the work, not after it."""
     from nlosrender.errors import FileError
-    from nlosrender.files.kinds import PNG, REPORT
-    from nlosrender.files.replacement import check_writable, explained_write
+    from nlosrender.files.atomic_write import check_writable, explained_write
+    from nlosrender.files.file_kinds import PNG, REPORT
 
     if output.name in ("", ".."):
         raise FileError(f"{output}: is a folder. Name files in it, such as {output / 'bench'}")

@@ -51,15 +51,15 @@ def new(
     import shlex
 
     from nlosrender.config.template import starter_config
-    from nlosrender.files.kinds import CONFIG, Kind
-    from nlosrender.files.replacement import replacing
+    from nlosrender.files.atomic_write import replacing
+    from nlosrender.files.file_kinds import CONFIG, FileKind
 
     if path == "-":
         typer.echo(starter_config(scan_type.value), nl=False)
         return
     target = Path(path)
     text = starter_config(scan_type.value, target.stem, target.name)
-    with replacing(path, CONFIG if force else Kind(lambda _: "exists already; --force overwrites it.")) as partial:
+    with replacing(path, CONFIG if force else FileKind(lambda _: "exists already; --force overwrites it.")) as partial:
         partial.write_text(text, encoding="utf-8")
     typer.echo(f"{path}: written; nlosrender validate {shlex.quote(path)} checks it after changes.")
 

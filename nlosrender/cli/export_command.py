@@ -63,7 +63,7 @@ def export(
 
     from nlosrender.cli.output_names import beside
     from nlosrender.errors import OptionError
-    from nlosrender.files.exports import export_capture, suffix_of
+    from nlosrender.files.export.export import export_capture, suffix_of
 
     if bounces not in ("3", "all"):
         raise OptionError(f"--bounces: got {bounces!r}, need 3 or all")

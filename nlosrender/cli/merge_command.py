@@ -34,7 +34,7 @@ def merge(
     """Put the parts of a capture together; what is missing, there twice, damaged or not its own is named."""
     from nlosrender.cli.progress import progress_bar
     from nlosrender.cli.stated_error import energies_by_bounce, stated_error_lines
-    from nlosrender.files.merge import merge_captures
+    from nlosrender.files.parts.merge import merge_captures
 
     with progress_bar("merge", hidden=quiet) as (progress, _, _):
         report = merge_captures(parts, output, progress, overwrite=overwrite)

@@ -13,7 +13,7 @@ def beside(file: Path, ending: str) -> Path:
     FileError
         ``file`` is missing or a folder, whose name may be none, such as ``.``
     """
-    from nlosrender.files.reader import check_regular
+    from nlosrender.files.reading.reader import check_regular
 
     check_regular(file)
     return file.with_name(file.stem + ending)

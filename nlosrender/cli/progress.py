@@ -9,7 +9,7 @@ from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING, NamedTuple
 
 if TYPE_CHECKING:
-    from nlosrender.rendering.report import Progress, Standing, Warn
+    from nlosrender.rendering.render_report import Progress, Standing, Warn
 
 
 class Telling(NamedTuple):

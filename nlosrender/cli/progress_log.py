@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Self
 from nlosrender.readable import readable_duration
 
 if TYPE_CHECKING:
-    from nlosrender.rendering.report import Standing
+    from nlosrender.rendering.render_report import Standing
 
 FIRST_SECONDS = 5.0  # before the first line: a short command says what it has to say when it is done
 LEAST_SECONDS = 10.0  # between two lines

@@ -81,8 +81,8 @@ def reconstruct(
     from nlosrender.analysis.reconstruction.volume_file import write_volume
     from nlosrender.cli.output_names import beside
     from nlosrender.errors import OptionError
-    from nlosrender.files.kinds import PNG, VOLUME
-    from nlosrender.files.replacement import check_writable
+    from nlosrender.files.atomic_write import check_writable
+    from nlosrender.files.file_kinds import PNG, VOLUME
 
     center, size = _lengths(volume_center, "--volume-center"), _lengths(volume_size, "--volume-size")
     settings = ReconstructionSettings(method, wavelength, cycles, center, size, voxels, voxel_size, bounces)

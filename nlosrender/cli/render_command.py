@@ -17,7 +17,7 @@ from nlosrender.readable import readable_duration
 if TYPE_CHECKING:
     from nlosrender.capture.part import Selection
     from nlosrender.rendering.dask_cluster import Cluster
-    from nlosrender.rendering.report import RenderReport
+    from nlosrender.rendering.render_report import RenderReport
 
 
 class Executor(StrEnum):
@@ -93,7 +93,7 @@ def render(
     from nlosrender.config.places import with_places
     from nlosrender.config.sweep_load import load_sweep
     from nlosrender.errors import ConfigError, FileError
-    from nlosrender.files.replacement import refuse_sources
+    from nlosrender.files.atomic_write import refuse_sources
     from nlosrender.pipeline import render_capture
 
     changes = list(overrides or [])

@@ -16,8 +16,8 @@ if TYPE_CHECKING:
     from nlosrender.config.document import Config
     from nlosrender.config.sweep_load import Sweep
     from nlosrender.rendering.dask_cluster import Cluster
-    from nlosrender.rendering.report import Progress, RenderReport, Warn
-    from nlosrender.rendering.sweep import SweepReport
+    from nlosrender.rendering.render_report import Progress, RenderReport, Warn
+    from nlosrender.rendering.sweep_render import SweepReport
 
 PILOTS = 3  # captures whose cost `plan` measures: the first, the last and those between
 
@@ -40,13 +40,13 @@ def render_all(
     RenderError
         Captures failed; the others are rendered.
     ConfigError, BackendError, FileError, IncompleteRender, InterruptedRender
-        As ``rendering.sweep.render_sweep``.
+        As ``rendering.sweep_render.render_sweep``.
     """
     from nlosrender.cli.progress import progress_bar
     from nlosrender.config.places import with_places
     from nlosrender.errors import ConfigError, RenderError
     from nlosrender.pipeline import render_capture
-    from nlosrender.rendering.sweep import render_sweep
+    from nlosrender.rendering.sweep_render import render_sweep
 
     def render(config: Config, progress: Progress, warn: Warn, resume: bool | None) -> RenderReport:
         try:

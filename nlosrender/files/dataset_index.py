@@ -11,10 +11,10 @@ from pathlib import Path
 from typing import Any, Literal
 
 from nlosrender.errors import FileError
-from nlosrender.files.kinds import INDEX
-from nlosrender.files.part_attributes import PART, UNSAMPLED, json_object, text_list
-from nlosrender.files.reader import read_header
-from nlosrender.files.replacement import replacing
+from nlosrender.files.atomic_write import replacing
+from nlosrender.files.file_kinds import INDEX
+from nlosrender.files.parts.part_attributes import PART, UNSAMPLED, json_object, text_list
+from nlosrender.files.reading.reader import read_header
 
 FORMAT_VERSION = 1
 

@@ -10,8 +10,8 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from nlosrender.errors import FileError
-from nlosrender.files.kinds import PICTURES
-from nlosrender.files.replacement import explained_write
+from nlosrender.files.atomic_write import explained_write
+from nlosrender.files.file_kinds import PICTURES
 from nlosrender.interruption import uninterrupted
 
 

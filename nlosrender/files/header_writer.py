@@ -14,7 +14,7 @@ from nlosrender.capture.bounces import (
 )
 from nlosrender.files import layout
 from nlosrender.files.attributes import set_attributes
-from nlosrender.files.capture_file import CaptureHeader
+from nlosrender.files.capture_header import CaptureHeader
 from nlosrender.scene.pose import Pose
 
 _VIEW_TEXT = {

@@ -12,14 +12,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nlosrender.files import layout
+from nlosrender.files.atomic_write import explained_write
 from nlosrender.files.attributes import set_attributes
-from nlosrender.files.capture_file import CaptureHeader
+from nlosrender.files.capture_header import CaptureHeader
+from nlosrender.files.chunking import PackedChunk
 from nlosrender.files.chunks import chunk_shape
+from nlosrender.files.deferred_error_file import DeferredErrorFile
 from nlosrender.files.header_writer import root_attributes, sample_attributes, write_header
-from nlosrender.files.pieces import PackedChunk
-from nlosrender.files.replacement import explained_write
-from nlosrender.files.shielded_file import ShieldedFile
-from nlosrender.files.unit_log import StoredChunk
+from nlosrender.files.partial.work_item_log import StoredChunk
 from nlosrender.interruption import uninterrupted
 
 GZIP_LEVEL = 4  # told to HDF5, which packs only chunks that are filled in parts
@@ -62,10 +62,10 @@ class CaptureSink:
         self.path, self.target = path, target
         self._reserved = frozenset(reserved)
         self._file: h5py.File | None = None
-        self._stream: ShieldedFile | None = None
+        self._stream: DeferredErrorFile | None = None
         try:
             with self._writing():
-                self._stream = ShieldedFile(path, keep=create is None)
+                self._stream = DeferredErrorFile(path, keep=create is None)
                 mode = "r+" if create is None else "w"
                 self._file = h5py.File(self._stream, mode, libver=LIBRARY_VERSIONS, rdcc_nbytes=CHUNK_CACHE_BYTES)
                 if create is not None:
@@ -151,7 +151,7 @@ class CaptureSink:
                 self._file.close()
         self._close_stream()
 
-    def _offset_of(self, chunk: PackedChunk, stream: ShieldedFile) -> int:
+    def _offset_of(self, chunk: PackedChunk, stream: DeferredErrorFile) -> int:
         """Return where in the file the chunk was written just now."""
         # HDF5 can tell, but goes through all chunks for it
         found = [position for position, length in stream.writes if length == len(chunk.content)]
@@ -172,7 +172,7 @@ class CaptureSink:
         if self._stream is not None:
             self._stream.close()
 
-    def _open_stream(self) -> ShieldedFile:
+    def _open_stream(self) -> DeferredErrorFile:
         if self._stream is None:
             raise ValueError(f"{self.target}: is not open")
         return self._stream

@@ -16,7 +16,7 @@ from nlosrender.capture.bounces import BounceAxis
 from nlosrender.capture.relative_error import relative_l2_error
 
 MANTISSA_BITS = 53  # of float64
-CONTRAST_BITS = 32  # that a unit's contrasts are rounded to
+CONTRAST_BITS = 32  # that a work item's contrasts are rounded to
 STATED_DIGITS = 4  # of errors that rest on them: more would depend on how the work is cut
 HALF = 26  # bits of the lower half of a mantissa: sums of 2^36 halves stay within 64-bit integers
 
@@ -29,7 +29,7 @@ class Sums:
     slot_squares: tuple[Fraction, ...] = ()  # sum of squared estimates per bounce slot
     outside: Fraction = Fraction(0)  # H outside the time window [J m^-2 sr^-1]
     energy: tuple[Fraction, ...] = ()  # H per bounce slot [J m^-2 sr^-1]
-    samples: int | None = None  # paths per sensor point, the least of all units
+    samples: int | None = None  # paths per sensor point, the least of all work items
     seconds: float = 0.0  # spent rendering
     contrasts: tuple[tuple[Fraction, ...], ...] = ()  # of the energy per bounce slot [J m^-2 sr^-1]
 

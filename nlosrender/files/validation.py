@@ -18,11 +18,11 @@ from nlosrender.errors import FileError
 from nlosrender.files import layout
 from nlosrender.files.attributes import get_attributes
 from nlosrender.files.energy_check import wrong_energies
-from nlosrender.files.reader import StoredCapture, explained_read, open_hdf5
-from nlosrender.files.scan import read_scan
-from nlosrender.files.stored_axes import BY_RANK, stored_axes
-from nlosrender.files.stored_header import samples_of
-from nlosrender.files.stored_points import dataset_in, small_numbers, stored_points
+from nlosrender.files.reading.reader import StoredCapture, explained_read, open_hdf5
+from nlosrender.files.reading.scan import read_scan
+from nlosrender.files.reading.stored_axes import BY_RANK, stored_axes
+from nlosrender.files.reading.stored_header import samples_of
+from nlosrender.files.reading.stored_points import dataset_in, small_numbers, stored_points
 
 CLASSES = {layout.FLOAT: h5py.h5t.FLOAT, layout.INTEGER: h5py.h5t.INTEGER}
 WORDS = {h5py.h5t.FLOAT: "floating point", h5py.h5t.INTEGER: "integer"}

@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nlosrender.files import layout
-from nlosrender.files.capture_file import CaptureHeader
-from nlosrender.files.kinds import CAPTURE, NOTHING
-from nlosrender.files.pieces import TILE_AXES, Cutter
-from nlosrender.files.replacement import check_writable, explained_write, new_partial, publish
+from nlosrender.files.atomic_write import check_writable, explained_write, new_partial, publish
+from nlosrender.files.capture_header import CaptureHeader
+from nlosrender.files.chunking import TILE_AXES, Chunker
+from nlosrender.files.file_kinds import CAPTURE, NOTHING
 from nlosrender.files.sink import CaptureSink, new_capture
 from nlosrender.interruption import uninterrupted
 
@@ -66,7 +66,7 @@ class CaptureWriter:
         self._compression = compression
         self._store_variance = store_variance
         self._overwrite = overwrite
-        self._cutter = Cutter(header, compression)
+        self._chunker = Chunker(header, compression)
         self._sink: CaptureSink | None = None
         self._written: set[tuple[str, tuple[int, ...]]] = set()  # chunks that exist, by dataset
 
@@ -162,13 +162,13 @@ class CaptureWriter:
     ) -> None:
         sink = self._open_sink()
         confocal = self.header.confocal
-        for piece in self._cutter.pieces(name, block, laser_at, sensor_at):
+        for piece in self._chunker.pieces(name, block, laser_at, sensor_at):
             # a chunk that exists may hold light of an earlier write, which zeros must replace
             if not piece.samples.any() and (name, piece.chunk) not in self._written:
                 continue
             self._written.add((name, piece.chunk))
             if piece.fills:
-                sink.put(self._cutter.pack(name, piece))
+                sink.put(self._chunker.pack(name, piece))
             else:
                 selection = layout.in_file_order(piece.where, confocal)
                 sink.fill(name, selection, layout.to_file_order(piece.samples, TILE_AXES, confocal))

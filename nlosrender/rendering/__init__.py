@@ -1,1 +1,1 @@
-"""The work itself: unit after unit from the engine into the file."""
+"""The work itself: work item after work item from the engine into the file."""

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from nlosrender.errors import BackendError
-from nlosrender.rendering.sharing import Sharing
+from nlosrender.rendering.process_layout import ProcessLayout
 
 if TYPE_CHECKING:
     from distributed import Client, LocalCluster
@@ -29,7 +29,7 @@ class Cluster:
     """A connection to a dask scheduler with workers, made when it is first used."""
 
     connect: Callable[[], Client]  # the same one at every call
-    sharing: Sharing
+    sharing: ProcessLayout
     threads: int | None  # of Dr.Jit in each worker; None: as many as dask gave that worker
 
     @property
@@ -48,7 +48,7 @@ class Cluster:
 def joined_cluster(scheduler: str | None = None, workers: int | None = None) -> Iterator[Cluster]:
     """Connect to a scheduler, or start one and workers on this machine; they end with the block.
 
-    On this machine they start when the first unit is sent, after everything about the capture is known to be right.
+    On this machine they start when the first work item is sent: the capture has been checked by then.
 
     Parameters
     ----------
@@ -70,7 +70,7 @@ def joined_cluster(scheduler: str | None = None, workers: int | None = None) -> 
     _silence_tracebacks()
     if scheduler is not None:
         with _connected(scheduler) as client:
-            yield Cluster(lambda: client, Sharing(workers=_awaited(client, scheduler, workers)), threads=None)
+            yield Cluster(lambda: client, ProcessLayout(workers=_awaited(client, scheduler, workers)), threads=None)
         return
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     count = workers or cores
@@ -87,7 +87,7 @@ def joined_cluster(scheduler: str | None = None, workers: int | None = None) -> 
             return client
 
         # the process that writes takes a share of the memory, too
-        yield Cluster(connect, Sharing(workers=count, memory_shares=count + 1), threads=max(1, cores // count))
+        yield Cluster(connect, ProcessLayout(workers=count, memory_shares=count + 1), threads=max(1, cores // count))
 
 
 def _silence_tracebacks() -> None:
@@ -136,14 +136,14 @@ def _awaited(client: Client, scheduler: str, wanted: int | None) -> int:
 
 
 def _local_workers(count: int) -> LocalCluster:
-    """Start processes that finish their unit when Ctrl-C reaches every process of the terminal."""
+    """Start processes that finish their work item when Ctrl-C reaches every process of the terminal."""
     from distributed import LocalCluster
 
     resource_tracker.ensure_running()  # a process of Python's own: starting it lets the signal through again
     # inherited by dask's thread, and by every worker that it ever starts, from the worker's first moment on
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
-        # memory_limit 0: units are planned to fit, and dask would kill workers for what is the machine's file cache
+        # memory_limit 0: work items are planned to fit, and dask would kill workers for the machine's file cache
         return LocalCluster(
             n_workers=count, threads_per_worker=1, processes=True, memory_limit=0, dashboard_address=None
         )

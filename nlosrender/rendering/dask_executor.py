@@ -1,6 +1,6 @@
-"""The units of a plan, rendered by the workers of a dask cluster and written by this process alone.
+"""The work items of a plan, rendered by the workers of a dask cluster and written by this process alone.
 
-dask hands out the units, and hands out again those of workers that die; here their number on the way is bounded.
+dask hands out the work items, and hands out again those of workers that die; here their number on the way is bounded.
 """
 
 from __future__ import annotations
@@ -16,27 +16,27 @@ from typing import TYPE_CHECKING
 
 from nlosrender.capture.plan import WorkItem
 from nlosrender.errors import BackendError, IncompleteRender, InterruptedRender, RenderError
-from nlosrender.files.partial_capture import PartialCapture
+from nlosrender.files.partial.partial_capture import PartialCapture
 from nlosrender.interruption import StopRequest
 from nlosrender.rendering.dask_cluster import Cluster
-from nlosrender.rendering.dask_worker import Job, PackedUnit, Refusal, render_remotely
-from nlosrender.rendering.local import kept, standing
-from nlosrender.rendering.report import Progress, Stopwatch, Warn, Watch
-from nlosrender.rendering.units import UnitWriter
+from nlosrender.rendering.dask_worker import Job, PackedItem, Refusal, render_remotely
+from nlosrender.rendering.local_executor import saved_suffix, standing
+from nlosrender.rendering.render_report import Progress, Stopwatch, Warn, Watch
+from nlosrender.rendering.work_items import ItemWriter
 
 if TYPE_CHECKING:
     from distributed import Future, as_completed
 
     from nlosrender.engine.path.engine import Budget
 
-STOP_SECONDS = 20.0  # that units in flight have after a signal: a batch system waits 30 s before it kills
-PER_WORKER = 2  # units on the way for each worker: the one it renders, and the next or the last
+STOP_SECONDS = 20.0  # that work items in flight have after a signal: a batch system waits 30 s before it kills
+PER_WORKER = 2  # work items on the way for each worker: the one it renders, and the next or the last
 LOOK_SECONDS = 0.02  # between two looks at what has come, and at the signals
 WORKER_LOOK_SECONDS = 5.0  # between two looks at whether there are workers at all
 
 
 def render_on_cluster(
-    units: Sequence[WorkItem],
+    items: Sequence[WorkItem],
     job: Job,
     budget: Budget,
     partial: PartialCapture,
@@ -49,18 +49,18 @@ def render_on_cluster(
     warn: Warn,
     watch: Watch,
 ) -> None:
-    """Render units on a cluster and store each as it comes.
+    """Render work items on a cluster and store each as it comes.
 
     Parameters
     ----------
-    units, job
+    items, job
         What is left to do, of which capture.
     budget
-        When to stop, settled; ``time_limit_s`` is dealt out to the units as if all workers were always busy.
+        When to stop, settled; ``time_limit_s`` is dealt out to the work items as if all workers were always busy.
     partial
         Where they go; open.
     stop
-        When it comes no more units are begun; those that are being rendered have ``STOP_SECONDS``.
+        When it comes no more work items are begun; those that are being rendered have ``STOP_SECONDS``.
     cluster
         Who renders.
     store_variance
@@ -72,22 +72,22 @@ def render_on_cluster(
     Raises
     ------
     InterruptedRender
-        A stop was requested before the last unit.
+        A stop was requested before the last work item.
     IncompleteRender
-        The scheduler is gone, or a unit took several workers down with it; RenderError where no unit is finished.
+        The scheduler is gone, or a work item took several workers down with it; RenderError where none is finished.
     BackendError, RenderError, FileError
-        A worker cannot render, a unit cannot be rendered or stored.
+        A worker cannot render, a work item cannot be rendered or stored.
     """
     workers = cluster.sharing.workers
-    if len(units) < workers:
-        warn(f"--workers: the capture is cut into {len(units)} units, so that some of {workers} workers have no work.")
-    if budget.time_limit_s is not None and units:
+    if len(items) < workers:
+        warn(f"--workers: the capture is cut into {len(items)} units, so that some of {workers} workers have no work.")
+    if budget.time_limit_s is not None and items:
         left = max(0.0, budget.time_limit_s - partial.tally.sums.seconds / workers)
-        budget = replace(budget, time_limit_s=left * workers / len(units))
-    total = len(partial.tally.units) + len(units)
-    flight = _Flight(units, job, budget, store_variance, cluster)
-    writer = UnitWriter(partial, stopwatch)
-    done = len(partial.tally.units)
+        budget = replace(budget, time_limit_s=left * workers / len(items))
+    total = len(partial.tally.items) + len(items)
+    flight = _Flight(items, job, budget, store_variance, cluster)
+    writer = ItemWriter(partial, stopwatch)
+    done = len(partial.tally.items)
     so_far = partial.tally.sums
     watch(standing(so_far, done, total))
     try:
@@ -101,29 +101,29 @@ def render_on_cluster(
         writer.wait()
     except (BackendError, IncompleteRender) as error:
         writer.wait()
-        begins_anew = isinstance(error, IncompleteRender) and not partial.tally.units
+        begins_anew = isinstance(error, IncompleteRender) and not partial.tally.items
         kind = RenderError if begins_anew else type(error)
-        raise kind(f"{partial.path}: {error} The render stopped{kept(partial, total)}") from error
+        raise kind(f"{partial.path}: {error} The render stopped{saved_suffix(partial, total)}") from error
     finally:
         writer.close()
         flight.cancel()
     if done < total:
-        raise InterruptedRender(f"{partial.path}: stopped by {stop.signal_name}{kept(partial, total)}")
+        raise InterruptedRender(f"{partial.path}: stopped by {stop.signal_name}{saved_suffix(partial, total)}")
 
 
 class _Flight:
-    """The units on their way to the workers and back: never more than ``PER_WORKER`` for each."""
+    """The work items on their way to the workers and back: never more than ``PER_WORKER`` for each."""
 
-    def __init__(self, units: Sequence[WorkItem], job: Job, budget: Budget, store_variance: bool, cluster: Cluster):
-        self._left, self._client = iter(units), cluster.client
+    def __init__(self, items: Sequence[WorkItem], job: Job, budget: Budget, store_variance: bool, cluster: Cluster):
+        self._left, self._client = iter(items), cluster.client
         self._arguments = (asdict(budget), store_variance, cluster.threads)
         self._job = job
         self._out: dict[Future, None] = {}  # the oldest first: the order in which they are begun
         self._recalled = False
         self._given_up_at = math.inf  # s of the monotonic clock, after a stop
 
-    def arrivals(self, stop: StopRequest, warn: Warn) -> Iterator[PackedUnit]:
-        """Yield units as they come; after a stop only those that were begun."""
+    def arrivals(self, stop: StopRequest, warn: Warn) -> Iterator[PackedItem]:
+        """Yield work items as they come; after a stop only those that were begun."""
         from distributed import as_completed
 
         flying = as_completed([])
@@ -166,14 +166,14 @@ class _Flight:
 
     def _top_up(self, flying: as_completed) -> None:
         bound = PER_WORKER * max(1, len(self._client.scheduler_info()["workers"]))
-        for unit in islice(self._left, max(0, bound - len(self._out))):
-            # not pure: dask would take units of equal arguments for one
-            future = self._client.submit(render_remotely, self._job, unit, *self._arguments, pure=False)
+        for item in islice(self._left, max(0, bound - len(self._out))):
+            # not pure: dask would take work items of equal arguments for one
+            future = self._client.submit(render_remotely, self._job, item, *self._arguments, pure=False)
             self._out[future] = None
             flying.add(future)
 
     def _recall(self) -> None:
-        """Take back the units that wait behind those that are being rendered."""
+        """Take back the work items that wait behind those that are being rendered."""
         self._recalled = True
         running = max(1, len(self._client.scheduler_info()["workers"]))
         waiting = [future for future in list(self._out)[running:] if not future.done()]
@@ -181,11 +181,11 @@ class _Flight:
         for future in waiting:
             del self._out[future]
 
-    def _arrived(self, future: Future) -> PackedUnit:
+    def _arrived(self, future: Future) -> PackedItem:
         from distributed import KilledWorker
 
         try:
-            result: PackedUnit | Refusal = future.result()
+            result: PackedItem | Refusal = future.result()
         except KilledWorker as error:
             raise IncompleteRender(
                 "a unit has ended every worker process it was given to. Lower render.memory_limit if they ran out "

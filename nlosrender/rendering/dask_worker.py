@@ -1,4 +1,4 @@
-"""What a worker process does: set up a capture once, then render and pack unit after unit.
+"""What a worker process does: set up a capture once, then render and pack work item after work item.
 
 Nothing that is sent here may import Dr.Jit by being unpickled: the backend has to choose LLVM before that.
 """
@@ -18,16 +18,16 @@ from nlosrender.config.document import Config
 from nlosrender.config.load import config_to_dict
 from nlosrender.engine.backend.start import Backend, BackendName, limit_threads, start_backend
 from nlosrender.errors import BackendError, ConfigError, NlosError, Problem
+from nlosrender.files.chunking import Chunker, PackedChunk
 from nlosrender.files.identity import capture_identity, differences
-from nlosrender.files.pieces import Cutter, PackedChunk
 from nlosrender.files.sums import Sums
-from nlosrender.rendering.local import rendered
-from nlosrender.rendering.report import Stopwatch
+from nlosrender.rendering.local_executor import render_timed
+from nlosrender.rendering.process_layout import ProcessLayout
+from nlosrender.rendering.render_report import Stopwatch
 from nlosrender.rendering.set_up import set_up_engine
-from nlosrender.rendering.sharing import Sharing
 
 if TYPE_CHECKING:
-    from nlosrender.rendering.units import Engine
+    from nlosrender.rendering.work_items import Engine
 
 
 @dataclass(frozen=True)
@@ -38,19 +38,19 @@ class Job:
     selection: Selection
     identity: Mapping[str, Any]  # what the worker's own view of the capture has to agree with
     backend: BackendName
-    sharing: Sharing
+    sharing: ProcessLayout
 
 
 @dataclass(frozen=True, eq=False)
-class PackedUnit:
-    """A unit as it travels: chunks ready to be written."""
+class PackedItem:
+    """A work item as it travels: chunks ready to be written."""
 
-    unit: WorkItem
+    item: WorkItem
     packed: tuple[PackedChunk, ...]
     sums: Sums
     seconds: dict[str, float]  # per stage, spent on it in the worker
 
-    def chunks(self, cutter: Cutter) -> tuple[PackedChunk, ...]:
+    def chunks(self, chunker: Chunker) -> tuple[PackedChunk, ...]:
         """Return its chunks, packed by the worker."""
         return self.packed
 
@@ -68,39 +68,39 @@ class Refusal:
 
 
 @dataclass
-class _Desk:
-    """The one capture that this process is set up for; a unit is rendered at a time, the one before is packed."""
+class _WorkerState:
+    """The one capture that this process is set up for; a work item is rendered at a time, the one before is packed."""
 
     lock: threading.Lock = field(default_factory=threading.Lock)
     key: str = ""
     engine: Engine | None = None
-    cutter: Cutter | None = None
+    chunker: Chunker | None = None
 
-    def prepared(self, job: Job) -> tuple[Engine, Cutter]:
+    def prepared(self, job: Job) -> tuple[Engine, Chunker]:
         """Return what renders and what cuts; the backend is started."""
         # in every thread: Mitsuba's variant belongs to the thread
         backend = start_backend(job.backend, colored=job.config.is_colored, polarized=job.config.render.polarized)
         key = tree_hash(dict(job.identity))
-        if key != self.key or self.engine is None or self.cutter is None:
-            self.key, self.engine, self.cutter = "", None, None  # only one fits the memory
+        if key != self.key or self.engine is None or self.chunker is None:
+            self.key, self.engine, self.chunker = "", None, None  # only one fits the memory
             _refuse_other_capture(job, backend)
             _, self.engine, header = set_up_engine(job.config, backend, job.selection, job.sharing)
-            self.cutter = Cutter(header, job.config.output.compression)
+            self.chunker = Chunker(header, job.config.output.compression)
             self.key = key
-        return self.engine, self.cutter
+        return self.engine, self.chunker
 
 
-_DESK = _Desk()
+_WORKER = _WorkerState()
 
 
 def render_remotely(
-    job: Job, unit: WorkItem, budget: Mapping[str, Any], store_variance: bool, threads: int | None
-) -> PackedUnit | Refusal:
-    """Render a unit in a worker process.
+    job: Job, item: WorkItem, budget: Mapping[str, Any], store_variance: bool, threads: int | None
+) -> PackedItem | Refusal:
+    """Render a work item in a worker process.
 
     Parameters
     ----------
-    job, unit
+    job, item
         What to render.
     budget
         The fields of a settled ``Budget``: the class itself would import Dr.Jit.
@@ -111,21 +111,21 @@ def render_remotely(
     """
     stopwatch = Stopwatch()
     try:
-        with _DESK.lock:
+        with _WORKER.lock:
             with stopwatch.stage("scene"):
-                engine, cutter = _DESK.prepared(job)
+                engine, chunker = _WORKER.prepared(job)
                 limit_threads(threads or _threads_of_worker())
             from nlosrender.engine.path.engine import Budget
 
-            finished = rendered(engine, unit, Budget(**budget), store_variance, stopwatch)
+            finished = render_timed(engine, item, Budget(**budget), store_variance, stopwatch)
         begun = time.perf_counter()
-        packed = tuple(finished.chunks(cutter))
+        packed = tuple(finished.chunks(chunker))
         stopwatch.seconds["compress"] += time.perf_counter() - begun
     except ConfigError as error:
         return Refusal(ConfigError, error.problems)
     except NlosError as error:
         return Refusal(type(error), f"{error} (on worker {_worker_name()})")
-    return PackedUnit(unit, packed, finished.sums, stopwatch.seconds)
+    return PackedItem(item, packed, finished.sums, stopwatch.seconds)
 
 
 def _refuse_other_capture(job: Job, backend: Backend) -> None:

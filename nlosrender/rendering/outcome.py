@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING
 from nlosrender.capture.bounces import BounceAxis
 from nlosrender.config.render import RenderConfig
 from nlosrender.errors import ConfigError, Problem
-from nlosrender.files.part_attributes import MISSED, known_of, summed_attributes
+from nlosrender.files.parts.part_attributes import MISSED, known_of, summed_attributes
 
 if TYPE_CHECKING:
     from nlosrender.engine.preflight.unsampled_paths import UnsampledPaths
     from nlosrender.files.sums import Sums
-    from nlosrender.rendering.units import Engine
+    from nlosrender.rendering.work_items import Engine
 
 MISSED_BY = 1.25  # times the target: the estimate has an error of its own
 
@@ -31,7 +31,7 @@ class Outcome:
 
     @classmethod
     def of(cls, render: RenderConfig, engine: Engine, unsampled: tuple[UnsampledPaths, ...], sums: Sums) -> Outcome:
-        """Return the outcome of a render whose units are ``sums`` together."""
+        """Return the outcome of a render whose work items are ``sums`` together."""
         from nlosrender.engine.preflight.zero_capture import zero_reasons
 
         zero = () if sums.squares else zero_reasons(engine, unsampled, float(sums.outside))

@@ -11,16 +11,21 @@ from nlosrender.capture.arrivals import filled_shares
 from nlosrender.capture.plan import Plan
 from nlosrender.config.document import Config
 from nlosrender.engine.backend.start import Backend
-from nlosrender.files.capture_file import CaptureHeader
-from nlosrender.files.size import FileSize, disk_warnings, forecast_size
-from nlosrender.rendering.sharing import ALONE, Sharing
+from nlosrender.files.capture_header import CaptureHeader
+from nlosrender.files.size_estimate import FileSize, disk_warnings, forecast_size
+from nlosrender.rendering.process_layout import ONE_PROCESS, ProcessLayout
 
 if TYPE_CHECKING:
-    from nlosrender.rendering.units import Engine
+    from nlosrender.rendering.work_items import Engine
 
 
 def render_warnings(
-    config: Config, backend: Backend, plan: Plan, engine: Engine, header: CaptureHeader, sharing: Sharing = ALONE
+    config: Config,
+    backend: Backend,
+    plan: Plan,
+    engine: Engine,
+    header: CaptureHeader,
+    sharing: ProcessLayout = ONE_PROCESS,
 ) -> Iterator[str]:
     """Yield the warnings about scene, memory and disk; ``config_warnings`` has those that need the configuration only.
 

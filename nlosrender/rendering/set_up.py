@@ -16,16 +16,16 @@ from nlosrender.capture.plan import Plan, plan_capture
 from nlosrender.capture.time_axis import TimeAxis, resolve_time_axis
 from nlosrender.config.document import Config
 from nlosrender.engine.backend.start import Backend, batch_memory, physical_memory, start_backend
-from nlosrender.files.capture_file import CaptureHeader
+from nlosrender.files.capture_header import CaptureHeader
 from nlosrender.files.chunks import sensor_tile
-from nlosrender.rendering.sharing import ALONE, Sharing
+from nlosrender.rendering.process_layout import ONE_PROCESS, ProcessLayout
 from nlosrender.scene.hidden_geometry import Surface, hidden_surfaces
 from nlosrender.scene.placing import placed
 from nlosrender.scene.relay_wall import RelayWall, relay_wall_from_config
 
 if TYPE_CHECKING:
     from nlosrender.engine.path.engine import Budget
-    from nlosrender.rendering.units import Engine
+    from nlosrender.rendering.work_items import Engine
     from nlosrender.scene.build import BuiltScene
     from nlosrender.scene.view import BuiltView
 
@@ -43,7 +43,7 @@ def started_backend(config: Config) -> Backend:
 
 
 def set_up_engine(
-    config: Config, backend: Backend, selection: Selection = WHOLE, sharing: Sharing = ALONE
+    config: Config, backend: Backend, selection: Selection = WHOLE, sharing: ProcessLayout = ONE_PROCESS
 ) -> tuple[Plan, Engine, CaptureHeader]:
     """Stages 2 to 4 up to the first ray: scene, capture, plan, engine, and what the file will say of them."""
     from nlosrender.engine.preflight.omitted_work import shared_samples
@@ -56,7 +56,7 @@ def set_up_engine(
 
 
 def calibrated_budget(config: Config, engine: Engine) -> Budget:
-    """Return when to stop, settled for the whole capture at once: no unit's result depends on how the work is cut."""
+    """Return when to stop, settled for the whole capture at once: no result depends on how the work is cut."""
     from nlosrender.engine.path.engine import Budget
 
     return engine.calibrate(Budget(config.render.spp, config.render.target_error, config.render.time_limit_s))
@@ -120,10 +120,10 @@ def prepare(
     capture: Capture,
     time_axis: TimeAxis,
     selection: Selection = WHOLE,
-    sharing: Sharing = ALONE,
+    sharing: ProcessLayout = ONE_PROCESS,
     replicas: int | None = None,
 ) -> tuple[Plan, Engine]:
-    """Stages 3 and 4: cut the work into units and set up the engine; ``replicas`` other than the plan's on request."""
+    """Stages 3 and 4: cut the work into items and set up the engine; ``replicas`` other than the plan's on request."""
     from nlosrender.engine.path.engine import RenderOptions
     from nlosrender.engine.planner import choose_engine
 

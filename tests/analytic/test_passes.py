@@ -1,4 +1,4 @@
-"""A unit that is stopped between passes, and gone on from by another process, has the bits of an undisturbed one."""
+"""A work item that is stopped between passes, and resumed by another process, has the bits of an undisturbed one."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from nlosrender.capture.plan import Batch, WorkItem
 from nlosrender.capture.tile import Tile
 from nlosrender.engine.backend.start import start_backend
 from nlosrender.engine.launch.passes import Passes, SavedStages, Snapshot
-from nlosrender.files.unit_state import read_state, write_state
-from nlosrender.rendering.units import render_unit
+from nlosrender.files.partial.work_item_state import read_state, write_state
+from nlosrender.rendering.work_items import render_item
 
 PLATE = {"type": "rectangle", "width": 0.8, "height": 0.6, "center": [0.1, 0, 1.0], "normal": [0, 0, -1]}
 BEFORE = PLATE | {"width": 0.3, "height": 0.4, "center": [0.3, 0.1, 0.6], "normal": [0.2, 0.1, -1]}
@@ -62,7 +62,7 @@ def stopping(path: Path, tag: str) -> Callable[[Callable[[], SavedStages]], None
 
 
 def prepared(scene: dict[str, Any]) -> Callable[[Passes], Any]:
-    """Return what renders all of a capture as one unit, every time as a process that has just been started."""
+    """Return what renders all of a capture as one work item, every time as a process that has just been started."""
     config = configured(scene)
     backend = start_backend("llvm", colored=config.is_colored)
     from nlosrender.engine.path.engine import Budget
@@ -71,11 +71,11 @@ def prepared(scene: dict[str, Any]) -> Callable[[Passes], Any]:
         plan, engine, _ = pipeline.set_up_engine(config, backend)
         budget = pipeline.calibrated_budget(config, engine)
         assert isinstance(budget, Budget)
-        (unit,) = plan.work_items
+        (item,) = plan.work_items
         if scene is SCENES["two batches"]:
             upper, lower = Tile(0, 1, 0, 5), Tile(1, 3, 0, 5)
-            unit = WorkItem(unit.sensors, unit.lasers, (Batch(upper, unit.lasers), Batch(lower, unit.lasers)))
-        return render_unit(engine, unit, budget, passes)
+            item = WorkItem(item.sensors, item.lasers, (Batch(upper, item.lasers), Batch(lower, item.lasers)))
+        return render_item(engine, item, budget, passes)
 
     return render
 

@@ -19,8 +19,8 @@ from nlosrender.analysis.reconstruction.reconstruct import (
 from nlosrender.analysis.reconstruction.spectrum import path_lengths, spectra, unambiguous_period
 from nlosrender.analysis.reconstruction.voxel_grid import voxel_grid
 from nlosrender.errors import FileError
-from nlosrender.files import scan
-from nlosrender.files.reader import open_capture
+from nlosrender.files.reading import scan
+from nlosrender.files.reading.reader import open_capture
 
 POINT = (0.13, -0.08, 0.82)  # m; on no voxel's centre
 WAVELENGTH = 0.12

@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 
 from nlosrender.cli.app import app
 from nlosrender.errors import EXIT_BAD_INPUT, EXIT_COMPARISON_EXCEEDED, EXIT_OK, EXIT_USAGE
-from nlosrender.files.capture_file import CaptureHeader
+from nlosrender.files.capture_header import CaptureHeader
 from nlosrender.files.writer import CaptureWriter
 from nlosrender.scene.pose import Pose
 

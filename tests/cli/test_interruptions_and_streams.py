@@ -20,7 +20,7 @@ from nlosrender.capture.part import Selection
 from nlosrender.cli.progress import progress_bar
 from nlosrender.engine.backend import start as backend
 from nlosrender.errors import EXIT_BAD_INPUT, EXIT_FAILURE, EXIT_INTERRUPTED, EXIT_OK, FileError
-from nlosrender.files.exports import export_capture
+from nlosrender.files.export.export import export_capture
 from nlosrender.files.filled_folder import filled_folder
 
 PNG_START = b"\x89PNG\r\n\x1a\n"
@@ -148,7 +148,7 @@ STOPPED = {  # commands, and a function each that is called while their output i
     ("frames", "view.hdf5"): "analysis.frames.save_exr",
     ("frames", "view.hdf5", "-o", "view.gif"): "files.replacement.publish",
     ("plot", "wall.hdf5"): "files.replacement.publish",
-    ("export", "wall.hdf5", "--format", "tal"): "files.exports_tal._write_enum",
+    ("export", "wall.hdf5", "--format", "tal"): "files.export.tal_format._write_enum",
     ("export", "wall.hdf5", "--format", "fk"): "files.replacement.publish",
     ("reconstruct", "wall.hdf5", "--voxels", "8"): "analysis.reconstruction.volume_file.set_attributes",
     ("merge", "part1.hdf5", "part2.hdf5", "-o", "merged.hdf5"): "files.merge._copy",

@@ -16,7 +16,7 @@ from support.commands import run
 from nlosrender.cli import progress, progress_log
 from nlosrender.cli.progress_log import LEAST_SECONDS, MOST_SECONDS, ProgressLog
 from nlosrender.readable import readable_duration
-from nlosrender.rendering.report import Standing
+from nlosrender.rendering.render_report import Standing
 
 SCENE = """\
 name: plate

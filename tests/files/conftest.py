@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from nlosrender.files.capture_file import CaptureHeader
+from nlosrender.files.capture_header import CaptureHeader
 from nlosrender.files.writer import CaptureWriter
 from nlosrender.scene.pose import Pose
 

@@ -16,9 +16,9 @@ from nlosrender.analysis.comparison.captures import Tolerances, compare_captures
 from nlosrender.analysis.reconstruction.reconstruct import ReconstructionSettings, reconstruct_capture
 from nlosrender.cli.app import app
 from nlosrender.errors import FileError
-from nlosrender.files.exports import export_capture
-from nlosrender.files.reader import open_capture, read_header
-from nlosrender.files.scan import chosen_bounces, read_scan
+from nlosrender.files.export.export import export_capture
+from nlosrender.files.reading.reader import open_capture, read_header
+from nlosrender.files.reading.scan import chosen_bounces, read_scan
 
 POINT = (0.1, -0.2, 0.8)
 SENSORS = cells(5, 4, 1.0, 0.8)

@@ -19,7 +19,7 @@ from nlosrender.analysis.comparison.captures import Comparison, Tolerances, comp
 from nlosrender.analysis.comparison.dataset import check_dataset
 from nlosrender.analysis.comparison.report import comparison_report
 from nlosrender.errors import FileError
-from nlosrender.files.capture_file import CaptureHeader
+from nlosrender.files.capture_header import CaptureHeader
 from nlosrender.files.writer import CaptureWriter
 
 ROUNDING = 2e-7  # relative: two float32 roundings of 6e-8 in samples, squares summed in float64

@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 from support.partial_captures import CONFIG, Stopped, write_part
 
-from nlosrender.files.journal import Journal, read_records
-from nlosrender.files.partial_capture import PartialCapture
-from nlosrender.files.replacement import partial_folder
-from nlosrender.files.unit_log import UnfinishedRender
+from nlosrender.files.atomic_write import partial_folder
+from nlosrender.files.partial.journal import Journal, read_records
+from nlosrender.files.partial.partial_capture import PartialCapture
+from nlosrender.files.partial.work_item_log import JournalState
 from nlosrender.files.validation import validate_file
 
 UNITS = 3  # finished before the damage
@@ -99,7 +99,7 @@ def test_a_flipped_bit_in_a_chunk_costs_its_unit(
     """The unit is rendered again, the others are not, and it is said."""
     path = stopped("none", closed)
     folder = partial_folder(path)
-    state = UnfinishedRender.from_records(read_records(folder / "journal"))
+    state = JournalState.from_records(read_records(folder / "journal"))
     record = next(record for record in read_records(folder / "journal") if "unit" in record)
     _, _, offset, _, _ = record["chunks"][0]
     with (folder / "samples.0.hdf5").open("r+b") as samples:
@@ -109,7 +109,7 @@ def test_a_flipped_bit_in_a_chunk_costs_its_unit(
         samples.write(bytes([byte ^ 4]))
     with claimed(path) as partial:
         partial.open(header_of("single"), {}, "none", store_variance=True)
-        assert partial.tally.units == state.tally.units[1:]
+        assert partial.tally.items == state.tally.items[1:]
         (message,) = partial.damage
         assert "1 of 3 finished units are damaged on the disk and are rendered again" in message
     header = header_of("single")
@@ -138,7 +138,7 @@ def test_a_flipped_bit_outside_the_chunks_costs_nothing(stopped: Callable, heade
     samples.write_bytes(content)
     with claimed(path) as partial:
         partial.open(header_of("single"), {}, "gzip", store_variance=True)
-        assert len(partial.tally.units) == UNITS
+        assert len(partial.tally.items) == UNITS
         assert any("is damaged; it is built anew" in text for text in partial.damage)
 
 
@@ -149,10 +149,10 @@ def test_a_damaged_journal_is_said(stopped: Callable) -> None:
     lines = journal.read_bytes().splitlines(keepends=True)
     journal.write_bytes(lines[0] + lines[1] + lines[2][:-5])
     with claimed(path) as partial:
-        assert (len(partial.tally.units), partial.damage) == (1, [])
+        assert (len(partial.tally.items), partial.damage) == (1, [])
     journal.write_bytes(lines[0] + lines[1] + lines[2].replace(b"data", b"dada") + lines[3])
     with claimed(path) as partial:
-        assert len(partial.tally.units) == 1
+        assert len(partial.tally.items) == 1
         (message,) = partial.damage
         assert "the units it told of from there on are rendered again" in message
 
@@ -165,5 +165,5 @@ def test_records_of_something_else_are_no_traceback(stopped: Callable, record: o
     journal.append(record)  # type: ignore[arg-type]
     journal.close()
     with claimed(path) as partial:
-        assert partial.tally.units == []
+        assert partial.tally.items == []
         assert any("is damaged; everything is rendered again" in text for text in partial.damage)

@@ -19,7 +19,7 @@ from typer.testing import CliRunner
 from nlosrender.cli.app import app
 from nlosrender.constants import SPEED_OF_LIGHT
 from nlosrender.errors import FileError, OptionError
-from nlosrender.files.exports import FORMATS, export_capture
+from nlosrender.files.export.export import FORMATS, export_capture
 
 POINT = (0.1, -0.2, 0.8)
 SENSORS = cells(5, 4, 1.0, 0.8)  # equal spacings, as one format needs them
@@ -252,7 +252,7 @@ def test_version_73_files_are_matlabs_own(tmp_path: Path, name: str) -> None:
 FULL_DISK = """
 import resource, sys
 from nlosrender.errors import FileError
-from nlosrender.files.exports import export_capture
+from nlosrender.files.export.export import export_capture
 for source, name in zip(sys.argv[1::2], sys.argv[2::2]):
     # a limit on the size of files stands in for the full disk: the same error comes from the same call
     resource.setrlimit(resource.RLIMIT_FSIZE, (3000, resource.getrlimit(resource.RLIMIT_FSIZE)[1]))

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from nlosrender.files.journal import Journal, JournalInUseError
+from nlosrender.files.partial.journal import Journal, JournalInUseError
 
 RECORDS = [{"a": 1}, {"text": "line\nbreak é", "list": [1, 2.5, None]}, {"b": "x" * 300}]
 
@@ -70,7 +70,7 @@ def test_a_journal_is_open_once(tmp_path: Path) -> None:
 def test_a_killed_process_leaves_no_lock(tmp_path: Path) -> None:
     """The lock goes with the process that held it."""
     code = (
-        "import os, signal, sys; from pathlib import Path; from nlosrender.files.journal import Journal\n"
+        "import os, signal, sys; from pathlib import Path; from nlosrender.files.partial.journal import Journal\n"
         "j = Journal(Path(sys.argv[1])); j.append({'a': 1}); os.kill(os.getpid(), signal.SIGKILL)"
     )
     done = subprocess.run([sys.executable, "-c", code, str(tmp_path / "journal")], check=False)

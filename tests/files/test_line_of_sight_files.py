@@ -16,9 +16,9 @@ from nlosrender.analysis.plots import plot_capture
 from nlosrender.analysis.summary import summarise
 from nlosrender.capture.part import Selection
 from nlosrender.errors import FileError, OptionError
-from nlosrender.files.exports import export_capture
-from nlosrender.files.merge import merge_captures
-from nlosrender.files.reader import open_capture
+from nlosrender.files.export.export import export_capture
+from nlosrender.files.parts.merge import merge_captures
+from nlosrender.files.reading.reader import open_capture
 from nlosrender.files.validation import validate_file
 
 WALL = {"type": "rectangle", "width": 2, "height": 2, "center": [0, 0, 0], "normal": [0, 0, 1]}

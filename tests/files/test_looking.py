@@ -19,7 +19,7 @@ from nlosrender.analysis.reconstruction.reconstruct import ReconstructionSetting
 from nlosrender.analysis.summary import summarise
 from nlosrender.errors import FileError, OptionError
 from nlosrender.files.provenance import provenance_attributes
-from nlosrender.files.reader import open_capture
+from nlosrender.files.reading.reader import open_capture
 from nlosrender.files.writer import CaptureWriter
 
 

@@ -14,8 +14,8 @@ from support.partial_captures import CONFIG, part_of, write_part
 
 from nlosrender.capture.part import WHOLE, Part, Selection
 from nlosrender.errors import FileError, OptionError
-from nlosrender.files.merge import merge_captures
-from nlosrender.files.unit_log import CHECKSUM_RANGE, placed_checksum
+from nlosrender.files.partial.work_item_log import CHECKSUM_RANGE, placed_checksum
+from nlosrender.files.parts.merge import merge_captures
 from nlosrender.files.validation import validate_file
 
 

@@ -12,14 +12,14 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-from support.partial_captures import CONFIG, Stopped, part_of, units_of, write_part
+from support.partial_captures import CONFIG, Stopped, items_of, part_of, write_part
 
 from nlosrender.capture.part import WHOLE, Selection
 from nlosrender.errors import FileError
-from nlosrender.files.journal import read_records
-from nlosrender.files.partial_capture import PartialCapture
-from nlosrender.files.replacement import partial_folder
-from nlosrender.files.unit_log import UnfinishedRender
+from nlosrender.files.atomic_write import partial_folder
+from nlosrender.files.partial.journal import read_records
+from nlosrender.files.partial.partial_capture import PartialCapture
+from nlosrender.files.partial.work_item_log import JournalState
 from nlosrender.files.validation import validate_file
 
 
@@ -131,7 +131,7 @@ def test_killed_at_any_byte(
         assert len(list(copy.iterdir())) == 1
     assert finished == sorted(finished)  # nothing that was once finished is done again
     assert finished[0] == 0
-    assert finished[-1] == len(list(units_of(header, part_of(header, WHOLE))))
+    assert finished[-1] == len(list(items_of(header, part_of(header, WHOLE))))
 
 
 def test_an_open_file_is_not_trusted(tmp_path: Path, header_of: Callable, block_of: Callable) -> None:
@@ -142,10 +142,10 @@ def test_an_open_file_is_not_trusted(tmp_path: Path, header_of: Callable, block_
     for _ in range(2):
         with pytest.raises(Stopped):
             write_part(path, header, block_of(header), stop_after=1)
-        assert UnfinishedRender.from_records(read_records(journal)).closed
-    with PartialCapture.claim(path, UnfinishedRender.from_records(read_records(journal)).first["identity"]) as partial:
+        assert JournalState.from_records(read_records(journal)).closed
+    with PartialCapture.claim(path, JournalState.from_records(read_records(journal)).first["identity"]) as partial:
         partial.open(header, {}, "gzip", store_variance=True)
-        assert not UnfinishedRender.from_records(read_records(journal)).closed
+        assert not JournalState.from_records(read_records(journal)).closed
 
 
 def test_dark_chunks_take_no_space(tmp_path: Path, header_of: Callable, block_of: Callable) -> None:

@@ -14,7 +14,7 @@ import pytest
 from nlosrender.analysis.plots import plot_capture
 from nlosrender.analysis.summary import summarise
 from nlosrender.errors import FileError
-from nlosrender.files.reader import open_capture, read_header
+from nlosrender.files.reading.reader import open_capture, read_header
 from nlosrender.files.validation import validate_file
 
 

@@ -22,13 +22,13 @@ from nlosrender.bench.meshes import write_ply
 from nlosrender.bench.report import write_json
 from nlosrender.capture.part import Selection
 from nlosrender.errors import EXIT_FAILURE, DiskError, FileError
+from nlosrender.files.atomic_write import partial_folder, replacing
 from nlosrender.files.dataset_index import write_index
-from nlosrender.files.exports import export_capture
-from nlosrender.files.kinds import PLY
-from nlosrender.files.merge import merge_captures
-from nlosrender.files.partial_capture import PartialCapture
-from nlosrender.files.reader import open_capture, read_header
-from nlosrender.files.replacement import partial_folder, replacing
+from nlosrender.files.export.export import export_capture
+from nlosrender.files.file_kinds import PLY
+from nlosrender.files.partial.partial_capture import PartialCapture
+from nlosrender.files.parts.merge import merge_captures
+from nlosrender.files.reading.reader import open_capture, read_header
 from nlosrender.files.writer import CaptureWriter
 
 THESIS = "\\documentclass{thesis} ten years of work"

@@ -11,7 +11,7 @@ import h5py
 import numpy as np
 import pytest
 
-from nlosrender.files.shielded_file import ShieldedFile
+from nlosrender.files.deferred_error_file import DeferredErrorFile
 from nlosrender.files.writer import CaptureWriter
 from nlosrender.interruption import uninterrupted
 
@@ -33,7 +33,7 @@ def test_a_full_disk_goes_unnoticed_until_asked(tmp_path: Path, monkeypatch: pyt
     """However early the disk fills, HDF5 reads back all it wrote, and the error is kept."""
     monkeypatch.setattr(os, "pwrite", failing_after(limit))
     values = np.random.default_rng(0).random((9, 14, 11))
-    stream = ShieldedFile(tmp_path / "a")
+    stream = DeferredErrorFile(tmp_path / "a")
     with h5py.File(stream, "w", rdcc_nbytes=0) as file:  # without a cache chunks are written and read back at once
         data = file.create_dataset("x", values.shape, "f4", chunks=(4, 5, 3))
         for index in range(0, 9, 2):
@@ -50,7 +50,7 @@ def test_a_full_disk_goes_unnoticed_until_asked(tmp_path: Path, monkeypatch: pyt
 def test_partial_writes_are_continued(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A system that takes 1000 bytes at a time still gets all of them."""
     monkeypatch.setattr(os, "pwrite", failing_after(10**9))
-    stream = ShieldedFile(tmp_path / "a")
+    stream = DeferredErrorFile(tmp_path / "a")
     with h5py.File(stream, "w") as file:
         file["x"] = np.arange(5000)
     stream.raise_error()

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from nlosrender.errors import FileError, RenderError
-from nlosrender.files.kinds import CAPTURE
+from nlosrender.files.file_kinds import CAPTURE
 from nlosrender.files.provenance import provenance_attributes
 from nlosrender.files.writer import CaptureWriter, check_writable
 from nlosrender.scene.pose import Pose

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from support.point_captures import cells, point_light, points_header, write_points
 
-from nlosrender.files.exports import export_capture
+from nlosrender.files.export.export import export_capture
 
 PEER = Path(__file__).parents[2] / ".venv-peers" / "bin" / "python"
 READ = """

@@ -25,7 +25,7 @@ from patch_captures import (
     render_patch,
 )
 
-from nlosrender.files.reader import open_capture
+from nlosrender.files.reading.reader import open_capture
 
 PEER = Path(__file__).parents[2] / ".venv-peers" / "bin" / "python"
 READ = Path(__file__).with_name("read_with_y_tal.py")

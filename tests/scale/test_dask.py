@@ -122,7 +122,7 @@ def test_a_killed_worker_costs_nothing(folder: Path) -> None:
     ids=["virtual_lights", "confocal", "target_error"],
 )
 def test_every_engine_and_scan_type(folder: Path, settings: tuple[str, ...]) -> None:
-    """Where a unit is rendered, and how the capture is cut for it, changes no bit."""
+    """Where a work item is rendered, and how the capture is cut for it, changes no bit."""
     options = [part for setting in settings for part in ("--set", setting)]
     report_of(started(folder, *options, "-o", "whole.hdf5", "--json"))
     assert report_of(started(folder, *options, *DASK, "--json"))["units"] > 1
@@ -150,7 +150,9 @@ def test_a_unit_that_ends_its_workers_stops_the_render(folder: Path, monkeypatch
     """Exit code 5 and what to do; what was finished is saved, and the same command goes on."""
     report_of(started(folder, "-o", "whole.hdf5", "--json"))
     with monkeypatch.context() as patched:
-        patched.setenv("DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES", "0")  # deaths that are a unit's own bad luck
+        patched.setenv(
+            "DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES", "0"
+        )  # deaths that are a work item's own bad luck
         process = started(folder, *DASK)
         assert wait_for_units(folder, process, 2) >= 2
         local_workers(process)[0].kill()
@@ -170,7 +172,7 @@ def test_a_first_unit_that_ends_its_workers_leaves_nothing(folder: Path, monkeyp
     while len(local_workers(process)) < 2:
         assert process.poll() is None, process.communicate()
         time.sleep(0.01)
-    time.sleep(5)  # they have started, and the first units are on their way
+    time.sleep(5)  # they have started, and the first work items are on their way
     local_workers(process)[0].kill()
     code, errors = ended(process)
     assert code == 1, errors
@@ -214,7 +216,7 @@ def dask_processes(folder: Path, workers: int) -> Iterator[list[subprocess.Popen
 @pytest.mark.slow
 @pytest.mark.parametrize("by", ["file", "address"])
 def test_a_scheduler_that_runs_elsewhere(folder: Path, by: str) -> None:
-    """Workers of a cluster, one of which dies and is not replaced: the other one renders its units."""
+    """Workers of a cluster, one of which dies and is not replaced: the other one renders its work items."""
     report_of(started(folder, "-o", "whole.hdf5", "--json"))
     with dask_processes(folder, workers=2) as (_, victim, _):
         file = folder / "scheduler.json"

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 from support.render_processes import INTERRUPTED, N_UNITS, PARTIAL, ended, report_of, start_render, wait_for_units
 
-from nlosrender.files.partial_capture import PartialCapture
+from nlosrender.files.partial.partial_capture import PartialCapture
 
 
 @pytest.fixture(scope="module")

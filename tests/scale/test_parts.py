@@ -13,10 +13,10 @@ from support.rendering import configured, flat_wall
 
 from nlosrender.capture.part import WHOLE, Selection
 from nlosrender.errors import FileError, InterruptedRender, RenderError
-from nlosrender.files.merge import merge_captures
+from nlosrender.files.parts.merge import merge_captures
 from nlosrender.files.validation import validate_file
 from nlosrender.pipeline import render_capture
-from nlosrender.rendering.report import RenderReport
+from nlosrender.rendering.render_report import RenderReport
 
 PLATE = {"type": "rectangle", "width": 0.5, "height": 0.4, "center": [0.1, 0, 0.9], "normal": [0, 0, -1]}
 BALL = {"type": "sphere", "center": [0.5, 0.2, 1.1], "radius": 0.2}

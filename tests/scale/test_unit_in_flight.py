@@ -15,9 +15,9 @@ from support.rendering import configured, flat_wall
 from nlosrender.config.document import Config
 from nlosrender.engine.backend.start import start_backend
 from nlosrender.errors import FileError, IncompleteRender, InterruptedRender
-from nlosrender.files.partial_capture import PartialCapture
+from nlosrender.files.partial.partial_capture import PartialCapture
 from nlosrender.pipeline import render_capture
-from nlosrender.rendering import unit_in_flight
+from nlosrender.rendering import item_in_flight
 
 PLATE = {"type": "rectangle", "width": 0.8, "height": 0.6, "center": [0.1, 0, 1.0], "normal": [0, 0, -1]}
 
@@ -29,7 +29,7 @@ def config(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Config:
     from nlosrender.engine.launch import sample_schedule as sampling
 
     monkeypatch.setattr(sampling, "PASS_SECONDS", math.inf)  # launches of 1, 4, 20, ... paths a lane
-    monkeypatch.setattr(unit_in_flight, "SOON_SECONDS", 0.0)
+    monkeypatch.setattr(item_in_flight, "SOON_SECONDS", 0.0)
     scene = flat_wall(PLATE, max_bounces=4, spp=60_000)
     return configured(scene | {"output": {"path": str(tmp_path / "a.hdf5")}})
 
@@ -87,7 +87,7 @@ def test_a_signal_ends_a_long_unit_and_the_same_command_goes_on(config: Config) 
 def test_a_kill_costs_what_was_done_since_the_last_state(config: Config, monkeypatch: pytest.MonkeyPatch) -> None:
     """States are kept now and then; the last one is what a later render goes on from."""
     undisturbed = whole(config)
-    monkeypatch.setattr(unit_in_flight, "KEEP_SECONDS", 0.0)
+    monkeypatch.setattr(item_in_flight, "KEEP_SECONDS", 0.0)
     with pytest.raises(Killed):
         render_capture(config, at(0.1, Killed()))
     assert len(states(config)) == 1

@@ -16,7 +16,7 @@ from support.rendering import flat_wall
 
 from nlosrender.analysis.summary import summarise
 from nlosrender.errors import FileError
-from nlosrender.files.reader import open_capture, read_header
+from nlosrender.files.reading.reader import open_capture, read_header
 from nlosrender.files.validation import validate_file
 
 SHAPE = (1, 4, 6, 3, 5)  # of a confocal capture

@@ -1,4 +1,4 @@
-"""Render synthetic samples unit by unit into resumable files, without a renderer."""
+"""Render synthetic samples work item by work item into resumable files, without a renderer."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from nlosrender.capture.bounces import BounceAxis
 from nlosrender.capture.part import WHOLE, Part, Selection, Tiling
 from nlosrender.capture.tile import Tile, runs
 from nlosrender.files import layout
-from nlosrender.files.capture_file import CaptureHeader
+from nlosrender.files.capture_header import CaptureHeader
+from nlosrender.files.chunking import packed_chunks
 from nlosrender.files.chunks import chunk_shape
 from nlosrender.files.identity import identity_attributes
-from nlosrender.files.part_attributes import part_attributes, summed_attributes
-from nlosrender.files.partial_capture import PartialCapture
-from nlosrender.files.pieces import packed_chunks
+from nlosrender.files.partial.partial_capture import PartialCapture
+from nlosrender.files.parts.part_attributes import part_attributes, summed_attributes
 from nlosrender.files.provenance import provenance_attributes
 from nlosrender.files.sums import Sums, sums_of
 
@@ -43,7 +43,7 @@ def part_of(header: CaptureHeader, selection: Selection) -> Part:
     return selection.part(header.sizes["laser_y"] * header.sizes["laser_x"], tiling_of(header))
 
 
-def units_of(header: CaptureHeader, part: Part) -> Iterator[tuple[Tile, Tile]]:
+def items_of(header: CaptureHeader, part: Part) -> Iterator[tuple[Tile, Tile]]:
     """Storage tiles with one laser each: (sensors, lasers)."""
     for cell in tiling_of(header).cells(part.strips):
         for laser in runs(*part.lasers, header.sizes["laser_x"], 1):
@@ -69,9 +69,9 @@ def write_part(
     config: Mapping[str, Any] = CONFIG,
     compression: str = "gzip",
 ) -> int:
-    """Write ``block`` and its square as variance, unit by unit; return how many units earlier runs had finished.
+    """Write ``block`` and its square as variance, work item by work item; return how many earlier runs had finished.
 
-    ``stop_after`` units ``Stopped`` is raised, as an error in a renderer would be.
+    ``stop_after`` work items ``Stopped`` is raised, as an error in a renderer would be.
     """
     part, tiling = part_of(header, selection), tiling_of(header)
     identity = {"config": dict(config), "variant": "none", "replicas": 2, "part": str(selection)}
@@ -79,8 +79,8 @@ def write_part(
     with PartialCapture.claim(path, identity, resume) as partial:
         provenance = provenance_attributes(config, "hash") | identity_attributes(identity)
         partial.open(header, provenance, compression, store_variance=True)
-        earlier = list(partial.tally.units)
-        left = [unit for unit in units_of(header, part) if unit not in earlier]
+        earlier = list(partial.tally.items)
+        left = [item for item in items_of(header, part) if item not in earlier]
         for number, (sensors, lasers) in enumerate(left):
             if number == stop_after:
                 raise Stopped
@@ -92,7 +92,7 @@ def write_part(
             chunks = (
                 chunk
                 for name, values in ((layout.DATA, block), (layout.VARIANCE, variance))
-                for chunk in packed_chunks(partial.cutter, name, values[inside], *corner)
+                for chunk in packed_chunks(partial.chunker, name, values[inside], *corner)
             )
             partial.store((sensors, lasers), chunks, sums_of_unit(block[inside], variance[inside]))
         results = summed_attributes(partial.tally.sums, BOUNCES, {"render": 0.5})

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from nlosrender.files.capture_file import CaptureHeader
+from nlosrender.files.capture_header import CaptureHeader
 from nlosrender.files.writer import CaptureWriter
 from nlosrender.scene.pose import Pose
 

@@ -11,8 +11,8 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from nlosrender.files.journal import read_records
-from nlosrender.files.unit_log import UnfinishedRender
+from nlosrender.files.partial.journal import read_records
+from nlosrender.files.partial.work_item_log import JournalState
 
 Process = subprocess.Popen[str]
 
@@ -94,7 +94,7 @@ def saved_units(folder: Path) -> int:
     partial = folder / PARTIAL
     with suppress(FileNotFoundError):  # not yet, or no longer
         if any(partial.glob("samples.*")):
-            return len(UnfinishedRender.from_records(read_records(partial / "journal")).tally.units)
+            return len(JournalState.from_records(read_records(partial / "journal")).tally.items)
     return 0
 
 

@@ -18,7 +18,7 @@ from nlosrender.capture.part import Part, Tiling
 from nlosrender.capture.plan import Batch, Plan, Tile, WorkItem
 from nlosrender.engine.backend.start import start_backend
 from nlosrender.errors import ConfigError
-from nlosrender.files.size import FileSize, disk_warnings, forecast_size
+from nlosrender.files.size_estimate import FileSize, disk_warnings, forecast_size
 
 BOX = (np.array([-0.4, -0.7, 0.5]), np.array([0.9, 0.2, 1.6]))
 PLATE = {"type": "rectangle", "width": 0.5, "height": 0.4, "center": [0.1, 0, 0.9], "normal": [0, 0, -1]}
@@ -28,9 +28,9 @@ ROOM = {"type": "room", "size": [2.0, 1.6, 1.5]}
 
 
 def plan_of(batches: tuple[Batch, ...], replicas: int, bytes_per_batch: int) -> Plan:
-    """A plan whose units are single batches."""
-    units = tuple(WorkItem(batch.sensors, batch.lasers, (batch,)) for batch in batches)
-    return Plan(units, replicas, bytes_per_batch, Tiling(3, 5, 1, 1), Part((0, 1), (0, 15)))
+    """A plan whose work items are single batches."""
+    items = tuple(WorkItem(batch.sensors, batch.lasers, (batch,)) for batch in batches)
+    return Plan(items, replicas, bytes_per_batch, Tiling(3, 5, 1, 1), Part((0, 1), (0, 15)))
 
 
 # --- sizes ---

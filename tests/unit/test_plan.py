@@ -84,7 +84,7 @@ def test_a_batch_stays_within_32_bit_indices():
     assert len(plan.batches) > 1
 
 
-# --- units ---
+# --- work items ---
 
 PAIR = 101 * (BYTES_PER_SUM * 2 + BYTES_OF_STATISTICS)  # bytes of one pair with one row of 100 bins
 
@@ -97,27 +97,27 @@ def planned(scan_type: str, pairs: float, selection: Selection = WHOLE, lanes: i
     return plan_capture(scanned, **options, storage_tile=(2, 3), selection=selection)
 
 
-def pairs_of(unit) -> set[tuple[int, int]]:
-    return set(itertools.product(unit.sensors.flat_indices(5), unit.lasers.flat_indices(7)))
+def pairs_of(item) -> set[tuple[int, int]]:
+    return set(itertools.product(item.sensors.flat_indices(5), item.lasers.flat_indices(7)))
 
 
 @pytest.mark.parametrize("scan_type", ["single", "confocal", "exhaustive"])
 @pytest.mark.parametrize("pairs", [1, 2, 5, 6, 14, 40, 90, 1000])
 @pytest.mark.parametrize("shard", [None, (1, 3), (2, 3), (3, 3)])
 def test_units_are_whole_storage_tiles(scan_type, pairs, shard):
-    """Each chunk of the file is filled by one unit, and a unit's batches cover it once, within the memory."""
+    """Each chunk of the file is filled by one work item, and a work item's batches cover it once, within the memory."""
     plan = planned(scan_type, pairs, Selection(shard=shard))
     cells = list(plan.tiling.cells(plan.part.strips))
     covered = [0] * len(cells)
-    for unit in plan.work_items:
-        inside = [cell for cell in cells if unit.sensors.contains(cell)]
-        assert sum(cell.size for cell in inside) == unit.sensors.size
+    for item in plan.work_items:
+        inside = [cell for cell in cells if item.sensors.contains(cell)]
+        assert sum(cell.size for cell in inside) == item.sensors.size
         for cell in inside:
-            covered[cells.index(cell)] += 1 if scan_type == "confocal" else unit.lasers.size
-        points = [point for batch in unit.batches for point in batch.sensors.flat_indices(5)]
-        assert sorted(points) == unit.sensors.flat_indices(5)
-        for batch in unit.batches:
-            assert batch.lasers == (batch.sensors if scan_type == "confocal" else unit.lasers)
+            covered[cells.index(cell)] += 1 if scan_type == "confocal" else item.lasers.size
+        points = [point for batch in item.batches for point in batch.sensors.flat_indices(5)]
+        assert sorted(points) == item.sensors.flat_indices(5)
+        for batch in item.batches:
+            assert batch.lasers == (batch.sensors if scan_type == "confocal" else item.lasers)
             size = batch.sensors.size * (1 if scan_type == "confocal" else batch.lasers.size)
             assert size * PAIR <= plan.bytes_per_batch <= pairs * PAIR + 6 * 101 * BYTES_OF_ASSEMBLY
     assert covered == [plan.part.lasers[1] - plan.part.lasers[0]] * len(cells)
@@ -131,8 +131,8 @@ def test_lanes_come_before_lasers():
     """
     plan = planned("exhaustive", 28, lanes=12)
     assert plan.replicas == 2
-    assert {unit.sensors.size for unit in plan.work_items} == {6, 4, 5}
-    assert {unit.lasers.size for unit in plan.work_items if unit.sensors.size == 6} == {4, 3}
+    assert {item.sensors.size for item in plan.work_items} == {6, 4, 5}
+    assert {item.lasers.size for item in plan.work_items if item.sensors.size == 6} == {4, 3}
 
 
 @pytest.mark.parametrize("scan_type", ["confocal", "exhaustive"])
@@ -141,27 +141,27 @@ def test_lanes_come_before_lasers():
 def test_what_is_left_after_other_units(scan_type, first, then):
     """Whatever the memory was and is, nothing that is finished is done again and nothing is left out."""
     before, now = planned(scan_type, first), planned(scan_type, then)
-    everything = set().union(*(pairs_of(unit) for unit in now.work_items))
+    everything = set().union(*(pairs_of(item) for item in now.work_items))
     for n_finished in range(0, len(before.work_items) + 1, max(1, len(before.work_items) // 5)):
         finished = before.work_items[:n_finished]
-        left = remaining_items(now, scan_type == "confocal", [(unit.sensors, unit.lasers) for unit in finished])
-        done = set().union(*(pairs_of(unit) for unit in finished)) if finished else set()
-        todo = [pair for unit in left for pair in pairs_of(unit)]
+        left = remaining_items(now, scan_type == "confocal", [(item.sensors, item.lasers) for item in finished])
+        done = set().union(*(pairs_of(item) for item in finished)) if finished else set()
+        todo = [pair for item in left for pair in pairs_of(item)]
         assert len(todo) == len(set(todo))
         assert done.isdisjoint(todo)
         if scan_type == "exhaustive":
             assert done | set(todo) == everything
         else:
-            assert sum(unit.sensors.size for unit in (*finished, *left)) == 15
-        for unit in left:
-            sizes = [batch.sensors.size for batch in unit.batches]
-            assert sum(sizes) == unit.sensors.size
+            assert sum(item.sensors.size for item in (*finished, *left)) == 15
+        for item in left:
+            sizes = [batch.sensors.size for batch in item.batches]
+            assert sum(sizes) == item.sensors.size
 
 
 def test_an_unchanged_plan_goes_on_where_it_stopped():
-    """With the same memory the units that are left are those of the plan, in their order."""
+    """With the same memory the work items that are left are those of the plan, in their order."""
     plan = planned("exhaustive", 9)
-    finished = [(unit.sensors, unit.lasers) for unit in plan.work_items[:7]]
+    finished = [(item.sensors, item.lasers) for item in plan.work_items[:7]]
     assert remaining_items(plan, False, finished) == list(plan.work_items[7:])
 
 

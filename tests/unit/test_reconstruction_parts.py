@@ -25,8 +25,8 @@ from nlosrender.analysis.reconstruction.threads import in_threads
 from nlosrender.analysis.reconstruction.voxel_grid import VoxelGrid, voxel_grid
 from nlosrender.config.load import config_to_dict
 from nlosrender.errors import FileError, NlosError, OptionError
-from nlosrender.files.reader import open_capture
-from nlosrender.files.scan import Scan, read_scan
+from nlosrender.files.reading.reader import open_capture
+from nlosrender.files.reading.scan import Scan, read_scan
 
 
 def scan_of(path: Path, scan_type: str = "single", **changes: object) -> Scan:

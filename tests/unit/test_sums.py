@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from nlosrender.capture.bounces import BounceAxis
-from nlosrender.files.part_attributes import known_of
+from nlosrender.files.parts.part_attributes import known_of
 from nlosrender.files.sums import Sums, exact_sum, sums_of
 
 

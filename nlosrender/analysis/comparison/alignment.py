@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nlosrender.errors import FileError
-from nlosrender.files.reader import StoredCapture, StoredPositions
-from nlosrender.files.stored_header import StoredHeader
+from nlosrender.files.reading.reader import StoredCapture, StoredPositions
+from nlosrender.files.reading.stored_header import StoredHeader
 
 T = TypeVar("T", np.float32, np.float64)
 Grid = NDArray[np.float64]

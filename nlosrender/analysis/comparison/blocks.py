@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from nlosrender.analysis.comparison.alignment import GridTurn
 from nlosrender.errors import FileError
 from nlosrender.files import layout
-from nlosrender.files.reader import StoredCapture, explained_read, open_hdf5
-from nlosrender.files.stored_header import samples_of
+from nlosrender.files.reading.reader import StoredCapture, explained_read, open_hdf5
+from nlosrender.files.reading.stored_header import samples_of
 
 Float32 = NDArray[np.float32]
 Samples = NDArray[np.float32] | NDArray[np.float64]  # as stored, or as rendered

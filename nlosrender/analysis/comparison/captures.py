@@ -14,7 +14,7 @@ from nlosrender.analysis.comparison.structure import StructureDifference, struct
 from nlosrender.analysis.comparison.z_test import ZTest
 from nlosrender.capture.bounces import BounceAxis
 from nlosrender.errors import FileError
-from nlosrender.files.stored_header import StoredHeader
+from nlosrender.files.reading.stored_header import StoredHeader
 
 SAME = 1e-6  # relative L2: float32 leaves 6e-8 per sample
 SIGNIFICANCE = 0.01

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nlosrender.analysis.comparison.blocks import Block, Samples
-from nlosrender.files.stored_header import StoredHeader
+from nlosrender.files.reading.stored_header import StoredHeader
 
 Float64 = NDArray[np.float64]
 

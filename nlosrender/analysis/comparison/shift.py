@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nlosrender.analysis.comparison.blocks import Block
-from nlosrender.files.stored_header import StoredHeader
+from nlosrender.files.reading.stored_header import StoredHeader
 
 Complex = NDArray[np.complex128]
 ROUND_DIGITS = 6  # of a shift in bins: float32 spectra leave no more

@@ -9,8 +9,8 @@ import numpy as np
 
 from nlosrender.analysis.comparison.alignment import START_TOLERANCE, Alignment, apart
 from nlosrender.errors import FileError
-from nlosrender.files.reader import StoredCapture
-from nlosrender.files.stored_header import StoredHeader
+from nlosrender.files.reading.reader import StoredCapture
+from nlosrender.files.reading.stored_header import StoredHeader
 
 WIDTH_TOLERANCE = 1e-6  # relative; a float32 deltaT is off by 6e-8
 # attributes that change what a sample means; files by other writers may lack them, and then say nothing

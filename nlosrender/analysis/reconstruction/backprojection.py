@@ -15,8 +15,8 @@ from nlosrender.analysis.reconstruction.spectrum import path_lengths
 from nlosrender.analysis.reconstruction.threads import Progress, in_threads, portion
 from nlosrender.analysis.reconstruction.voxel_grid import VoxelGrid
 from nlosrender.files.layout import Float64
-from nlosrender.files.reader import StoredCapture
-from nlosrender.files.scan import Float32, Scan, light_bands
+from nlosrender.files.reading.reader import StoredCapture
+from nlosrender.files.reading.scan import Float32, Scan, light_bands
 
 FINER = 4  # samples per bin of the interpolated histograms; the nearest one is taken
 SLAB_VOXELS = 2**16  # voxels at a time: their distances stay in the cache

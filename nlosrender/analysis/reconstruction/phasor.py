@@ -21,8 +21,8 @@ from nlosrender.analysis.reconstruction.threads import Progress, in_threads, por
 from nlosrender.analysis.reconstruction.voxel_grid import VoxelGrid
 from nlosrender.errors import FileError, OptionError
 from nlosrender.files.layout import Float64
-from nlosrender.files.reader import StoredCapture
-from nlosrender.files.scan import Scan, light_bands
+from nlosrender.files.reading.reader import StoredCapture
+from nlosrender.files.reading.scan import Scan, light_bands
 
 SPECTRA_BYTES = 2**29  # of the laser points that are propagated together, sharing the kernels
 MAX_WAVENUMBERS = 20_000

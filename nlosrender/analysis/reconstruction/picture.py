@@ -11,10 +11,10 @@ from nlosrender.analysis.reconstruction.reconstruct import SEPARATOR, Reconstruc
 from nlosrender.analysis.reconstruction.score import Score, otsu_threshold
 from nlosrender.analysis.theme import COLORMAP, FAINT, GROUND, INK, MARK, color_bar, style
 from nlosrender.config.encodable import encodable
-from nlosrender.files.kinds import PNG
+from nlosrender.files.atomic_write import replacing
+from nlosrender.files.file_kinds import PNG
 from nlosrender.files.layout import Float64
-from nlosrender.files.replacement import replacing
-from nlosrender.files.scan import Float32
+from nlosrender.files.reading.scan import Float32
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

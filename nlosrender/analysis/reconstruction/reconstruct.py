@@ -17,8 +17,8 @@ from nlosrender.analysis.reconstruction.voxel_grid import VoxelGrid, expected_bo
 from nlosrender.config.fields import LONGEST
 from nlosrender.errors import FileError, OptionError
 from nlosrender.files.layout import Float64
-from nlosrender.files.reader import open_capture
-from nlosrender.files.scan import Float32, chosen_bounces, read_scan
+from nlosrender.files.reading.reader import open_capture
+from nlosrender.files.reading.scan import Float32, chosen_bounces, read_scan
 
 METHODS = ("phasor", "backprojection")
 FILTER_WAVELENGTHS = 1 / 8  # width of the backprojection's filter: about the depth resolution of phasor fields

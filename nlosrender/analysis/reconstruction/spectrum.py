@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from nlosrender.analysis.reconstruction.pulse import Pulse
 from nlosrender.files.layout import Float64
-from nlosrender.files.scan import Float32, Scan
+from nlosrender.files.reading.scan import Float32, Scan
 from nlosrender.scene.bounding_box import Bounds, box_corners
 
 Complex64 = NDArray[np.complex64]

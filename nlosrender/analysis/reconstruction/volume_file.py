@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 
 from nlosrender.analysis.reconstruction.reconstruct import Reconstruction
+from nlosrender.files.atomic_write import replacing
 from nlosrender.files.attributes import set_attributes
-from nlosrender.files.kinds import VOLUME
+from nlosrender.files.file_kinds import VOLUME
+from nlosrender.files.hdf5_writer import hdf5_writer
 from nlosrender.files.provenance import package_versions
-from nlosrender.files.replacement import replacing
-from nlosrender.files.shielded_hdf5 import shielded_hdf5
 from nlosrender.interruption import uninterrupted
 
 AXES = ("z", "y", "x")  # of the volume, as h5py shows it
@@ -57,7 +57,7 @@ def write_volume(
     with (
         replacing(path, VOLUME, [reconstruction.source]) as partial,
         uninterrupted(),
-        shielded_hdf5(partial) as hdf5,
+        hdf5_writer(partial) as hdf5,
     ):
         file = hdf5.file
         for name in AXES:

@@ -9,7 +9,7 @@ import numpy as np
 
 from nlosrender.errors import FileError, OptionError
 from nlosrender.files.layout import Float64
-from nlosrender.files.scan import Scan
+from nlosrender.files.reading.scan import Scan
 from nlosrender.scene.bounding_box import Bounds
 
 DEFAULT_VOXELS = 128  # along the longest edge

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nlosrender.analysis.theme import COLORMAP, FAINT, GROUND, INK, style
-from nlosrender.files.kinds import PNG
-from nlosrender.files.replacement import replacing
+from nlosrender.files.atomic_write import replacing
+from nlosrender.files.file_kinds import PNG
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

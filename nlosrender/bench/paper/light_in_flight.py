@@ -12,7 +12,7 @@ from nlosrender.bench.paper.drawing import new_figure, save
 from nlosrender.bench.paper.figure import Check, PaperFigure, Picture, Table
 from nlosrender.bench.paper.steady import steady_picture, worst_deviation
 from nlosrender.bench.paper.study import Float64, Rendered, Study
-from nlosrender.files.reader import open_capture
+from nlosrender.files.reading.reader import open_capture
 
 SHOWN = 6  # frames side by side
 SCENES = {

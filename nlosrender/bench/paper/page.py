@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from nlosrender.bench.paper.figure import PaperFigure, Table, relative_name
-from nlosrender.files.kinds import PAGE, REPORT
-from nlosrender.files.replacement import replacing
+from nlosrender.files.atomic_write import replacing
+from nlosrender.files.file_kinds import PAGE, REPORT
 
 STYLE = """
 body{margin:0 auto;max-width:1080px;padding:24px;background:#0e0f14;color:#e8e8ee;font:16px/1.5 system-ui,sans-serif}

@@ -14,7 +14,7 @@ from nlosrender.bench.paper.figure import Check, PaperFigure, Picture, Table
 from nlosrender.bench.paper.light_in_flight import steady_sum
 from nlosrender.bench.paper.steady import steady_picture, worst_deviation
 from nlosrender.bench.paper.study import Float64, Rendered, Study
-from nlosrender.files.reader import open_capture
+from nlosrender.files.reading.reader import open_capture
 
 SCENE = "polarised-cornell-box"
 COMPONENTS = ("I", "Q", "U", "V")

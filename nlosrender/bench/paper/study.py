@@ -15,8 +15,8 @@ from nlosrender.config.document import Config
 from nlosrender.config.load import load_config
 from nlosrender.errors import FileError
 from nlosrender.files.layout import VARIANCE
-from nlosrender.files.reader import open_capture
-from nlosrender.rendering.report import RenderReport
+from nlosrender.files.reading.reader import open_capture
+from nlosrender.rendering.render_report import RenderReport
 
 Float64 = NDArray[np.float64]
 Progress = Callable[[str], None]  # told what is being done

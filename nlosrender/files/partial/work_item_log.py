@@ -1,0 +1,130 @@
+"""What the journal of an unfinished capture says: which work items are finished, and where their chunks lie."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import astuple, dataclass, field
+from typing import Any
+
+from nlosrender.capture.tile import Tile
+from nlosrender.files.sums import Sums
+
+CHECKSUM_RANGE = 2**64
+WorkItemKey = tuple[Tile, Tile]  # sensors, lasers
+Record = Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class StoredChunk:
+    """Where the bytes of a chunk lie in a file."""
+
+    dataset: str
+    at: tuple[int, ...]  # where the chunk starts, in file order
+    offset: int
+    length: int
+    checksum: int  # CRC-32 of the bytes
+
+
+@dataclass(frozen=True)
+class Closing:
+    """What a file of samples was like when HDF5 had closed it properly."""
+
+    size: int  # bytes
+    checksum: int  # CRC-32 of everything but the chunks
+
+
+@dataclass
+class RenderState:
+    """What is finished."""
+
+    items: list[WorkItemKey] = field(default_factory=list)
+    sums: Sums = field(default_factory=Sums)
+    checksum: dict[str, int] = field(default_factory=dict)  # per dataset, of its chunks in whatever order
+    n_bytes: int = 0  # of all chunks
+
+    def add(self, item: WorkItemKey, chunks: Iterable[StoredChunk], sums: Sums) -> None:
+        """Count one work item."""
+        self.items.append(item)
+        self.sums += sums
+        for chunk in chunks:
+            before = self.checksum.get(chunk.dataset, 0)
+            self.checksum[chunk.dataset] = (before + placed_checksum(chunk.at, chunk.checksum)) % CHECKSUM_RANGE
+            self.n_bytes += chunk.length
+
+
+@dataclass
+class JournalState:
+    """The state that the records of a journal add up to."""
+
+    first: Record = field(default_factory=dict)  # the record of how it began
+    generation: int = 0  # of the file that holds the samples
+    newest: int = 0  # generation that was ever begun
+    closed: Closing | None = None  # that file as HDF5 has closed it; None: it has not
+    tally: RenderState = field(default_factory=RenderState)
+
+    @classmethod
+    def from_records(cls, records: Iterable[Record]) -> JournalState:
+        """Add up the records of a journal, oldest first.
+
+        Raises
+        ------
+        ValueError
+            They are not those of a render.
+        """
+        state = cls()
+        tallies: dict[int, RenderState] = {}
+        try:
+            for record in records:
+                closed = record.get("closed")
+                state.closed = Closing(*closed) if isinstance(closed, list) else None
+                if "identity" in record:
+                    state.first = record
+                if "switched_to" in record:
+                    state.generation = record["switched_to"]
+                if "unit" in record:
+                    state.newest = max(state.newest, record["generation"])
+                    tallies.setdefault(record["generation"], RenderState()).add(*item_of(record))
+            state.newest = max(state.newest, state.generation)
+        except (KeyError, TypeError, AttributeError, RecursionError) as error:
+            raise ValueError(f"no record of a render: {error!r}") from error
+        state.tally = tallies.get(state.generation, RenderState())
+        return state
+
+
+def closing_record(closing: Closing) -> dict[str, Any]:
+    """Return the record that the file of samples is closed."""
+    return {"closed": astuple(closing)}
+
+
+def item_record(generation: int, item: WorkItemKey, chunks: Iterable[StoredChunk], sums: Sums) -> dict[str, Any]:
+    """Return the record of a finished work item whose chunks lie in the file of a ``generation``."""
+    return {
+        "unit": [list(astuple(tile)) for tile in item],
+        "generation": generation,
+        "sums": sums.as_json(),
+        "chunks": [list(astuple(chunk)) for chunk in chunks],
+    }
+
+
+def item_of(record: Record) -> tuple[WorkItemKey, list[StoredChunk], Sums]:
+    """Undo ``item_record``."""
+    sensors, lasers = (Tile(*corners) for corners in record["unit"])
+    chunks = [StoredChunk(name, tuple(at), *rest) for name, at, *rest in record["chunks"]]
+    return (sensors, lasers), chunks, Sums.from_json(record["sums"])
+
+
+def items_of(
+    records: Iterable[Mapping[str, Any]], generation: int
+) -> Iterator[tuple[WorkItemKey, list[StoredChunk], Sums]]:
+    """Yield the finished work items whose chunks lie in the file of a ``generation``."""
+    for record in records:
+        if record.get("generation") == generation:
+            yield item_of(record)
+
+
+def placed_checksum(at: tuple[int, ...], checksum: int) -> int:
+    """Return a chunk's checksum mixed with its place: chunks that have changed places do not add up to the same."""
+    place = 0
+    for index in at:
+        place = (place * 1_000_003 + index) % CHECKSUM_RANGE
+    return (checksum + 1) * (2 * place + 1) % CHECKSUM_RANGE

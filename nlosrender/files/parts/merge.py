@@ -1,0 +1,231 @@
+"""Puts the parts of a capture together, chunk by chunk: memory does not grow with the capture."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import zlib
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from pathlib import Path
+
+import h5py
+import numpy as np
+
+from nlosrender.capture.bounces import BounceAxis
+from nlosrender.capture.part import WHOLE
+from nlosrender.capture.tile import Tile
+from nlosrender.config.canonical import tree_hash
+from nlosrender.errors import FileError
+from nlosrender.files import layout
+from nlosrender.files.atomic_write import check_writable, explained_write, new_partial, publish
+from nlosrender.files.chunking import PackedChunk
+from nlosrender.files.file_kinds import CAPTURE, FileKind, same_capture
+from nlosrender.files.identity import SELECTION
+from nlosrender.files.partial.work_item_log import CHECKSUM_RANGE, placed_checksum
+from nlosrender.files.parts.part_attributes import (
+    CHECKSUMS,
+    NOTE,
+    PART,
+    SUMS,
+    UNKNOWN_FROM,
+    UNSAMPLED,
+    ZERO,
+    json_object,
+    known_of,
+    summed_attributes,
+    text_list,
+)
+from nlosrender.files.parts.shards import Shard, read_shards
+from nlosrender.files.reading.reader import explained_read, open_hdf5
+from nlosrender.files.sink import CaptureSink, sample_names
+from nlosrender.files.sums import Sums
+from nlosrender.interruption import uninterrupted
+
+Progress = Callable[[float], None]
+
+
+@dataclass(frozen=True)
+class MergeReport:
+    """What was put together."""
+
+    output: Path
+    parts: int
+    error_estimate: float  # relative L2 error of H over the whole capture; NaN: not known
+    energy: dict[str, float]  # H summed over the capture, per bounce [J m^-2 sr^-1]
+    out_of_window: float  # the same outside the time window
+    samples: int  # paths per sensor point, the least of all parts
+    unsampled_paths: tuple[str, ...] = ()  # classes of paths whose light is missing
+    zero_because: tuple[str, ...] = ()  # why H is zero everywhere; empty where it is not
+    error_estimate_per_bounce: Mapping[str, float | None] = field(default_factory=dict)  # None: not known, or no light
+    energy_error_per_bounce: Mapping[str, float | None] = field(default_factory=dict)  # standard error; None: not known
+
+
+def merge_captures(
+    paths: Sequence[str | Path],
+    output: str | Path,
+    progress: Progress = lambda share: None,
+    *,
+    overwrite: bool = False,
+) -> MergeReport:
+    """Put the parts of a capture together; ``data`` is bit for bit what one render of the whole would have given.
+
+    Parameters
+    ----------
+    paths
+        Files rendered with ``--shard`` or ``--lasers``, in any order.
+    output
+        File to write; it appears when it is complete.
+    progress
+        Told the share of the work done.
+    overwrite
+        Whether a file that holds another capture, or a part, may be replaced.
+
+    Raises
+    ------
+    FileError
+        A part is damaged, of another capture, overlaps another one or is missing; or the output cannot be written.
+    """
+    output = Path(output)
+    check_writable(output, CAPTURE, paths)
+    shards = read_shards([Path(path) for path in paths])
+    kind = CAPTURE if overwrite else _whole(shards[0])
+    target = check_writable(output, kind, paths)
+    with explained_write(output):
+        partial = new_partial(target)
+    sink: CaptureSink | None = None
+    try:
+        with uninterrupted(), explained_write(output):
+            shutil.copyfile(shards[0].path, partial)  # its samples included
+        sink = CaptureSink(partial, output, sample_names(shards[0].header.has_variance))
+        for number, shard in enumerate(shards):
+            _copy(shard, None if number == 0 else sink)
+            progress((number + 1) / len(shards))
+        sums, bounces = sum((shard.stored.sums for shard in shards), Sums()), _bounces(shards[0])
+        sink.remove_attributes((PART, SUMS, CHECKSUMS, NOTE, ZERO, SELECTION))
+        sink.set_attributes(_attributes(shards, sums, output))
+        sink.close()
+        with uninterrupted(), explained_write(output):
+            publish(output, partial, target, kind)
+    finally:
+        with uninterrupted():
+            if sink is not None:
+                sink.abandon()
+            with suppress(OSError):
+                partial.unlink(missing_ok=True)
+    return MergeReport(
+        output=output,
+        parts=len(shards),
+        error_estimate=sums.stated_error(_told(shards, UNSAMPLED)),
+        energy=sums.energy_per_bounce(bounces),
+        out_of_window=float(sums.outside),
+        samples=sums.samples or 0,
+        unsampled_paths=_told(shards, UNSAMPLED),
+        zero_because=() if sums.squares else _told(shards, ZERO),
+        error_estimate_per_bounce=known_of(sums.errors_per_bounce(bounces), bounces, _unknown_from(shards)),
+        energy_error_per_bounce=known_of(sums.energy_errors(bounces), bounces, _unknown_from(shards)),
+    )
+
+
+def _whole(shard: Shard) -> FileKind:
+    """Return the kind of files that hold the capture that a shard is a part of."""
+    attributes = shard.header.attributes
+    return same_capture(str(attributes.get("capture_hash")), str(WHOLE), json_object(attributes.get("config")))
+
+
+def _copy(shard: Shard, sink: CaptureSink | None) -> None:
+    """Copy a shard's chunks, or only check that they are what was rendered.
+
+    Raises
+    ------
+    FileError
+        They are not.
+    """
+    whole = set(shard.tiling.tiles())
+    with open_hdf5(shard.path) as file, explained_read(shard.path):
+        for name in sample_names(shard.header.has_variance):
+            samples: h5py.Dataset = file[name]
+            existing: set[tuple[int, ...]] = set()
+            # not one by one: HDF5 goes through all chunks for each
+            samples.id.chunk_iter(lambda chunk, existing=existing: existing.add(chunk.chunk_offset))
+            checksum = found = 0
+            for cell, chunk in _places(shard):
+                if chunk not in existing:
+                    continue
+                _, content = samples.id.read_direct_chunk(chunk)
+                checksum += placed_checksum(chunk, zlib.crc32(content))
+                found += 1
+                if sink is not None and cell in whole:
+                    sink.put(PackedChunk(name, chunk, content))
+                elif sink is not None:  # the rest of this chunk is another shard's
+                    where = _selection(shard, cell, chunk)
+                    sink.fill(name, where, np.asarray(samples[where], dtype=np.float32))
+            damaged = checksum % CHECKSUM_RANGE != shard.stored.checksum.get(name, 0)
+            if damaged or found != len(existing):
+                message = f"{shard}: is damaged: its {name} is not what was rendered."
+                raise FileError(f"{message} Copy it again, or render it again.")
+
+
+def _places(shard: Shard) -> Iterator[tuple[Tile, tuple[int, ...]]]:
+    """Yield where a shard may have chunks: the sensor points it has of them, and where they start in file order."""
+    header, part, sizes = shard.header, shard.part, shard.header.sizes
+    tiling, steps = shard.tiling, dict(zip(layout.file_axes(header.confocal), header.chunks or (), strict=True))
+    for laser in range(*part.lasers):
+        laser_y, laser_x = divmod(laser, sizes["laser_x"])
+        for cell in tiling.cells(part.strips):
+            corner = {"sensor_y": cell.y0 // tiling.rows * tiling.rows, "sensor_x": cell.x0, "laser_y": laser_y}
+            corner["laser_x"] = laser_x
+            for channel in range(sizes["channel"]):
+                for bounce in header.bounce_indices:
+                    for time_bin in range(0, sizes["bin"], steps["bin"]):
+                        place = corner | {"channel": channel, "bounce": bounce, "bin": time_bin}
+                        yield cell, layout.in_file_order(place, header.confocal)
+
+
+def _selection(shard: Shard, cell: Tile, chunk: tuple[int, ...]) -> tuple[slice, ...]:
+    """Return what a shard has of a chunk, as a selection of the dataset."""
+    header = shard.header
+    axes, steps, shape = layout.file_axes(header.confocal), header.chunks or (), header.data_shape
+    inside = {
+        axis: slice(start, min(start + step, length))
+        for axis, start, step, length in zip(axes, chunk, steps, shape, strict=True)
+    }
+    rows = {"sensor_y": slice(cell.y0, cell.y1), "sensor_x": slice(cell.x0, cell.x1)}
+    return layout.in_file_order(inside | rows, header.confocal)
+
+
+def _attributes(shards: Sequence[Shard], sums: Sums, output: Path) -> dict[str, object]:
+    """Return the attributes of the whole that its first part does not have."""
+    attributes = shards[0].header.attributes
+    seconds: dict[str, float] = {}
+    for shard in shards:
+        for stage, spent in json_object(shard.header.attributes.get("seconds")).items():
+            seconds[stage] = seconds.get(stage, 0.0) + float(spent)
+    changed: dict[str, object] = {"created": datetime.now(UTC).isoformat(timespec="seconds")}
+    config = json_object(attributes.get("config"))
+    if isinstance(config.get("output"), dict):
+        config["output"]["path"] = str(output)
+        changed |= {"config": json.dumps(config, ensure_ascii=False), "config_hash": tree_hash(config)}
+    zero = () if sums.squares else _told(shards, ZERO)
+    missing = _told(shards, UNSAMPLED)
+    return changed | summed_attributes(sums, _bounces(shards[0]), seconds, missing, zero, _unknown_from(shards))
+
+
+def _unknown_from(shards: Sequence[Shard]) -> int | None:
+    """Return the lowest bounce that light is missing of in any shard."""
+    told = [shard.header.attributes.get(UNKNOWN_FROM) for shard in shards]
+    return min((bounce for bounce in told if isinstance(bounce, int)), default=None)
+
+
+def _told(shards: Sequence[Shard], name: str) -> tuple[str, ...]:
+    """Return the texts in a list of all shards, each once."""
+    return tuple(dict.fromkeys(text for shard in shards for text in text_list(shard.header.attributes, name)))
+
+
+def _bounces(shard: Shard) -> BounceAxis:
+    attributes = shard.header.attributes
+    limit = attributes.get("max_bounces")
+    highest = limit if isinstance(limit, int) else None
+    return BounceAxis(highest, bool(attributes.get("split_bounces")), shard.header.first_bounce)

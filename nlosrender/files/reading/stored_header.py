@@ -1,0 +1,205 @@
+"""What a capture file says about itself, read without touching its samples; also from files by other writers."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from math import prod
+from pathlib import Path
+from typing import TypeVar
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from nlosrender.capture.bounces import FILE_BOUNCES, FIRST_BOUNCE, LINE_OF_SIGHT, THIRD_BOUNCE, first_bounce_of
+from nlosrender.errors import FileError
+from nlosrender.files import layout
+from nlosrender.files.attributes import get_attributes
+from nlosrender.files.reading.stored_axes import BY_RANK, stored_axes
+from nlosrender.files.reading.stored_points import NOT_ZNLOS, Numbers, dataset_in, small_numbers
+
+T = TypeVar("T", np.float32, np.float64)
+MAX_CHUNK_BYTES = 2**30  # unpacked; a few kilobytes in a file may claim 4 GiB
+MAX_BOUNCES = 64  # on the axis of a file from elsewhere; ours have 6
+
+
+@dataclass(frozen=True)
+class StoredHeader:
+    """Metadata of a capture file; None and empty where the file does not say."""
+
+    path: Path
+    scan_type: str
+    data_shape: tuple[int, ...]  # as h5py shows it
+    axes: tuple[str, ...]  # in-memory names of the axes of ``data_shape``
+    row_major: bool  # whether every dataset has its axes in reverse order
+    confocal: bool  # laser and sensor points are the same
+    sizes: Mapping[str, int]  # length of every axis, by its in-memory name
+    third_index: int | None  # of the third bounce on the bounce axis; None: the file has none, or says nonsense
+    bin_width_opl: float  # m
+    start_opl: float  # m
+    bounce_indices: tuple[int, ...]  # of the bounce axis that hold light; all of them when the file does not say
+    bounces_known: bool  # whether it does say
+    split_bounces: bool | None
+    sensor_grid_size: Numbers | None  # (width, height) m
+    laser_grid_size: Numbers | None
+    sensor_position: Numbers | None  # (3,) m, in the file's frame
+    laser_position: Numbers | None
+    hidden_volume_position: Numbers | None
+    hidden_volume_rotation: Numbers | None
+    hidden_volume_edges: Numbers | None  # three numbers when the file has them, else the cube's edge
+    dtype: str
+    itemsize: int  # bytes of one sample
+    chunks: tuple[int, ...] | None
+    compression: str
+    has_variance: bool
+    attributes: Mapping[str, object]  # of the file
+    data_attributes: Mapping[str, object]
+
+    @property
+    def first_bounce(self) -> int:
+        """The bounce that index 0 of the bounce axis holds."""
+        if self.scan_type == LINE_OF_SIGHT or self.third_index is None:
+            return first_bounce_of(self.scan_type)
+        return THIRD_BOUNCE - self.third_index
+
+    @property
+    def n_bins(self) -> int:
+        """Number of bins."""
+        return self.sizes["bin"]
+
+    @property
+    def end_opl(self) -> float:
+        """Optical path length at the end of the last bin [m]."""
+        return self.start_opl + self.n_bins * self.bin_width_opl
+
+    @property
+    def sensor_grid(self) -> tuple[int, int]:
+        """Rows and columns of the sensor grid."""
+        return self.sizes["sensor_y"], self.sizes["sensor_x"]
+
+    @property
+    def laser_grid(self) -> tuple[int, int]:
+        """Rows and columns of the laser grid; a confocal capture has its sensor grid here."""
+        return self.sensor_grid if self.confocal else (self.sizes["laser_y"], self.sizes["laser_x"])
+
+
+def intensity(header: StoredHeader, block: NDArray[T]) -> NDArray[T]:
+    """Return a block (channel, ...) in grey: colours averaged, of Stokes components the first."""
+    if header.attributes.get("channels") == layout.STOKES:
+        return block[0]
+    return block.mean(axis=0)
+
+
+def header_of(file: h5py.File, path: Path) -> StoredHeader:
+    """Read the metadata of an open file.
+
+    Raises
+    ------
+    FileError
+        ``data`` or ``deltaT`` is missing, or what is there cannot be a capture.
+    """
+    samples = samples_of(file, path)
+    for name in layout.SPECS:  # read or not: a file that names others is refused as a whole
+        dataset_in(file, path, name)
+    attributes, data_attributes = get_attributes(file), get_attributes(samples)
+    axes = stored_axes(file, path, samples, attributes)
+    sizes = axes.sizes
+    if sizes["bounce"] > MAX_BOUNCES:
+        raise FileError(f"{path}: has {sizes['bounce']} bounces, a capture has {FILE_BOUNCES}. {NOT_ZNLOS}")
+    indices = _bounce_indices(data_attributes, sizes["bounce"])
+    split = attributes.get("split_bounces")
+    width = _exact_or_stored(file, path, "deltaT")
+    if width is None:
+        raise FileError(f"{path}: has no dataset deltaT (the bin width in m of optical path). {NOT_ZNLOS}")
+    if not (np.isfinite(width) and width > 0):
+        raise FileError(f"{path}: deltaT is {width}, need a length > 0 [m of optical path]")
+    edges = small_numbers(file, path, "hiddenVolumeSize", exact=True)
+    return StoredHeader(
+        path=path,
+        scan_type=_scan_type(attributes, axes.confocal, sizes),
+        data_shape=tuple(samples.shape),
+        axes=axes.names,
+        row_major=axes.row_major,
+        confocal=axes.confocal,
+        sizes=sizes,
+        third_index=_third_index(data_attributes, sizes["bounce"]),
+        bin_width_opl=width,
+        start_opl=_exact_or_stored(file, path, "t0") or 0.0,
+        bounce_indices=tuple(range(sizes["bounce"])) if indices is None else indices,
+        bounces_known=indices is not None,
+        split_bounces=bool(split) if isinstance(split, int) else None,
+        sensor_grid_size=small_numbers(file, path, "cameraGridSize"),
+        laser_grid_size=small_numbers(file, path, "laserGridSize"),
+        sensor_position=small_numbers(file, path, "cameraPosition"),
+        laser_position=small_numbers(file, path, "laserPosition"),
+        hidden_volume_position=small_numbers(file, path, "hiddenVolumePosition"),
+        hidden_volume_rotation=small_numbers(file, path, "hiddenVolumeRotation"),
+        hidden_volume_edges=edges,
+        dtype=str(samples.dtype),
+        itemsize=samples.dtype.itemsize,
+        chunks=samples.chunks,
+        compression=samples.compression or "none",
+        has_variance=dataset_in(file, path, layout.VARIANCE) is not None,
+        attributes=attributes,
+        data_attributes=data_attributes,
+    )
+
+
+def samples_of(file: h5py.File, path: Path, name: str = layout.DATA) -> h5py.Dataset:
+    """Return the dataset ``data`` (or ``variance``) once it is sure to hold a capture's samples.
+
+    Raises
+    ------
+    FileError
+        It is missing, not numeric, of the wrong rank, or empty.
+    """
+    samples = dataset_in(file, path, name)
+    if samples is None:
+        found = ", ".join(sorted(file)[:8]) or "nothing"
+        raise FileError(f"{path}: has no dataset {name} (found: {found}). {NOT_ZNLOS}")
+    if samples.dtype.kind not in "iuf":
+        raise FileError(f"{path}: {name} holds {samples.dtype}, need numbers. {NOT_ZNLOS}")
+    # without a channel the number of axes alone makes no capture
+    if samples.ndim not in BY_RANK or (samples.ndim % 2 == 0 and dataset_in(file, path, "deltaT") is None):
+        confocal, pairs = " ".join(layout.CONFOCAL_AXES), " ".join(layout.PAIR_AXES)
+        raise FileError(
+            f"{path}: {name} has {samples.ndim} axes {samples.shape or ''}, need 5 ({confocal}) or 7 ({pairs}), or one "
+            f"less without a channel. {NOT_ZNLOS}"
+        )
+    if 0 in samples.shape:
+        raise FileError(f"{path}: {name} is empty: its shape is {samples.shape}")
+    if samples.chunks is not None and prod(samples.chunks) * samples.dtype.itemsize > MAX_CHUNK_BYTES:
+        raise FileError(f"{path}: {name} has chunks of shape {samples.chunks}, need at most 1 GiB each. Use h5repack.")
+    return samples
+
+
+def _exact_or_stored(file: h5py.File, path: Path, name: str) -> float | None:
+    numbers = small_numbers(file, path, name, exact=True)
+    return None if numbers is None else numbers[0]
+
+
+def _bounce_indices(data_attributes: Mapping[str, object], length: int) -> tuple[int, ...] | None:
+    stored = data_attributes.get("bounce_indices")
+    if not isinstance(stored, list) or length > FILE_BOUNCES:
+        return None
+    indices = tuple(sorted({index for index in stored if isinstance(index, int) and 0 <= index < length}))
+    return indices or None
+
+
+def _scan_type(attributes: Mapping[str, object], confocal: bool, sizes: Mapping[str, int]) -> str:
+    if confocal:
+        return "confocal"
+    if sizes["laser_y"] * sizes["laser_x"] > 1:
+        return "exhaustive"
+    # an exhaustive capture may have a single laser point too
+    stored = attributes.get("scan_type")
+    return str(stored) if stored in ("exhaustive", LINE_OF_SIGHT) else "single"
+
+
+def _third_index(data_attributes: Mapping[str, object], n_bounces: int) -> int | None:
+    stored = data_attributes.get("third_bounce", THIRD_BOUNCE - FIRST_BOUNCE)
+    if isinstance(stored, list) and len(stored) == 1:  # MATLAB knows no scalars
+        stored = stored[0]
+    usable = isinstance(stored, (int, float)) and stored in range(n_bounces)
+    return int(stored) if usable else None  # type: ignore[call-overload]

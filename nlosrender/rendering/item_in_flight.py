@@ -1,0 +1,95 @@
+"""The work item that is being rendered: its state is kept on the disk now and then, and when the render has to stop."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import asdict
+from typing import TYPE_CHECKING, Any
+
+from nlosrender.capture.plan import WorkItem
+from nlosrender.engine.launch.passes import Passes, SavedStages, Snapshot
+from nlosrender.errors import FileError
+from nlosrender.files.partial.partial_capture import PartialCapture
+from nlosrender.interruption import StopRequest
+from nlosrender.rendering.render_report import Progress, Warn
+
+if TYPE_CHECKING:
+    from nlosrender.engine.path.engine import Budget
+
+KEEP_SECONDS = (
+    30.0  # between two states, so that a kill costs no more than about a minute; quick work items never keep one
+)
+KEEP_COST = 0.1  # share of the time that keeping may take: states may have gigabytes
+SOON_SECONDS = 5.0  # a work item that ends so soon after a signal is finished
+OF_UNIT = "unit"  # stage of what is noted here
+
+
+class ItemStopped(Exception):
+    """A stop was requested, and the work item in flight has come to the end of a pass."""
+
+
+class ItemInFlight:
+    """Keeps the state of a work item while it is rendered.
+
+    Parameters
+    ----------
+    partial, item, budget
+        Where states go; of what; when it is done (a limit of time does not count: it is another one every time).
+    stop
+        When it comes the work item has ``SOON_SECONDS`` to end; then it is kept as it is.
+    progress, warn
+        Told the share that is done, and what cannot be kept.
+    """
+
+    def __init__(
+        self,
+        partial: PartialCapture,
+        item: WorkItem,
+        budget: Budget,
+        stop: StopRequest,
+        progress: Progress,
+        warn: Warn,
+    ):
+        self._partial, self._stop, self._warn = partial, stop, warn
+        self._key = (item.sensors, item.lasers)
+        self._budget: Mapping[str, Any] = asdict(budget) | {"time_limit_s": budget.time_limit_s is not None}
+        kept = partial.kept_state(*self._state_of) or {}
+        if not kept and partial.has_state(self._key):
+            warn(
+                f"{partial.path}: what was kept of the unit in flight is damaged, or of another target; it begins anew."
+            )
+        self.earlier_seconds = float(kept[OF_UNIT].numbers["seconds"]) if OF_UNIT in kept else 0.0
+        self.passes = Passes(progress, self._look, kept)
+        self._begun = self._kept_at = time.perf_counter()
+        self._pause = KEEP_SECONDS
+        self._signal_at: float | None = None  # when the stop was noticed
+
+    @property
+    def seconds(self) -> float:
+        """Spent rendering the work item, by earlier runs and this one."""
+        return self.earlier_seconds + time.perf_counter() - self._begun
+
+    @property
+    def _state_of(self) -> tuple[Any, Mapping[str, Any]]:
+        return self._key, self._budget
+
+    def _look(self, take: Callable[[], SavedStages]) -> None:
+        now = time.perf_counter()
+        if self._stop.came:
+            self._signal_at = self._signal_at or now
+            if now - self._signal_at >= SOON_SECONDS:
+                self._keep(take())
+                raise ItemStopped
+        elif now - self._kept_at >= self._pause:
+            self._keep(take())
+            self._kept_at = time.perf_counter()
+            self._pause = max(self._pause, KEEP_SECONDS, (self._kept_at - now) / KEEP_COST)
+
+    def _keep(self, kept: SavedStages) -> None:
+        noted = Snapshot(numbers={"seconds": self.seconds})
+        try:
+            self._partial.keep_state(*self._state_of, kept | {OF_UNIT: noted})
+        except FileError as error:  # a full disk: what an earlier state holds is left
+            self._warn(f"{error} What is done of the unit in flight cannot be kept.")
+            self._pause *= 4

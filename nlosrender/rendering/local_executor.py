@@ -1,0 +1,182 @@
+"""Renders the work items of a plan one after the other in this process; what is finished survives whatever happens."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+from nlosrender.capture.plan import WorkItem
+from nlosrender.engine.launch.passes import Passes
+from nlosrender.errors import FileError, IncompleteRender, InterruptedRender, RenderError
+from nlosrender.files.partial.partial_capture import PartialCapture
+from nlosrender.files.sums import Sums
+from nlosrender.interruption import StopRequest, stop_request
+from nlosrender.rendering.item_in_flight import ItemInFlight, ItemStopped
+from nlosrender.rendering.render_report import Progress, Standing, Stopwatch, Warn, Watch
+from nlosrender.rendering.work_items import ItemWriter, RenderedItem, finished_item, render_item
+
+if TYPE_CHECKING:
+    from nlosrender.engine.path.engine import Budget
+    from nlosrender.rendering.work_items import Engine
+
+
+@contextmanager
+def resumable(partial: PartialCapture) -> Iterator[StopRequest]:
+    """Let the first signal to stop inside the block be a request, and say what is left after a failure.
+
+    Raises
+    ------
+    InterruptedRender
+        A second signal came.
+    IncompleteRender
+        A file could not be written, but work items are finished and saved.
+    """
+    try:
+        with stop_request() as stop:
+            yield stop
+    except KeyboardInterrupt as error:
+        raise InterruptedRender(f"{partial.path}: interrupted{saved_suffix(partial)}") from error
+    except FileError as error:
+        if not partial.is_resumable:
+            raise
+        raise IncompleteRender(f"{error} The render stopped{saved_suffix(partial)}") from error
+    except RenderError:
+        partial.discard()  # the same would come out again
+        raise
+
+
+def render_items(
+    items: Sequence[WorkItem],
+    engine: Engine,
+    budget: Budget,
+    partial: PartialCapture,
+    stop: StopRequest,
+    *,
+    store_variance: bool,
+    stopwatch: Stopwatch,
+    progress: Progress,
+    warn: Warn,
+    watch: Watch,
+) -> None:
+    """Render work items and store each as it is done.
+
+    Parameters
+    ----------
+    items
+        What is left to do.
+    engine, budget
+        What renders them; when to stop, ``time_limit_s`` being the limit for all work items, earlier runs' included.
+    partial
+        Where they go; open.
+    stop
+        Looked at between passes: a work item that takes long is kept as it is.
+    store_variance
+        Whether the file has the variance.
+    stopwatch, progress, warn, watch
+        Told the seconds, the share that is done, that the user has to wait, and what is finished.
+
+    Raises
+    ------
+    InterruptedRender
+        A stop was requested before the last work item.
+    RenderError, FileError
+        A work item cannot be rendered or stored.
+    """
+    earlier = len(partial.tally.items)
+    total = earlier + len(items)
+    spent = partial.tally.sums.seconds
+    begun = time.perf_counter()
+    writer = ItemWriter(partial, stopwatch)
+    so_far = partial.tally.sums  # which the writer is a work item behind of, later on
+    watch(standing(so_far, earlier, total))
+    try:
+        for number, item in enumerate(items):
+            limit = budget.time_limit_s
+            if limit is not None:  # what is left of the time, shared by the work items that are left
+                limit = max(0.0, limit - spent - (time.perf_counter() - begun)) / (len(items) - number)
+
+            def report_progress(share: float, done: int = earlier + number) -> None:
+                progress((done + share) / total)
+                if stop.came:
+                    warn(
+                        f"{stop.signal_name}: the unit in flight is finished, or kept as it is after a few seconds; "
+                        "once more stops at once."
+                    )
+
+            own_budget = replace(budget, time_limit_s=limit)
+            flight = ItemInFlight(partial, item, own_budget, stop, report_progress, warn)
+            finished = render_timed(
+                engine, item, own_budget, store_variance, stopwatch, flight.passes, flight.earlier_seconds
+            )
+            spent += flight.earlier_seconds
+            so_far += finished.sums
+            writer.store(finished)
+            del finished, flight  # its arrays are the writer's now
+            report_progress(1.0)
+            watch(standing(so_far, earlier + number + 1, total))
+            if stop.came and number + 1 < len(items):
+                raise ItemStopped
+        writer.wait()
+    except ItemStopped as stopped:
+        writer.wait()
+        raise InterruptedRender(
+            f"{partial.path}: stopped by {stop.signal_name}{saved_suffix(partial, total)}"
+        ) from stopped
+    finally:
+        writer.close()
+
+
+def render_timed(
+    engine: Engine,
+    item: WorkItem,
+    budget: Budget,
+    store_variance: bool,
+    stopwatch: Stopwatch,
+    passes: Passes | None = None,
+    earlier_seconds: float = 0.0,
+) -> RenderedItem:
+    """Render a work item; the engine's own arrays are gone when this returns.
+
+    Parameters
+    ----------
+    engine, item, budget, passes
+        As for ``render_item``.
+    store_variance
+        Whether the file has the variance.
+    stopwatch
+        Told the seconds.
+    earlier_seconds
+        Spent on the work item by an earlier render.
+
+    Raises
+    ------
+    RenderError
+        The result is not finite.
+    """
+    compiled, begun = engine.compile_seconds, time.perf_counter()
+    histogram = render_item(engine, item, budget, passes or Passes())
+    seconds = time.perf_counter() - begun
+    compiled = engine.compile_seconds - compiled
+    stopwatch.seconds["compile"] += compiled
+    stopwatch.seconds["render"] += seconds - compiled
+    confocal = engine.capture.scan_type == "confocal"
+    seconds += earlier_seconds
+    return finished_item(item, histogram, confocal=confocal, store_variance=store_variance, seconds=seconds)
+
+
+def standing(sums: Sums, done: int, total: int) -> Standing:
+    """Return where a render stands whose finished work items have these sums."""
+    return Standing("units", done, total, sums.error_estimate if done and sums.squares else None)
+
+
+def saved_suffix(partial: PartialCapture, total: int | None = None) -> str:
+    """Return the end of a sentence: what is saved, of ``total`` work items."""
+    finished = len(partial.tally.items)
+    if not partial.is_resumable:
+        return " before anything was finished; nothing is kept."
+    of_all = "" if total is None else f" of {total}"
+    begun = ", and so is what was done of the one in flight" if partial.has_states else ""
+    return f"; {finished}{of_all} units are finished and saved{begun}. The same command goes on from there."

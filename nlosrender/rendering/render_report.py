@@ -1,0 +1,88 @@
+"""What a render tells while it runs and when it is done."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+
+Progress = Callable[[float], None]  # told the share of the work that is done, in [0, 1]
+Warn = Callable[[str], None]  # told one warning
+
+
+@dataclass(frozen=True)
+class Standing:
+    """How many work items of a render, or captures of a sweep, are finished."""
+
+    what: str  # they are: "units" (work items), "captures"
+    done: int
+    total: int
+    error: float | None = None  # relative L2 error of H over what is finished; None: nothing is, or it is not known
+
+
+Watch = Callable[[Standing], None]  # told after every work item
+
+STAGES = ("scene", "compile", "render", "compress", "write")
+
+
+@dataclass
+class Stopwatch:
+    """Seconds spent per stage; compressing and writing go on while the next work item is rendered."""
+
+    seconds: dict[str, float] = field(default_factory=lambda: dict.fromkeys(STAGES, 0.0))
+    begun: float = field(default_factory=time.perf_counter)
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        """Add the time spent inside to stage ``name``."""
+        start = time.perf_counter()
+        try:
+            yield
+        finally:
+            self.seconds[name] += time.perf_counter() - start
+
+    def report(self) -> dict[str, float]:
+        """Return seconds per stage and ``total`` since the stopwatch was made."""
+        return self.seconds | {"total": time.perf_counter() - self.begun}
+
+
+@dataclass(frozen=True)
+class RenderReport:
+    """What a finished render has to say for itself."""
+
+    output: Path
+    engine: str
+    reason: str  # why this engine
+    variant: str  # Mitsuba variant
+    part: str | None  # which part of the capture; None: all of it
+    units: int  # work items it was cut into
+    resumed_units: int  # of them, finished by an earlier run
+    samples: int  # paths per sensor point, the least of all work items
+    error_estimate: float  # relative L2 error of H over the whole capture; NaN: not known
+    energy: dict[str, float]  # H summed over the capture, per bounce [J m^-2 sr^-1]
+    out_of_window: float  # the same outside the time window
+    n_bins: int
+    n_triangles: int
+    seconds: dict[str, float]  # of this run
+    warnings: tuple[str, ...]
+    unsampled_paths: tuple[str, ...] = ()  # classes of paths whose light is missing
+    zero_because: tuple[str, ...] = ()  # why H is zero everywhere; empty where it is not
+    error_estimate_per_bounce: Mapping[str, float | None] = field(default_factory=dict)  # None: not known, or no light
+    energy_error_per_bounce: Mapping[str, float | None] = field(default_factory=dict)  # standard error; None: not known
+
+
+@dataclass(frozen=True)
+class Warnings:
+    """Warnings, each said once."""
+
+    warn: Warn
+    emitted: dict[str, None] = field(default_factory=dict)  # in the order they were emitted
+
+    def emit(self, texts: Iterable[str]) -> None:
+        """Pass on those that are new."""
+        for text in texts:
+            if text not in self.emitted:
+                self.emitted[text] = None
+                self.warn(text)

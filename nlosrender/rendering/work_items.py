@@ -1,0 +1,217 @@
+"""Work items: rendered here, packed and written by a thread of its own while the next one is rendered."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nlosrender.capture.plan import WorkItem
+from nlosrender.engine.launch.passes import Passes, Snapshot
+from nlosrender.files import layout
+from nlosrender.files.chunking import Chunker, PackedChunk, packed_chunks
+from nlosrender.files.partial.partial_capture import PartialCapture
+from nlosrender.files.sums import Sums, sums_of
+from nlosrender.interruption import uninterrupted
+from nlosrender.rendering.render_report import Stopwatch
+
+if TYPE_CHECKING:
+    from nlosrender.engine.engines import Engine
+    from nlosrender.engine.launch.histogram import Histogram
+    from nlosrender.engine.path.engine import Budget
+
+
+def render_item(engine: Engine, item: WorkItem, budget: Budget, passes: Passes) -> Histogram:
+    """Render one work item: everything that is needed to do so in another process.
+
+    Parameters
+    ----------
+    engine, item, budget
+        What to render, and when to stop.
+    passes
+        Told the share of the work item that is done, and asked for what an earlier render has kept of it.
+
+    Returns
+    -------
+    Histogram
+        Axes (channel, bounce, laser, sensor, bin), laser and sensor flattened row by row.
+
+    Raises
+    ------
+    RenderError
+        The result is not finite.
+    """
+    limit, count = budget.time_limit_s, len(item.batches)
+    if count == 1:
+        part = passes.stage("batch 0")
+        whole = engine.render(item.batches[0], budget, part)
+        part.finish(Snapshot())  # its parts are no longer needed
+        return whole
+    share_of = replace(budget, time_limit_s=None if limit is None else limit / count)
+    pieces = []
+    for number, batch in enumerate(item.batches):
+        part = passes.stage(f"batch {number}", number / count, (number + 1) / count)
+        if (earlier := part.resumed("mean")) is not None:  # the whole batch was done
+            piece = _histogram(earlier)
+        else:
+            piece = engine.render(batch, share_of, part)
+        part.finish(_snapshot(piece))
+        pieces.append(piece)
+    return joined_histogram(item, pieces)
+
+
+def _snapshot(histogram: Histogram) -> Snapshot:
+    arrays = {name: getattr(histogram, name) for name in ("mean", "variance", "outside", "contrasts")}
+    return Snapshot(arrays, {"samples": histogram.samples})
+
+
+def _histogram(kept: Snapshot) -> Histogram:
+    from nlosrender.engine.launch.histogram import Histogram
+
+    arrays = kept.arrays
+    samples = kept.numbers["samples"]
+    return Histogram(arrays["mean"], arrays["variance"], arrays["outside"], samples, arrays["contrasts"])
+
+
+def joined_histogram(item: WorkItem, pieces: list[Histogram]) -> Histogram:
+    """Put the histograms of a work item's batches together, sensor points row by row."""
+    from nlosrender.engine.launch.histogram import Histogram
+
+    rows, columns = item.sensors.shape
+    arrays = {}
+    for name in ("mean", "variance", "outside"):
+        first = getattr(pieces[0], name)
+        whole = np.empty((*first.shape[:3], rows, columns, *first.shape[4:]))
+        for batch, piece in zip(item.batches, pieces, strict=True):
+            tile = batch.sensors
+            inside = np.s_[
+                tile.y0 - item.sensors.y0 : tile.y1 - item.sensors.y0,
+                tile.x0 - item.sensors.x0 : tile.x1 - item.sensors.x0,
+            ]
+            values = getattr(piece, name)
+            whole[(slice(None),) * 3 + inside] = values.reshape(*first.shape[:3], *tile.shape, *first.shape[4:])
+        arrays[name] = whole.reshape(*first.shape[:3], rows * columns, *first.shape[4:])
+    return Histogram(
+        arrays["mean"],
+        arrays["variance"],
+        arrays["outside"],
+        min(piece.samples for piece in pieces),
+        sum((piece.contrasts for piece in pieces[1:]), pieces[0].contrasts),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class RenderedItem:
+    """A work item on its way to the file."""
+
+    item: WorkItem
+    laser_at: tuple[int, int]  # row and column of its first laser in the file
+    samples: dict[str, NDArray[np.float32]]  # per dataset (channel, bounce, laser_y, laser_x, sensor_y, sensor_x, bin)
+    sums: Sums
+
+    def chunks(self, chunker: Chunker) -> Iterator[PackedChunk]:
+        """Yield the work item's chunks, packed."""
+        for name, block in self.samples.items():
+            yield from packed_chunks(chunker, name, block, self.laser_at, (self.item.sensors.y0, self.item.sensors.x0))
+
+
+def finished_item(
+    item: WorkItem, histogram: Histogram, *, confocal: bool, store_variance: bool, seconds: float
+) -> RenderedItem:
+    """Sum up a work item in float64 and take what is stored of it.
+
+    Parameters
+    ----------
+    item, histogram
+        The work item, and what the engine made of it.
+    confocal
+        Whether the file has no laser axes.
+    store_variance
+        Whether the file has the variance.
+    seconds
+        Spent rendering it.
+    """
+    lasers = (1, 1) if confocal else item.lasers.shape
+    channels, slots, _, _, n_bins = histogram.mean.shape
+    axes = (channels, slots, *lasers, *item.sensors.shape, n_bins)
+    # of Stokes components the intensity: the others have signs, and are no energy
+    light = slice(0, 1) if layout.CHANNELS.get(channels) == layout.STOKES else slice(None)
+    mean, variance, outside = histogram.mean[light], histogram.variance[light], histogram.outside[light]
+    sums = sums_of(mean, variance, outside, histogram.samples, seconds, histogram.contrasts[:, light].sum(axis=1))
+    stored = {layout.DATA: histogram.mean} | ({layout.VARIANCE: histogram.variance} if store_variance else {})
+    with np.errstate(over="ignore"):  # what overflows float32 is refused where it is cut into chunks
+        samples = {name: values.astype(np.float32).reshape(axes) for name, values in stored.items()}
+    return RenderedItem(item, (0, 0) if confocal else (item.lasers.y0, item.lasers.x0), samples, sums)
+
+
+class Storable(Protocol):
+    """A work item that can be stored, whoever packs its chunks: a ``RenderedItem``, or one that came from elsewhere."""
+
+    @property
+    def item(self) -> WorkItem:
+        """Its sensors and lasers."""
+
+    @property
+    def sums(self) -> Sums:
+        """What is summed over it."""
+
+    def chunks(self, chunker: Chunker) -> Iterable[PackedChunk]:
+        """Return its chunks, packed."""
+
+
+class ItemWriter:
+    """Stores work items in a thread of its own, one at a time; the render waits when it is a whole work item ahead.
+
+    Every call of HDF5 happens in one thread at a time: in this one until ``close``.
+
+    Parameters
+    ----------
+    capture
+        Where they go; open.
+    stopwatch
+        Told the seconds.
+    """
+
+    def __init__(self, capture: PartialCapture, stopwatch: Stopwatch):
+        self._capture, self._stopwatch = capture, stopwatch
+        self._thread = ThreadPoolExecutor(max_workers=1, thread_name_prefix="writer")
+        self._pending: Future[None] | None = None
+
+    def store(self, rendered: Storable) -> None:
+        """Hand over a work item, once the one before is stored.
+
+        Raises
+        ------
+        FileError, RenderError
+            The work item before could not be stored.
+        """
+        self.wait()
+        self._pending = self._thread.submit(self._store, rendered)
+
+    def wait(self) -> None:
+        """Wait until everything is stored.
+
+        Raises
+        ------
+        FileError, RenderError
+            It could not be.
+        """
+        pending, self._pending = self._pending, None
+        if pending is not None:
+            pending.result()
+
+    def close(self) -> None:
+        """End the thread once it is done; what it could not store is lost."""
+        with uninterrupted():
+            self._thread.shutdown(wait=True)
+
+    def _store(self, rendered: Storable) -> None:
+        chunks = rendered.chunks(self._capture.chunker)
+        item = rendered.item
+        packing, writing = self._capture.store((item.sensors, item.lasers), chunks, rendered.sums)
+        self._stopwatch.seconds["compress"] += packing
+        self._stopwatch.seconds["write"] += writing
