@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from typing import Literal, Self, TypeAlias
 
 EXIT_OK = 0
 EXIT_FAILURE = 1
@@ -18,6 +19,9 @@ EXIT_ENVIRONMENT = 6
 EXIT_INTERRUPTED = 130
 
 
+KeyPath: TypeAlias = tuple[str | int, ...]  # keys of a configuration from the root, or a section of it, down
+
+
 class NlosError(Exception):
     """Base of every error that is explained to the user instead of traced."""
 
@@ -25,25 +29,46 @@ class NlosError(Exception):
 
 
 @dataclass(frozen=True)
-class Problem:
+class ValidationIssue:
     """One mistake in a configuration: where it is and what to do about it."""
 
-    place: str  # "z.yaml:14:3" or "--set capture.laser_grid.nx=0"
-    key: str  # dotted key, "capture.laser_grid.nx"; empty when the whole file is meant
+    path: KeyPath  # ("capture", "laser_grid", "nx"); empty when the whole file is meant
     message: str  # what was found, what is allowed, what to do
+    at: Literal["value", "key"] = "value"  # which of the two is shown as the place
+    place: str = ""  # "z.yaml:14:3" or "--set capture.laser_grid.nx=0"; empty: not known yet
+
+    @property
+    def key(self) -> str:
+        """The dotted key, such as ``capture.laser_grid.nx``."""
+        return ".".join(map(str, self.path))
+
+    @classmethod
+    def at_key(cls, key: str, message: str) -> Self:
+        """Return the issue of a dotted key."""
+        return cls(tuple(int(part) if part.isdigit() else part for part in key.split(".")), message)
 
     def __str__(self) -> str:
         return ": ".join(part for part in (self.place, self.key, self.message) if part)
 
 
 class ConfigError(NlosError):
-    """The configuration cannot be used; holds every problem found, not only the first."""
+    """The configuration cannot be used; holds every issue found, not only the first."""
 
     exit_code = EXIT_BAD_INPUT
 
-    def __init__(self, problems: Sequence[Problem] | Problem):
-        self.problems: tuple[Problem, ...] = (problems,) if isinstance(problems, Problem) else tuple(problems)
-        super().__init__("\n".join(str(problem) for problem in self.problems))
+    def __init__(self, issues: Sequence[ValidationIssue] | ValidationIssue):
+        self.issues: tuple[ValidationIssue, ...] = (issues,) if isinstance(issues, ValidationIssue) else tuple(issues)
+        super().__init__("\n".join(map(str, self.issues)))
+
+    @classmethod
+    def at(cls, key: str, message: str) -> Self:
+        """Return the error of one dotted key whose place in the file is not known yet."""
+        return cls(ValidationIssue.at_key(key, message))
+
+    @classmethod
+    def of_file(cls, place: str, message: str) -> Self:
+        """Return the error of a whole file, or of a place in it that no key is known of."""
+        return cls(ValidationIssue((), message, place=place))
 
 
 class OptionError(NlosError):

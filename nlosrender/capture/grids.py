@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from nlosrender.capture.bounces import LINE_OF_SIGHT
-from nlosrender.errors import ConfigError, Problem
+from nlosrender.errors import ConfigError
 from nlosrender.scene.pose import Float64
 from nlosrender.scene.relay_wall import RelayWall
 from nlosrender.scene.wall_coordinates import EDGE_TOLERANCE
@@ -187,7 +187,7 @@ def _configured_grid(grid_config: GridConfig, wall: RelayWall, key: str) -> Poin
     try:
         return point_grid(wall, grid_config.nx, grid_config.ny, grid_config.width, grid_config.height)
     except ValueError as error:
-        raise ConfigError(Problem("", key, f"{error}.")) from error
+        raise ConfigError.at(key, f"{error}.") from error
 
 
 def _device_position(scene_position: ArrayLike | None, wall: RelayWall) -> Float64:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from nlosrender.capture.plan import BYTES_OF_STATISTICS, BYTES_PER_SUM
 from nlosrender.capture.time_axis import TimeAxis
 from nlosrender.config.capture import CaptureConfig
-from nlosrender.errors import ConfigError, Problem
+from nlosrender.errors import ConfigError
 
 # 80 float64 per grid point: position, normal, uv, wall coordinates (10) and their copies, leg (1), and the difference
 # to eight corners of a box, squared and summed (56)
@@ -24,7 +24,7 @@ def refuse_impossible_grids(capture_config: CaptureConfig, memory_limit: int) ->
                 f"{grid.nx} x {grid.ny} {points} take {grid.n_points * POINT_BYTES / 1e9:.3g} GB for their positions "
                 f"alone, but there are {memory_limit / 1e9:.3g} GB. Use fewer {points}."
             )
-            raise ConfigError(Problem("", key, message))
+            raise ConfigError.at(key, message)
 
 
 def refuse_wide_kernel(kernel_opl: float, time_axis: TimeAxis) -> None:
@@ -37,7 +37,7 @@ def refuse_wide_kernel(kernel_opl: float, time_axis: TimeAxis) -> None:
         message = (
             f"got {kernel_opl:g} m, wider than the time axis, {window:g} m; need a few bins, or 0 for a histogram."
         )
-        raise ConfigError(Problem("", "render.temporal_kernel_opl", message))
+        raise ConfigError.at("render.temporal_kernel_opl", message)
 
 
 def refuse_impossible_samples(
@@ -78,7 +78,7 @@ def refuse_impossible_samples(
         )
     else:
         return
-    raise ConfigError(Problem("", key, message))
+    raise ConfigError.at(key, message)
 
 
 def _words(capture_config: CaptureConfig) -> tuple[str, str]:

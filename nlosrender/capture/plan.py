@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from nlosrender.capture.grids import Capture
 from nlosrender.capture.part import WHOLE, Part, Selection, Tiling
 from nlosrender.capture.tile import Tile, joined, runs
-from nlosrender.errors import ConfigError, Problem
+from nlosrender.errors import ConfigError
 
 BYTES_PER_SUM = 8  # a float64 sum per replica and bin
 MAX_SUMS = 2**32 - 1  # of a batch: Dr.Jit indexes with 32 bits
@@ -115,7 +115,7 @@ def plan_capture(
             f"{one} needs {needed / 1e6:.0f} MB but {memory_limit / 1e6:.0f} MB are left for it. Raise it, or use "
             f"fewer bins ({n_bins}) or bounces."
         )
-        raise ConfigError(Problem("", "render.memory_limit", message))
+        raise ConfigError.at("render.memory_limit", message)
     wanted = max_item_samples // row
     if min_items > 1:  # only then: the part's share is rounded, and would cut a small rest off a single work item
         share = part.share_of(tiling.everything(capture.lasers_per_sensor))

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from nlosrender.errors import ConfigError, Problem
+from nlosrender.errors import ConfigError
 
 if TYPE_CHECKING:
     from nlosrender.config.capture import TimeAxisConfig
@@ -66,5 +66,5 @@ def resolve_time_axis(time_axis_config: TimeAxisConfig, latest_opl: float) -> Ti
             f"stops at {MAX_AUTO_BINS}. Give n_bins as an integer, a larger bin_width_opl "
             f"(from {(latest_opl - start) / MAX_AUTO_BINS:.2g} m), or a later start_opl."
         )
-        raise ConfigError(Problem("", "time_axis.n_bins", message))
+        raise ConfigError.at("time_axis.n_bins", message)
     return TimeAxis(start, width, int(rounded))

@@ -29,9 +29,9 @@ from nlosrender.cli import (
     render_command,
 )
 from nlosrender.cli.interrupt_watch import InterruptWatch
-from nlosrender.cli.json_output import OUTPUT, problems_of
+from nlosrender.cli.json_output import OUTPUT, issues_of
 from nlosrender.cli.streams import open_closed_streams, print_any_name
-from nlosrender.errors import EXIT_FAILURE, EXIT_INTERRUPTED, NlosError, Problem
+from nlosrender.errors import EXIT_FAILURE, EXIT_INTERRUPTED, NlosError, ValidationIssue
 
 app = typer.Typer(
     name="nlosrender",
@@ -80,7 +80,7 @@ def main() -> None:
             app()
     except NlosError as error:
         message = f"error: {error}" if "\n" not in str(error) else f"errors:\n{error}"
-        _end(message, error.exit_code, str(error).splitlines(), problems_of(error))
+        _end(message, error.exit_code, str(error).splitlines(), issues_of(error))
     except KeyboardInterrupt:
         _end("interrupted", EXIT_INTERRUPTED, ["interrupted"])
     except OSError as error:  # commands explain those of their files: what is left is standard output, mostly
@@ -93,10 +93,10 @@ def main() -> None:
         raise
 
 
-def _end(message: str | None, exit_code: int, parts: Iterable[str], problems: Iterable[Problem] = ()) -> NoReturn:
+def _end(message: str | None, exit_code: int, parts: Iterable[str], issues: Iterable[ValidationIssue] = ()) -> NoReturn:
     with suppress(OSError):  # nobody listens any more: the exit code still tells
         if message is not None:
             typer.echo(message, err=True)
     with suppress(OSError):
-        OUTPUT.print_failure(parts, exit_code, problems)
+        OUTPUT.print_failure(parts, exit_code, issues)
     sys.exit(exit_code)

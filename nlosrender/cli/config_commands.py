@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from nlosrender.cli.json_output import OUTPUT, problem_as_json
-from nlosrender.errors import EXIT_BAD_INPUT, EXIT_OK, ConfigError, Problem
+from nlosrender.cli.json_output import OUTPUT, issue_as_json
+from nlosrender.errors import EXIT_BAD_INPUT, EXIT_OK, ConfigError, ValidationIssue
 
 if TYPE_CHECKING:
     from nlosrender.config.document import Config
@@ -77,7 +77,7 @@ def validate(
     from nlosrender.config.sweep_load import load_sweep
     from nlosrender.config.warnings import config_warnings
 
-    problems: list[Problem] = []
+    issues: list[ValidationIssue] = []
     warnings: list[str] = []
     meshes: list[MeshReport] = []
     for path in configs:
@@ -85,12 +85,12 @@ def validate(
             sweep = load_sweep(path, overrides or ())
             config = load_config(path, overrides or ()) if sweep is None else sweep.config(0)
         except ConfigError as error:
-            problems += error.problems
+            issues += error.issues
             continue
         try:
             own_meshes, lines, doubts = _meshes_of(config)
         except ConfigError as error:
-            problems += with_places(error, path, overrides or ()).problems
+            issues += with_places(error, path, overrides or ()).issues
             continue
         found = [f"{path}: {warning}" for warning in (*config_warnings(config), *doubts)]
         warnings += found
@@ -103,11 +103,11 @@ def validate(
             for warning in found:
                 typer.echo(f"warning: {warning}", err=True)
     if as_json:
-        _print_verdict(problems, warnings, meshes)
-    if problems and as_json:
+        _print_verdict(issues, warnings, meshes)
+    if issues and as_json:
         raise typer.Exit(EXIT_BAD_INPUT)
-    if problems:
-        raise ConfigError(problems)
+    if issues:
+        raise ConfigError(issues)
 
 
 def schema() -> None:
@@ -137,16 +137,16 @@ def _meshes_of(config: Config) -> tuple[Sequence[MeshReport], Sequence[str], Seq
     return read.meshes, list(mesh_lines(read.meshes)), read.warnings
 
 
-def _print_verdict(problems: list[Problem], warnings: list[str], meshes: list[MeshReport]) -> None:
+def _print_verdict(issues: list[ValidationIssue], warnings: list[str], meshes: list[MeshReport]) -> None:
     from dataclasses import asdict
 
     verdict = {
-        "valid": not problems,
-        "problems": [problem_as_json(problem) for problem in problems],
+        "valid": not issues,
+        "problems": [issue_as_json(issue) for issue in issues],
         "warnings": warnings,
         "meshes": [asdict(mesh) for mesh in meshes],
     }
-    OUTPUT.print(verdict, EXIT_BAD_INPUT if problems else EXIT_OK, indent=2)
+    OUTPUT.print(verdict, EXIT_BAD_INPUT if issues else EXIT_OK, indent=2)
 
 
 def _summary(config: Config) -> str:

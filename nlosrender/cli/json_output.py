@@ -7,7 +7,7 @@ import sys
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-from nlosrender.errors import EXIT_OK, ConfigError, Problem
+from nlosrender.errors import EXIT_OK, ConfigError, ValidationIssue
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -47,29 +47,29 @@ class JsonOutput:
         failed = {"exit_code": exit_code} if exit_code != EXIT_OK else {}
         typer.echo(json.dumps(_finite({**content, **failed}), indent=indent, allow_nan=False))
 
-    def print_failure(self, messages: Iterable[str], exit_code: int, problems: Iterable[Problem] = ()) -> None:
+    def print_failure(self, messages: Iterable[str], exit_code: int, issues: Iterable[ValidationIssue] = ()) -> None:
         """Print why a command failed, unless it has printed its object before; only where ``--json`` asks for one."""
         if self.printed or not self.asked(sys.argv[1:]):
             return
-        found = [problem_as_json(problem) for problem in problems]
+        found = [issue_as_json(issue) for issue in issues]
         self.print({"exit_code": exit_code, "messages": list(messages), "problems": found})
 
 
-def problem_as_json(problem: Problem) -> dict[str, Any]:
+def issue_as_json(issue: ValidationIssue) -> dict[str, Any]:
     """Return a mistake with its place in parts: ``file``, ``line`` and ``column`` are null where there is none."""
-    file, line, column = problem.place or None, None, None
-    match = _PLACE.fullmatch(problem.place)
-    if problem.place.startswith("--set "):
+    file, line, column = issue.place or None, None, None
+    match = _PLACE.fullmatch(issue.place)
+    if issue.place.startswith("--set "):
         file = None
     elif match:
         file, line, column = match[1], int(match[2]), int(match[3])
     where = {"file": file, "line": line, "column": column}
-    return {"place": problem.place, **where, "key": problem.key, "message": problem.message}
+    return {"place": issue.place, **where, "key": issue.key, "message": issue.message}
 
 
-def problems_of(error: BaseException) -> tuple[Problem, ...]:
+def issues_of(error: BaseException) -> tuple[ValidationIssue, ...]:
     """Return the mistakes in a configuration that an error tells of."""
-    return error.problems if isinstance(error, ConfigError) else ()
+    return error.issues if isinstance(error, ConfigError) else ()
 
 
 def _finite(value: Any) -> Any:

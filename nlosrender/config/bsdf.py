@@ -27,8 +27,8 @@ from nlosrender.config.bsdf_table import (
 from nlosrender.config.fields import Checked, as_finite
 from nlosrender.config.frozen import FrozenDict
 from nlosrender.config.plugin_check import TRANSFORM_KEYS, PluginCheck, checked_plugin
-from nlosrender.config.refusal import KeyPath, listed
-from nlosrender.errors import nearest
+from nlosrender.config.refusal import listed
+from nlosrender.errors import KeyPath, nearest
 
 _NAMES = {  # known ones only: Mitsuba makes a file name of a metal's
     Kind.MATERIAL: (NO_METAL, *METALS),

@@ -13,12 +13,13 @@ from nlosrender.config.idle_keys import without_idle_keys
 from nlosrender.config.line_of_sight import line_of_sight_faults, relay_wall_faults
 from nlosrender.config.mitsuba_xml import read_mitsuba_xml
 from nlosrender.config.plugin_check import config_folder
-from nlosrender.config.refusal import Fault, KeyPath, shown
+from nlosrender.config.refusal import Fault, shown
 from nlosrender.config.relay_wall import EDGE_TOLERANCE, RelayWallConfig
 from nlosrender.config.render import OutputConfig, RenderConfig
 from nlosrender.config.scene import SceneConfig
 from nlosrender.config.section import Section
 from nlosrender.config.sweep import SweepConfig
+from nlosrender.errors import KeyPath
 
 STOKES_COMPONENTS = 4
 MAX_BINS = 2**40  # 4 TiB of float32: beyond it a grid or bin count is a slip of the pen

@@ -12,10 +12,10 @@ from typing import Any
 from nlosrender.config.capture import CaptureConfig, ScanType
 from nlosrender.config.emitters import EmitterConfig
 from nlosrender.config.hidden_geometry import HiddenItemConfig
-from nlosrender.config.refusal import KeyPath
 from nlosrender.config.relay_wall import RelayWallConfig
 from nlosrender.config.render import RenderConfig
 from nlosrender.config.section import Section
+from nlosrender.errors import KeyPath
 
 _SCANS = typing.get_args(ScanType)
 _OF_WALLS = ("single", "confocal", "exhaustive")

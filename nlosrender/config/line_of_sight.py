@@ -6,9 +6,10 @@ from collections.abc import Iterator
 
 from nlosrender.config.capture import CaptureConfig
 from nlosrender.config.mitsuba_xml import read_mitsuba_xml
-from nlosrender.config.refusal import Fault, KeyPath, refusal
+from nlosrender.config.refusal import Fault, refusal
 from nlosrender.config.render import RenderConfig
 from nlosrender.config.scene import SceneConfig
+from nlosrender.errors import KeyPath
 
 _SCAN: KeyPath = ("capture", "scan_type")
 _FEWEST_BOUNCES = 2  # of a relay wall: laser point and sensor point

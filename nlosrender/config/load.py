@@ -16,10 +16,10 @@ from pydantic_core import ErrorDetails
 from nlosrender.config.canonical import tree_hash
 from nlosrender.config.document import Config
 from nlosrender.config.overrides import apply_overrides
-from nlosrender.config.refusal import FAULT, KeyPath, shown
+from nlosrender.config.refusal import FAULT, shown
 from nlosrender.config.translate import locate, problem_from
 from nlosrender.config.yaml_tree import MAX_BYTES, Document, read_document
-from nlosrender.errors import ConfigError, Problem
+from nlosrender.errors import ConfigError, KeyPath, ValidationIssue
 
 # What stands in for a required section that is wrong, so that the rules between the others still run.
 _STAND_INS: dict[KeyPath, Any] = {
@@ -62,7 +62,7 @@ def read_text(path: Path) -> str:
     try:
         if path.is_fifo():  # a look for a sweep comes before the capture, and one for places after it
             message = "is a pipe, and a config is read more than once. Save it as a file."
-            raise ConfigError(Problem(str(path), "", message))
+            raise ConfigError.of_file(str(path), message)
         with path.open("rb") as file:
             content = file.read(MAX_BYTES + 1)
         return content.decode("utf-8-sig")
@@ -70,14 +70,14 @@ def read_text(path: Path) -> str:
         message = f"no UTF-8 text: byte 0x{content[error.start]:02x} at offset {error.start}. Save it as UTF-8."
         if len(content) > MAX_BYTES:  # the cut may have split a character; size is the real mistake
             message = f"larger than {MAX_BYTES // 1024} KiB, which no configuration needs."
-        raise ConfigError(Problem(str(path), "", message)) from error
+        raise ConfigError.of_file(str(path), message) from error
     except FileNotFoundError as error:
         message = f"there is no such file. nlosrender new {path} writes a starter."
-        raise ConfigError(Problem(str(path), "", message)) from error
+        raise ConfigError.of_file(str(path), message) from error
     except IsADirectoryError as error:
-        raise ConfigError(Problem(str(path), "", "this is a folder, need a YAML file.")) from error
+        raise ConfigError.of_file(str(path), "this is a folder, need a YAML file.") from error
     except (OSError, ValueError) as error:
-        raise ConfigError(Problem(str(path), "", f"cannot be read: {getattr(error, 'strerror', error)}.")) from error
+        raise ConfigError.of_file(str(path), f"cannot be read: {getattr(error, 'strerror', error)}.") from error
 
 
 def parse_config(text: str, source: str, folder: Path, overrides: Sequence[str] = ()) -> Config:
@@ -102,7 +102,7 @@ def parse_config(text: str, source: str, folder: Path, overrides: Sequence[str] 
     document = overridden_document(text, source, overrides)
     if document.tree.get("sweep") is not None:
         message = "this makes many captures, and a single one is needed here; remove it, or --set sweep=null."
-        document.problems.append(Problem(document.place(("sweep",), "key"), "sweep", message))
+        document.problems.append(ValidationIssue(("sweep",), message, place=document.place(("sweep",), "key")))
         document.tree = {key: value for key, value in document.tree.items() if key != "sweep"}
     return validate_document(document, folder)
 
@@ -122,7 +122,7 @@ def overridden_document(text: str, source: str, overrides: Sequence[str] = ()) -
         found = "the file is empty" if document.tree is None else f"got {shown(document.tree)}"
         message = f"{found}, need a mapping with the keys {', '.join(Config.model_fields)}."
         place = document.place(()) if document.tree is not None else source
-        raise ConfigError(document.problems or Problem(place, "", message))
+        raise ConfigError(document.problems or ValidationIssue((), message, place=place))
     apply_overrides(document, overrides)
     return document
 
@@ -178,11 +178,14 @@ def _validate(document: Document, context: dict[str, Any]) -> Config:
     told = sorted(dict.fromkeys(problems), key=_reading_order)
     if n_untold or len(told) > MOST_PROBLEMS:
         n_untold += len(told[MOST_PROBLEMS:])
-        told = [*told[:MOST_PROBLEMS], Problem(document.source, "", f"{n_untold} more mistakes are not listed.")]
+        told = [
+            *told[:MOST_PROBLEMS],
+            ValidationIssue((), f"{n_untold} more mistakes are not listed.", place=document.source),
+        ]
     raise ConfigError(told)
 
 
-def _reading_order(problem: Problem) -> tuple[int, int]:
+def _reading_order(problem: ValidationIssue) -> tuple[int, int]:
     """Sort key: from the top of the file down, overrides last."""
     match = re.search(r":(\d+):(\d+)$", problem.place)
     if match is None or problem.place.startswith("--set"):

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from nlosrender.config.refusal import KeyPath, shown
+from nlosrender.config.refusal import shown
 from nlosrender.config.text_keys import takes_text
 from nlosrender.config.yaml_tree import MAX_DEPTH, Document, Place, read_document
-from nlosrender.errors import ConfigError, Problem
+from nlosrender.errors import ConfigError, KeyPath, ValidationIssue
 
 _NOTHING = ("", "~", "null", "Null", "NULL")
 _GOALS = ("spp", "target_error")  # exclude each other
@@ -32,17 +32,17 @@ def apply_overrides(document: Document, overrides: Sequence[str]) -> None:
         parts = [part.strip() for part in key.split(".")]
         if not equals or not all(parts):
             message = "need KEY=VALUE with dots between keys, such as --set capture.sensor_grid.nx=16."
-            document.problems.append(Problem(place, "", message))
+            document.problems.append(ValidationIssue((), message, place=place))
             continue
         if len(parts) > MAX_DEPTH:
             message = f"got {len(parts)} keys, one inside the other; need at most {MAX_DEPTH}."
-            document.problems.append(Problem(place[:_LONGEST_PLACE], "", message))
+            document.problems.append(ValidationIssue((), message, place=place[:_LONGEST_PLACE]))
             continue
         try:
             value = _value(parts, key, text, place)
             put(document, parts, value, Place(place, place))
         except ConfigError as error:
-            document.problems.extend(error.problems)
+            document.problems.extend(error.issues)
 
 
 def _value(parts: Sequence[str], key: str, text: str, place: str) -> Any:
@@ -53,9 +53,11 @@ def _value(parts: Sequence[str], key: str, text: str, place: str) -> Any:
     try:
         read = read_document(text, place)
     except ConfigError as error:
-        raise ConfigError([Problem(place, key, problem.message) for problem in error.problems]) from error
+        raise ConfigError(
+            [ValidationIssue((key,), problem.message, place=place) for problem in error.issues]
+        ) from error
     if read.problems:
-        raise ConfigError([Problem(place, key, problem.message) for problem in read.problems])
+        raise ConfigError([ValidationIssue((key,), problem.message, place=place) for problem in read.problems])
     return read.tree
 
 
@@ -116,9 +118,9 @@ def _step(container: Any, part: str, path: KeyPath, place: str) -> str | int:
         return part
     if not isinstance(container, list):
         message = f"cannot set {part} in {where}, which holds {shown(container)}; need a mapping or a list there."
-        raise ConfigError(Problem(place, where, message))
+        raise ConfigError(ValidationIssue(path, message, place=place))
     if not part.isdecimal() or int(part) >= len(container):
         allowed = f"an index from 0 to {len(container) - 1}" if container else "a non-empty list"
         message = f"got {part} in a list of {len(container)}, need {allowed}."
-        raise ConfigError(Problem(place, f"{where}.{part}", message))
+        raise ConfigError(ValidationIssue((*path, part), message, place=place))
     return int(part)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from nlosrender.config.overrides import apply_overrides
 from nlosrender.config.yaml_tree import Document, read_document
-from nlosrender.errors import ConfigError, Problem
+from nlosrender.errors import ConfigError, ValidationIssue
 
 
 def with_places(error: ConfigError, path: Path, overrides: Sequence[str] = ()) -> ConfigError:
@@ -26,11 +26,8 @@ def with_places(error: ConfigError, path: Path, overrides: Sequence[str] = ()) -
         apply_overrides(document, overrides)
     except (OSError, ValueError):  # gone or changed since it was loaded: the key alone has to do
         return error
-    return ConfigError([_placed(problem, document) for problem in error.problems])
+    return ConfigError([_placed(problem, document) for problem in error.issues])
 
 
-def _placed(problem: Problem, document: Document) -> Problem:
-    if problem.place or not problem.key:
-        return problem
-    path = tuple(int(part) if part.isdigit() else part for part in problem.key.split("."))
-    return dataclasses.replace(problem, place=document.place(path))
+def _placed(issue: ValidationIssue, document: Document) -> ValidationIssue:
+    return issue if issue.place or not issue.path else dataclasses.replace(issue, place=document.place(issue.path))

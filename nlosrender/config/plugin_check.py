@@ -12,8 +12,8 @@ from pydantic import ValidationInfo
 from nlosrender.config.encodable import is_encodable
 from nlosrender.config.fields import LONGEST, as_finite
 from nlosrender.config.frozen import freeze
-from nlosrender.config.refusal import Fault, KeyPath, raise_faults, refusal, shown
-from nlosrender.errors import nearest
+from nlosrender.config.refusal import Fault, raise_faults, refusal, shown
+from nlosrender.errors import KeyPath, nearest
 
 TRANSFORM_KEYS = ("to_world", "to_uv")
 _OPERATIONS = "translate: [x, y, z], rotate: {axis: [x, y, z], angle_deg: a}, scale: s or [x, y, z]"

@@ -1,6 +1,6 @@
 """How a wrong value is refused: one plain sentence, with the value found and what is allowed.
 
-Validators of the config raise what this module builds; ``translate`` turns it into :class:`~nlosrender.errors.Problem`.
+Validators of the config raise what this module builds; ``translate`` makes a ``ValidationIssue`` of it.
 """
 
 from __future__ import annotations
@@ -13,9 +13,10 @@ from pydantic import ValidationError
 from pydantic_core import InitErrorDetails, PydanticCustomError
 
 from nlosrender.config.encodable import encodable
+from nlosrender.errors import KeyPath
 
 FAULT = "fault"  # error type of everything built here, so that it is told from pydantic's own
-KeyPath = tuple[str | int, ...]
+
 _LONGEST_SHOWN = 60  # characters of a wrong value that still help
 
 

@@ -16,11 +16,11 @@ from pydantic import ValidationError
 from nlosrender.config.document import Config
 from nlosrender.config.load import MOST_PROBLEMS, default_name, overridden_document, read_text, validate_document
 from nlosrender.config.overrides import put
-from nlosrender.config.refusal import KeyPath, shown
+from nlosrender.config.refusal import shown
 from nlosrender.config.sweep import SweepConfig
 from nlosrender.config.translate import problem_from
 from nlosrender.config.yaml_tree import Document, Place
-from nlosrender.errors import ConfigError, Problem
+from nlosrender.errors import ConfigError, KeyPath, ValidationIssue
 
 DEFAULT_PATTERN = "{name}/{index:05d}.hdf5"
 _SWEEP = "sweep"
@@ -134,7 +134,7 @@ def _refuse_swept_overrides(section: SweepConfig, overrides: Sequence[str]) -> N
     swept = {*section.keys, *(section.random.keys if section.random else ())}
     message = "is swept; take it out of sweep, or leave --set away."
     problems = [
-        Problem(f"--set {override}", key, message)
+        ValidationIssue((key,), message, place=f"--set {override}")
         for override in overrides
         if (key := override.partition("=")[0].strip()) in swept
     ]
@@ -165,13 +165,13 @@ def _settings(section: SweepConfig) -> Iterator[tuple[_Setting, ...]]:
 
 def _validated(base: Document, folder: Path, settings: tuple[tuple[_Setting, ...], ...]) -> Sweep:
     """Look at every capture; a mistake that several share is told once, with the first of them."""
-    found: dict[Problem, list[int]] = {}
+    found: dict[ValidationIssue, list[int]] = {}
     paths: dict[Path, int] = {}
     for index, own in enumerate(settings):
         try:
             config = validate_document(_capture_document(base, own, index), folder)
         except ConfigError as error:
-            for problem in error.problems:
+            for problem in error.issues:
                 found.setdefault(problem, []).append(index)
         else:
             path = config.output.path
@@ -179,7 +179,7 @@ def _validated(base: Document, folder: Path, settings: tuple[tuple[_Setting, ...
                 place = base.place(("output", "path"))
                 message = f"captures {paths[path]} and {index} are both {path}; need {{index}} in it, as in "
                 message += f"{DEFAULT_PATTERN}."
-                raise ConfigError(Problem(place, "output.path", message))
+                raise ConfigError(ValidationIssue(("output", "path"), message, place=place))
             paths[path] = index
         if len(found) >= MOST_PROBLEMS:
             break
@@ -188,7 +188,7 @@ def _validated(base: Document, folder: Path, settings: tuple[tuple[_Setting, ...
     return Sweep(base, folder, settings, tuple(paths))
 
 
-def _told(problem: Problem, indices: list[int], settings: tuple[tuple[_Setting, ...], ...]) -> Problem:
+def _told(problem: ValidationIssue, indices: list[int], settings: tuple[tuple[_Setting, ...], ...]) -> ValidationIssue:
     """Say which captures have a mistake that not all of them have."""
     if len(indices) == len(settings):
         return problem
@@ -214,7 +214,7 @@ def _capture_document(base: Document, settings: tuple[_Setting, ...], index: int
         try:
             put(document, setting.key.split("."), copy.deepcopy(setting.value), place)
         except ConfigError as error:
-            document.problems += error.problems
+            document.problems += error.issues
     _set_output(document, index)
     return document
 
@@ -231,7 +231,7 @@ def _set_output(document: Document, index: int) -> None:
     filled = _filled(pattern, {"name": name}, index)
     if "{" in filled or "}" in filled:
         message = f"got {shown(pattern)}; in a sweep only {{index}}, {{index:05d}} and {{name}} may stand in braces."
-        document.problems.append(Problem(document.place(("output", "path")), "output.path", message))
+        document.problems.append(ValidationIssue(("output", "path"), message, place=document.place(("output", "path"))))
     output["path"] = filled
 
 

@@ -10,9 +10,9 @@ from pydantic import BaseModel
 from pydantic_core import ErrorDetails
 
 from nlosrender.config.document import Config
-from nlosrender.config.refusal import FAULT, KeyPath, refusal
+from nlosrender.config.refusal import FAULT, refusal
 from nlosrender.config.yaml_tree import Document
-from nlosrender.errors import Problem, nearest
+from nlosrender.errors import KeyPath, ValidationIssue, nearest
 
 _NOT_A_MAPPING = ("model_type", "model_attributes_type", "dict_type", "mapping_type")
 
@@ -48,7 +48,7 @@ def _sections_in(annotation: Any) -> list[type[BaseModel]]:
     return [section for part in typing.get_args(annotation) for section in _sections_in(part)]
 
 
-def problem_from(error: ErrorDetails, document: Document) -> Problem:
+def problem_from(error: ErrorDetails, document: Document) -> ValidationIssue:
     """Return one pydantic error as a problem with its place."""
     path, section = locate(error["loc"])
     kind, value, context = error["type"], error.get("input"), error.get("ctx", {})
@@ -77,7 +77,7 @@ def problem_from(error: ErrorDetails, document: Document) -> Problem:
         message = refusal(value, "a list", "Write [] for an empty one." if value is None else "")
     else:
         message = f"{error['msg']}."
-    return Problem(document.place(path, at), ".".join(map(str, path)), message)
+    return ValidationIssue(path, message, at, document.place(path, at))
 
 
 def _tags(location: tuple[str | int, ...]) -> str:

@@ -6,7 +6,7 @@ import re
 
 import yaml
 
-from nlosrender.errors import Problem
+from nlosrender.errors import ValidationIssue
 
 _INDENT = (
     "the indentation does not fit the lines above: give all keys of a mapping, and all items of a list, the same "
@@ -67,7 +67,7 @@ _WORDS: tuple[tuple[str, str], ...] = (
 )
 
 
-def syntax_problem(error: yaml.MarkedYAMLError, source: str) -> Problem:
+def syntax_problem(error: yaml.MarkedYAMLError, source: str) -> ValidationIssue:
     """Return the problem of a text that PyYAML gave up on.
 
     Parameters
@@ -88,4 +88,4 @@ def syntax_problem(error: yaml.MarkedYAMLError, source: str) -> Problem:
             found = match.expand(words)
             break
     since = f" (it begins in line {begun.line + 1})" if mark and begun and begun.line != mark.line else ""
-    return Problem(place, "", f"not usable as YAML: {found}{since}.")
+    return ValidationIssue((), f"not usable as YAML: {found}{since}.", place=place)

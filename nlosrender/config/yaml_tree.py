@@ -19,9 +19,9 @@ from yaml.resolver import BaseResolver
 from yaml.scanner import Scanner
 
 from nlosrender.config.encodable import joined
-from nlosrender.config.refusal import KeyPath, shown
+from nlosrender.config.refusal import shown
 from nlosrender.config.yaml_mistakes import syntax_problem
-from nlosrender.errors import ConfigError, Problem
+from nlosrender.errors import ConfigError, KeyPath, ValidationIssue
 
 MAX_BYTES = 2**20
 MAX_NODES = 100_000  # keys and values after every alias is written out
@@ -46,7 +46,7 @@ class Document:
     source: str
     tree: Any
     places: dict[KeyPath, Place] = field(default_factory=dict)
-    problems: list[Problem] = field(default_factory=list)
+    problems: list[ValidationIssue] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)  # what of the text has no effect
     unread: set[KeyPath] = field(default_factory=set)  # paths whose value is a stand-in for one that is no value
 
@@ -123,7 +123,7 @@ def read_document(text: str, source: str) -> Document:
         The text is no YAML, or grows beyond the bounds.
     """
     if len(text.encode("utf-8", "surrogatepass")) > MAX_BYTES:
-        raise ConfigError(Problem(source, "", f"larger than {MAX_BYTES // 1024} KiB, which no configuration needs."))
+        raise ConfigError.of_file(source, f"larger than {MAX_BYTES // 1024} KiB, which no configuration needs.")
     try:
         node = _Composer(text).get_single_node()
         if node is not None:
@@ -134,7 +134,7 @@ def read_document(text: str, source: str) -> Document:
         before = text[: error.position]
         place = f"{source}:{before.count(chr(10)) + 1}:{len(before) - before.rfind(chr(10))}"
         message = f"character U+{error.character:04X} may not stand in YAML; remove it."
-        raise ConfigError(Problem(place, "", message)) from error
+        raise ConfigError.of_file(place, message) from error
     document = Document(source, None)
     if node is not None:
         document.places[()] = Place(_at(node, source), _at(node, source))
@@ -266,7 +266,7 @@ class _Builder:
 
     def _problem(self, node: Node, path: KeyPath, message: str) -> None:
         place = _at(node, self.document.source)
-        self.document.problems.append(Problem(place, ".".join(map(str, path)), message))
+        self.document.problems.append(ValidationIssue(path, message, place=place))
 
 
 def _is_merge(key: Node) -> bool:

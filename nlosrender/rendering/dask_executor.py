@@ -19,7 +19,7 @@ from nlosrender.errors import BackendError, IncompleteRender, InterruptedRender,
 from nlosrender.files.partial.partial_capture import PartialCapture
 from nlosrender.interruption import StopRequest
 from nlosrender.rendering.dask_cluster import Cluster
-from nlosrender.rendering.dask_worker import Job, PackedItem, Refusal, render_remotely
+from nlosrender.rendering.dask_worker import Job, PackedItem, RemoteError, render_remotely
 from nlosrender.rendering.local_executor import saved_suffix, standing
 from nlosrender.rendering.render_report import Progress, Stopwatch, Warn, Watch
 from nlosrender.rendering.work_items import ItemWriter
@@ -185,7 +185,7 @@ class _Flight:
         from distributed import KilledWorker
 
         try:
-            result: PackedItem | Refusal = future.result()
+            result: PackedItem | RemoteError = future.result()
         except KilledWorker as error:
             raise IncompleteRender(
                 "a unit has ended every worker process it was given to. Lower render.memory_limit if they ran out "
@@ -195,6 +195,6 @@ class _Flight:
             raise IncompleteRender("the dask scheduler is gone, and the units in flight with it.") from error
         except ImportError as error:
             raise BackendError(f"a worker lacks a package ({error}). Install nlosrender on every machine.") from error
-        if isinstance(result, Refusal):
+        if isinstance(result, RemoteError):
             raise result.error()
         return result

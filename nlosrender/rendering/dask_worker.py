@@ -17,7 +17,7 @@ from nlosrender.config.canonical import tree_hash
 from nlosrender.config.document import Config
 from nlosrender.config.load import config_to_dict
 from nlosrender.engine.backend.start import Backend, BackendName, limit_threads, start_backend
-from nlosrender.errors import BackendError, ConfigError, NlosError, Problem
+from nlosrender.errors import BackendError, ConfigError, NlosError, ValidationIssue
 from nlosrender.files.chunking import Chunker, PackedChunk
 from nlosrender.files.identity import capture_identity, differences
 from nlosrender.files.sums import Sums
@@ -56,11 +56,11 @@ class PackedItem:
 
 
 @dataclass(frozen=True)
-class Refusal:
+class RemoteError:
     """An explained error as it travels: a value, so that dask neither retries nor pickles an exception."""
 
     kind: type[NlosError]
-    content: str | tuple[Problem, ...]
+    content: str | tuple[ValidationIssue, ...]
 
     def error(self) -> NlosError:
         """Return the error to raise."""
@@ -95,7 +95,7 @@ _WORKER = _WorkerState()
 
 def render_remotely(
     job: Job, item: WorkItem, budget: Mapping[str, Any], store_variance: bool, threads: int | None
-) -> PackedItem | Refusal:
+) -> PackedItem | RemoteError:
     """Render a work item in a worker process.
 
     Parameters
@@ -122,9 +122,9 @@ def render_remotely(
         packed = tuple(finished.chunks(chunker))
         stopwatch.seconds["compress"] += time.perf_counter() - begun
     except ConfigError as error:
-        return Refusal(ConfigError, error.problems)
+        return RemoteError(ConfigError, error.issues)
     except NlosError as error:
-        return Refusal(type(error), f"{error} (on worker {_worker_name()})")
+        return RemoteError(type(error), f"{error} (on worker {_worker_name()})")
     return PackedItem(item, packed, finished.sums, stopwatch.seconds)
 
 

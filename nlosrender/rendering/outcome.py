@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from nlosrender.capture.bounces import BounceAxis
 from nlosrender.config.render import RenderConfig
-from nlosrender.errors import ConfigError, Problem
+from nlosrender.errors import ConfigError, ValidationIssue
 from nlosrender.files.parts.part_attributes import MISSED, known_of, summed_attributes
 
 if TYPE_CHECKING:
@@ -81,7 +81,7 @@ def missing_light(engine: Engine, strict: bool = False) -> tuple[UnsampledPaths,
 
     found = unsampled_paths(engine)
     if strict and found:
-        raise ConfigError([Problem("", paths.key, f"--strict: {paths.warning}") for paths in found])
+        raise ConfigError([ValidationIssue.at_key(paths.key, f"--strict: {paths.warning}") for paths in found])
     return found
 
 

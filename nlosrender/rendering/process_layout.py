@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 from nlosrender.capture.plan import MAX_ITEM_SAMPLES
 from nlosrender.engine.backend.start import PROCESS_BYTES, physical_memory
-from nlosrender.errors import ConfigError, Problem
+from nlosrender.errors import ConfigError
 
 # 64 MB with the variance, before it is packed: a message a network carries, and a loss a dying worker may cause
 MAX_SHIPPED_SAMPLES = 2**23
@@ -50,12 +50,12 @@ class ProcessLayout:
                 f"got {limit / 1e6:.0f} MB, of which the program takes {PROCESS_BYTES / 1e6:.0f} MB in each process "
                 f"before any histogram: need more than {least / 1e6:.0f} MB, or fewer --workers."
             )
-            raise ConfigError(Problem("", _KEY, message))
+            raise ConfigError.at(_KEY, message)
         return share
 
     @contextmanager
     def named(self, limit: int | None) -> Iterator[None]:
-        """Say in problems of the memory limit that it is shared, and how large the share of one process is."""
+        """Say in issues of the memory limit that it is shared, and how large the share of one process is."""
         try:
             yield
         except ConfigError as error:
@@ -66,7 +66,7 @@ class ProcessLayout:
             raise ConfigError(
                 [
                     replace(found, message=f"{found.message} {told}") if found.key == _KEY else found
-                    for found in error.problems
+                    for found in error.issues
                 ]
             ) from error
 

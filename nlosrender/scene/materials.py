@@ -11,7 +11,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from nlosrender.errors import ConfigError, Problem
+from nlosrender.errors import ConfigError
 from nlosrender.scene.hidden_geometry import Radiance
 from nlosrender.scene.images import check_image, image_files
 from nlosrender.scene.transforms import transform_matrix
@@ -197,7 +197,7 @@ def _check_texels(values: NDArray, name: str, key: str) -> None:
 
 def rejected(key: str, message: str) -> ConfigError:
     """Return the error about an item of the configuration."""
-    return ConfigError(Problem("", key, message))
+    return ConfigError.at(key, message)
 
 
 def first_line(error: BaseException) -> str:

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from nlosrender.config.bsdf_table import TRANSMITTING
-from nlosrender.errors import ConfigError, Problem
+from nlosrender.errors import ConfigError
 from nlosrender.scene.bounding_box import box_corners
 from nlosrender.scene.file_mesh import FileMesh
 from nlosrender.scene.hidden_geometry import MeshFile, ShapeDescription, Surface, hidden_surfaces
@@ -102,11 +102,11 @@ def _read(
         mesh = mesh.turned_round() if shape.flip_normals else mesh
     except ValueError as error:
         message = f"{shape.filename} cannot be used as a mesh: {error}."
-        raise ConfigError(Problem("", f"{surface.key}.filename", message)) from error
+        raise ConfigError.at(f"{surface.key}.filename", message) from error
     if mesh.uvs is None and has_picture(surface.bsdf):
         message = (
             f"a picture needs texture coordinates, and {shape.filename} cannot place it: {read.no_uvs}. Give every "
             "corner some, or take a texture or number that is the same everywhere."
         )
-        raise ConfigError(Problem("", f"{surface.key}.bsdf", message))
+        raise ConfigError.at(f"{surface.key}.bsdf", message)
     return mesh, read, mesh_report(surface.key, surface.name, Path(shape.filename).name, read, mesh, normals, wall_box)

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from nlosrender.config.fields import LONGEST, SHORTEST
-from nlosrender.errors import ConfigError, Problem
+from nlosrender.errors import ConfigError
 from nlosrender.scene.file_mesh import FileMesh
 from nlosrender.scene.hidden_geometry import mesh_matrix
 from nlosrender.scene.mesh_file import read_mesh_file
@@ -247,8 +247,8 @@ def _flattened(mesh: TriangleMesh) -> TriangleMesh:
 def too_fine(where: str) -> ConfigError:
     """Return the error about a laser or sensor point on a triangle that the renderer cannot find."""
     message = f"the relay wall's mesh is too fine at {where}. Remove slivers or use larger triangles there, or move the"
-    return ConfigError(Problem("", "scene.relay_wall.filename", f"{message} laser and sensor points off it."))
+    return ConfigError.at("scene.relay_wall.filename", f"{message} laser and sensor points off it.")
 
 
 def _refused(message: str) -> ConfigError:
-    return ConfigError(Problem("", "capture", message))
+    return ConfigError.at("capture", message)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from nlosrender.errors import ConfigError, Problem
+from nlosrender.errors import ConfigError
 
 
 @contextmanager
@@ -21,4 +21,4 @@ def placed() -> Iterator[None]:
         yield
     except ValueError as error:
         key, _, message = str(error).partition(": ")
-        raise ConfigError(Problem("", key, message)) from error
+        raise ConfigError.at(key, message) from error

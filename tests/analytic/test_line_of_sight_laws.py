@@ -137,7 +137,7 @@ def test_what_mitsuba_finds_wrong_with_a_scene(content: str, message: str, tmp_p
     (tmp_path / "scene.xml").write_text(f"<scene version='3.0.0'>{content}</scene>", encoding="utf-8")
     with pytest.raises(ConfigError, match=message) as caught:
         see(view_config(emitters=[PANEL], scene={"mitsuba": "scene.xml"}), folder=tmp_path)
-    assert caught.value.problems[0].key == "scene.mitsuba"
+    assert caught.value.issues[0].key == "scene.mitsuba"
 
 
 @pytest.mark.parametrize("axis", ["x", "y", "smaller", "larger", "diagonal"])

@@ -78,7 +78,7 @@ def test_two_media_behind_one_surface_are_refused(second: dict[str, Any]) -> Non
     ball |= {"bsdf": {"type": "blendbsdf", "weight": 0.5, "a": GLASS, "b": second}}
     with pytest.raises(ConfigError, match=r"refractive indices 1(\.3)? and 1\.5, need one medium") as caught:
         see(view_config(ball, emitters=[LAMP], spp=1))
-    assert caught.value.problems[0].key == "scene.hidden_geometry.0.bsdf"
+    assert caught.value.issues[0].key == "scene.hidden_geometry.0.bsdf"
 
 
 HALF = {"type": "checkerboard", "color0": 1.0, "color1": 0.5}
@@ -209,7 +209,7 @@ def test_a_shape_that_is_not_there_is_refused(shape: str, message: str, tmp_path
     shape = shape.format(flat="<transform name='to_world'>", end="</transform>")
     with pytest.raises(ConfigError, match=rf"scene\.xml: line 3: .*{message}") as caught:
         seen(tmp_path, f"<shape type='cube'/>\n{shape}")
-    assert caught.value.problems[0].key == "scene.mitsuba"
+    assert caught.value.issues[0].key == "scene.mitsuba"
 
 
 def test_a_mesh_that_mitsuba_reads_otherwise_is_refused(tmp_path: Path) -> None:
@@ -279,7 +279,7 @@ def test_a_texture_that_cannot_be_evaluated_is_told_before_the_render(holder: st
     plate = {"type": "rectangle", "width": 1, "height": 1, "center": [0, 0, 0], "normal": [0, 0, 1], "bsdf": bsdf}
     with pytest.raises(ConfigError, match="need a bitmap") as caught:
         see(view_config(plate, emitters=[LAMP], spp=1))
-    assert caught.value.problems[0].key == "scene.hidden_geometry.0.bsdf"
+    assert caught.value.issues[0].key == "scene.hidden_geometry.0.bsdf"
     content = f"""<shape type='rectangle'><bsdf type='{holder}'><texture type='checkerboard' name='normalmap'/>
         <bsdf type='diffuse'/></bsdf></shape>"""
     with pytest.raises(ConfigError, match=r"Rectangle: Mitsuba cannot evaluate its BSDF: .* need a bitmap"):

@@ -101,7 +101,7 @@ def test_attributes_that_are_not_there_or_cannot_be_are_refused(
     start_backend("llvm", colored=True, polarized=False)
     with pytest.raises(ConfigError, match=message) as caught:
         pipeline.load_scene(config)
-    assert caught.value.problems[0].key == "scene.hidden_geometry.0.bsdf"
+    assert caught.value.issues[0].key == "scene.hidden_geometry.0.bsdf"
 
 
 def test_a_relay_wall_has_no_attributes() -> None:

@@ -102,7 +102,7 @@ def test_validate_raises_the_problems_of_every_file(starter: Path, tmp_path: Pat
     result = runner.invoke(app, ["validate", str(tmp_path / "no.yaml"), str(starter), str(tmp_path)])
     assert f"{starter}: ok" in result.stdout
     assert isinstance(result.exception, ConfigError)
-    assert [problem.place for problem in result.exception.problems] == [str(tmp_path / "no.yaml"), str(tmp_path)]
+    assert [problem.place for problem in result.exception.issues] == [str(tmp_path / "no.yaml"), str(tmp_path)]
 
 
 def test_validate_applies_overrides(starter: Path) -> None:

@@ -12,8 +12,8 @@ import pytest
 from support.point_captures import cells, points_header, write_points
 
 from nlosrender.cli import app
-from nlosrender.cli.json_output import OUTPUT, problem_as_json
-from nlosrender.errors import EXIT_BAD_INPUT, EXIT_COMPARISON_EXCEEDED, EXIT_FAILURE, EXIT_USAGE, Problem
+from nlosrender.cli.json_output import OUTPUT, issue_as_json
+from nlosrender.errors import EXIT_BAD_INPUT, EXIT_COMPARISON_EXCEEDED, EXIT_FAILURE, EXIT_USAGE, ValidationIssue
 
 SCENE = """\
 scene:
@@ -128,7 +128,7 @@ def test_without_json_nothing_is_printed_on_stdout(
 
 def test_a_place_is_told_in_parts_whatever_the_file_is_called() -> None:
     """Colons and line breaks in a name are the name's."""
-    found = problem_as_json(Problem("a:1:2\n.yaml:14:3", "x", "wrong."))
+    found = issue_as_json(ValidationIssue(("x",), "wrong.", place="a:1:2\n.yaml:14:3"))
     assert (found["file"], found["line"], found["column"]) == ("a:1:2\n.yaml", 14, 3)
 
 

@@ -37,7 +37,7 @@ from nlosrender.errors import BackendError
 from nlosrender.files.identity import capture_identity
 from nlosrender.rendering import dask_cluster
 from nlosrender.rendering.dask_cluster import joined_cluster
-from nlosrender.rendering.dask_worker import Job, Refusal, render_remotely
+from nlosrender.rendering.dask_worker import Job, RemoteError, render_remotely
 
 psutil = pytest.importorskip("psutil")
 pytest.importorskip("distributed")
@@ -269,7 +269,7 @@ def test_a_worker_refuses_what_it_would_render_otherwise(folder: Path) -> None:
         everything = WorkItem(Tile(0, 3, 0, 5), Tile(0, 1, 0, 1), ())
         future = cluster.client.submit(render_remotely, job, everything, {}, False, None, pure=False)
         refusal = future.result(timeout=60)
-    assert isinstance(refusal, Refusal)
+    assert isinstance(refusal, RemoteError)
     with pytest.raises(BackendError, match=r"hidden_geometry\.1\.filename: \"sha256:0\" there, .*versions\.drjit"):
         raise refusal.error()
 

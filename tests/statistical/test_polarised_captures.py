@@ -136,7 +136,7 @@ def test_what_cannot_be_polarised(changes: dict[str, Any], key: str, message: st
     """Impossible combinations are told in the configuration."""
     with pytest.raises(ConfigError, match=message) as caught:
         configured(flat_wall(plate(), polarized=True, **changes))
-    assert caught.value.problems[0].key == key
+    assert caught.value.issues[0].key == key
 
 
 def test_only_paths_carry_polarised_light() -> None:

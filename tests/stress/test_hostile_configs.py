@@ -30,7 +30,7 @@ def test_damaged_configs_are_judged(text: str, ledger: Ledger) -> None:
     try:
         parse_config(text, "fuzz.yaml", Path("/nonexistent"))
     except ConfigError as error:
-        messages = [problem.message for problem in error.problems]
+        messages = [problem.message for problem in error.issues]
     assert time.perf_counter() - begun < SLOWEST
     assert messages
     assert all(messages)

@@ -79,7 +79,7 @@ def test_thousands_of_mistakes_are_told_in_part() -> None:
     text = "scene: 1\ncapture: 1\n" + "".join(f"k{i}: 1\n" for i in range(2_000))
     with pytest.raises(ConfigError, match=r"19\d\d more mistakes are not listed") as error:
         configured(text)
-    assert len(error.value.problems) == 101
+    assert len(error.value.issues) == 101
 
 
 def test_a_key_that_is_a_list_is_called_one(tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ import pytest
 
 from nlosrender.config.document import Config
 from nlosrender.config.load import load_config, parse_config
-from nlosrender.errors import ConfigError, Problem
+from nlosrender.errors import ConfigError, ValidationIssue
 
 BASE = """\
 name: z
@@ -278,11 +278,11 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def problems_of(text: str, folder: Path, overrides: tuple[str, ...] = ()) -> tuple[Problem, ...]:
+def problems_of(text: str, folder: Path, overrides: tuple[str, ...] = ()) -> tuple[ValidationIssue, ...]:
     with pytest.raises(ConfigError) as caught:
         parse_config(text, "z.yaml", folder, overrides)
     assert caught.value.exit_code == 3
-    return caught.value.problems
+    return caught.value.issues
 
 
 def test_the_base_is_sound(folder: Path) -> None:
@@ -403,4 +403,4 @@ def test_a_file_that_cannot_be_read_is_explained(
         path.write_bytes(content)
     with pytest.raises(ConfigError, match=message) as caught:
         load_config(path)
-    assert len(caught.value.problems) == 1
+    assert len(caught.value.issues) == 1

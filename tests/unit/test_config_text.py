@@ -81,7 +81,7 @@ def test_text_that_grows_without_bound_is_refused_before_it_grows(text: str, mes
     error = refused(text, match=message)
     # Some 20 ms on a slow machine; written out, the bombs hold 9^9 and 10^30 values.
     assert time.perf_counter() - start < 2.0
-    assert re.match(r"z\.yaml:\d+:\d+$", error.problems[0].place)
+    assert re.match(r"z\.yaml:\d+:\d+$", error.issues[0].place)
 
 
 def test_many_values_are_refused_too() -> None:
@@ -106,7 +106,7 @@ def test_broken_text_never_gives_a_traceback() -> None:
             parse(text)
         except ConfigError as error:
             refusals.append(error)
-    assert all(error.problems and all(problem.message for problem in error.problems) for error in refusals)
+    assert all(error.issues and all(problem.message for problem in error.issues) for error in refusals)
     assert len(refusals) > 40  # edits inside comments, a half of the text, change nothing
 
 
@@ -169,7 +169,7 @@ def test_an_override_can_repair_the_file() -> None:
 def test_a_wrong_override_is_placed_at_the_override(override: str, key: str, message: str) -> None:
     """The place of a mistake that came by --set is that option, as it was typed."""
     error = refused(SMALL, override, match=re.escape(message))
-    (problem,) = [problem for problem in error.problems if problem.key == key]
+    (problem,) = [problem for problem in error.issues if problem.key == key]
     assert problem.place == f"--set {override}"
 
 

@@ -102,7 +102,7 @@ def test_every_configuration_is_valid_or_names_the_command_that_makes_its_mesh(p
         return
     with pytest.raises(ConfigError) as caught:
         load_config(path)
-    (problem,) = caught.value.problems
+    (problem,) = caught.value.issues
     assert problem.message.endswith("It is made by: nlosrender paper --meshes-only")
 
 

@@ -118,11 +118,11 @@ def test_keys_that_place_a_thing_stay_mistakes(path: str, choice: Any) -> None:
             tree = config_of("line_of_sight", OWN["line_of_sight"])
             with pytest.raises(ConfigError) as caught:
                 parsed(tree, f"{path}={{type: {chosen}, {key}: 1}}")
-            assert any(problem.key == f"{path}.{key}" for problem in caught.value.problems)
+            assert any(problem.key == f"{path}.{key}" for problem in caught.value.issues)
             with pytest.raises(ConfigError) as caught:
                 parsed(tree, f"{path}={{type: {chosen}, {key}: null, radios: 1}}")
-            assert not any(problem.key == f"{path}.{key}" for problem in caught.value.problems)
-            assert any(problem.key == f"{path}.radios" for problem in caught.value.problems)
+            assert not any(problem.key == f"{path}.{key}" for problem in caught.value.issues)
+            assert any(problem.key == f"{path}.radios" for problem in caught.value.issues)
             tried += 1
     assert tried >= 10
 

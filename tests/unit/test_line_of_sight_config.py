@@ -25,7 +25,7 @@ def problem_of(config: dict[str, Any], folder: Path | None = None) -> tuple[str,
     """Return key and message of the one mistake in a configuration."""
     with pytest.raises(ConfigError) as caught:
         configured(config, folder=folder)
-    (problem,) = caught.value.problems
+    (problem,) = caught.value.issues
     return problem.key, problem.message
 
 
@@ -84,7 +84,7 @@ def test_mistakes_of_an_emitter(emitter: dict[str, Any], key: str, message: str)
     """Emitters are told apart by their type, and checked like any item."""
     with pytest.raises(ConfigError, match=message) as caught:
         configured(view_config(emitters=[emitter]))
-    assert caught.value.problems[0].key == f"scene.emitters.0.{key}"
+    assert caught.value.issues[0].key == f"scene.emitters.0.{key}"
 
 
 def test_a_whole_scene_is_for_cameras(tmp_path: Path) -> None:
@@ -151,7 +151,7 @@ def test_mistakes_of_a_mitsuba_scene(content: str, message: str, tmp_path: Path)
     (tmp_path / "scene.xml").write_text(content, encoding="utf-8")
     with pytest.raises(ConfigError, match=message) as caught:
         configured(view_config(emitters=[LAMP], scene={"mitsuba": "scene.xml"}), folder=tmp_path)
-    assert caught.value.problems[0].key == "scene.mitsuba"
+    assert caught.value.issues[0].key == "scene.mitsuba"
 
 
 @pytest.mark.parametrize("encoding", ["utf-8", "utf-16"])

@@ -214,7 +214,7 @@ def test_a_point_on_a_sliver_is_refused_before_the_render(sliver: float, tmp_pat
     with pytest.raises(ConfigError, match=r"too fine at wall coordinates .* a sliver .* Remove slivers") as caught:
         build_capture(validated.capture, wall)
     assert caught.value.exit_code == 3
-    assert caught.value.problems[0].key == "scene.relay_wall.filename"
+    assert caught.value.issues[0].key == "scene.relay_wall.filename"
 
 
 def test_slivers_beside_the_points_are_no_matter(tmp_path: Path) -> None:

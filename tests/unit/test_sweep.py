@@ -37,7 +37,7 @@ def problems_of(text: str, *overrides: str, base: str = BASE) -> list[str]:
     """Parse a config with a sweep that has mistakes."""
     with pytest.raises(ConfigError) as caught:
         sweep_of(text, *overrides, base=base)
-    return [str(problem) for problem in caught.value.problems]
+    return [str(problem) for problem in caught.value.issues]
 
 
 def swept(values: Any) -> list[Any]:
@@ -289,7 +289,7 @@ def test_a_sweep_where_one_capture_is_needed() -> None:
     """Commands that take one capture say so, beside every other mistake."""
     with pytest.raises(ConfigError, match=r"z\.yaml:7:1: sweep: this makes many captures") as caught:
         parse_config(BASE.replace("ny: 3", "ny: 0") + "sweep: {keys: {render.seed: [1]}}\n", "z.yaml", Path("/tmp"))
-    assert len(caught.value.problems) == 2
+    assert len(caught.value.issues) == 2
 
 
 def test_captures_share_nothing() -> None:

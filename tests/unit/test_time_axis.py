@@ -132,7 +132,7 @@ def test_too_many_bins_are_refused_with_advice():
     """Auto stops at 65536 bins and names the key and a bin width that fits."""
     with pytest.raises(ConfigError, match=r"time_axis\.n_bins: auto would need .* larger bin_width_opl") as caught:
         resolve_time_axis(config(bin_width_opl=1e-6), latest_arrival(capture(), WALL, BOX, 3))
-    assert caught.value.problems[0].key == "time_axis.n_bins"
+    assert caught.value.issues[0].key == "time_axis.n_bins"
 
 
 def test_large_captures_are_bounded_quickly():

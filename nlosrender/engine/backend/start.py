@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from nlosrender.engine.backend import llvm
-from nlosrender.errors import BackendError, ConfigError, Problem
+from nlosrender.errors import BackendError, ConfigError
 from nlosrender.interruption import uninterrupted
 
 BackendName = Literal["auto", "llvm", "cuda"]
@@ -155,7 +155,7 @@ def batch_memory(limit: int | None, n_triangles: int = 0) -> int:
         limit = physical_memory() // 4
     if limit <= PROCESS_BYTES:
         message = f"got {limit / 1e6:.0f} MB, need more than {PROCESS_BYTES / 1e6:.0f} MB, which the program takes "
-        raise ConfigError(Problem("", "render.memory_limit", f"{message}before any histogram."))
+        raise ConfigError.at("render.memory_limit", f"{message}before any histogram.")
     left = limit - PROCESS_BYTES
     return int(max(left - beside, left / 8))
 

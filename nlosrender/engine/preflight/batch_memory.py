@@ -13,7 +13,7 @@ from nlosrender.engine.preflight.omitted_work import traces_paths
 from nlosrender.engine.virtual_lights.engine import VirtualLightEngine
 from nlosrender.engine.virtual_lights.gather.block_histogram import BlockHistogram
 from nlosrender.engine.virtual_lights.third_bounce import COARSEST_SCALE, REFINEMENT
-from nlosrender.errors import ConfigError, Problem, RenderError
+from nlosrender.errors import ConfigError, RenderError
 
 PATCH_BYTES = 400  # float64 on the host, while they are cut and joined, and float32 on the device
 
@@ -71,7 +71,7 @@ def memory_warnings(engine: Engine, plan: Plan, memory_limit: int | None, lanes:
     if memory_limit is not None and memory_limit > physical:
         yield f"render.memory_limit: {_size(memory_limit)} is more than the machine's {_size(physical)}."
     if taken > physical:
-        raise ConfigError(Problem("", *_too_large(engine, taken, physical)))
+        raise ConfigError.at(*_too_large(engine, taken, physical))
     if taken > available:
         yield (
             f"render.memory_limit: a batch takes {_size(taken)}, more than is left for it: the gather needs rows for "
@@ -106,7 +106,7 @@ def _refuse_patches(engine: VirtualLightEngine, memory_limit: int) -> None:
             f"{_size(needed * PATCH_BYTES)}, but render.memory_limit leaves {_size(memory_limit)}. Use wider bins, or "
             "render.engine: path."
         )
-        raise ConfigError(Problem("", "time_axis.bin_width_opl", message))
+        raise ConfigError.at("time_axis.bin_width_opl", message)
 
 
 def n_pairs(capture: Capture, batch: Batch) -> int:
