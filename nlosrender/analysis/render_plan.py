@@ -67,15 +67,15 @@ def plan_render(config: Config) -> RenderPlan:
     ConfigError, BackendError, RenderError
         As ``render_capture``.
     """
+    begun = time.perf_counter()
+    warnings = Warnings(lambda text: None)
+    warnings.emit(config_warnings(config))
+    backend = started_backend(config)  # chooses LLVM, which has to come before Dr.Jit is imported:
     from nlosrender.engine.path.engine import Budget
     from nlosrender.engine.preflight.batch_memory import batch_bytes
     from nlosrender.engine.preflight.omitted_work import omitted_work
     from nlosrender.engine.preflight.time_estimate import estimate_render_time
 
-    begun = time.perf_counter()
-    warnings = Warnings(lambda text: None)
-    warnings.emit(config_warnings(config))
-    backend = started_backend(config)
     plan, engine, header = set_up_engine(config, backend)
     unsampled = missing_light(engine)
     warnings.emit(paths.warning for paths in unsampled)

@@ -5,33 +5,32 @@ Command modules import what they need inside the command: ``--help`` must not wa
 
 from __future__ import annotations
 
+import inspect
 import sys
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from contextlib import suppress
-from typing import Annotated, NoReturn
+from typing import Annotated, Any, NoReturn
 
 import typer
 
 from nlosrender import __version__
-from nlosrender.cli import (
-    bench_command,
-    check_engines_command,
-    compare_command,
-    config_commands,
-    export_command,
-    file_commands,
-    frames_command,
-    machine_commands,
-    merge_command,
-    paper_command,
-    plan_command,
-    reconstruct_command,
-    render_command,
-)
+from nlosrender.cli.bench_command import bench
+from nlosrender.cli.check_engines_command import check_engines
+from nlosrender.cli.compare_command import check, compare
+from nlosrender.cli.config_commands import new, schema, validate
+from nlosrender.cli.export_command import export
+from nlosrender.cli.file_commands import info, plot
+from nlosrender.cli.frames_command import frames
 from nlosrender.cli.interrupt_watch import InterruptWatch
-from nlosrender.cli.json_output import OUTPUT, issues_of
+from nlosrender.cli.json_output import OUTPUT
+from nlosrender.cli.machine_commands import doctor
+from nlosrender.cli.merge_command import merge
+from nlosrender.cli.paper_command import paper
+from nlosrender.cli.plan_command import plan
+from nlosrender.cli.reconstruct_command import reconstruct
+from nlosrender.cli.render_command import render
 from nlosrender.cli.streams import open_closed_streams, print_any_name
-from nlosrender.errors import EXIT_FAILURE, EXIT_INTERRUPTED, NlosError, ValidationIssue
+from nlosrender.errors import EXIT_FAILURE, EXIT_INTERRUPTED, ConfigError, NlosError, ValidationIssue
 
 app = typer.Typer(
     name="nlosrender",
@@ -41,19 +40,20 @@ app = typer.Typer(
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
 )
-render_command.register(app)
-merge_command.register(app)
-plan_command.register(app)
-config_commands.register(app)
-file_commands.register(app)
-frames_command.register(app)
-reconstruct_command.register(app)
-export_command.register(app)
-machine_commands.register(app)
-compare_command.register(app)
-check_engines_command.register(app)
-bench_command.register(app)
-paper_command.register(app)
+
+
+def _add(command: Callable[..., Any]) -> None:
+    """Add a command by its function's name; the last paragraph of the docstring, its example, follows the options."""
+    text, _, example = inspect.cleandoc(command.__doc__ or "").rpartition("\n\nExample: ")
+    app.command(command.__name__.replace("_", "-"), help=text, epilog=f"Example: {example}")(command)
+
+
+_COMMANDS: tuple[Callable[..., Any], ...] = (
+    *(render, merge, plan, new, validate, schema, info, plot, frames, reconstruct, export, doctor),
+    *(compare, check, check_engines, bench, paper),
+)
+for _command in _COMMANDS:
+    _add(_command)
 
 
 def _print_version(wanted: bool) -> None:
@@ -80,7 +80,8 @@ def main() -> None:
             app()
     except NlosError as error:
         message = f"error: {error}" if "\n" not in str(error) else f"errors:\n{error}"
-        _end(message, error.exit_code, str(error).splitlines(), issues_of(error))
+        issues = error.issues if isinstance(error, ConfigError) else ()
+        _end(message, error.exit_code, str(error).splitlines(), issues)
     except KeyboardInterrupt:
         _end("interrupted", EXIT_INTERRUPTED, ["interrupted"])
     except OSError as error:  # commands explain those of their files: what is left is standard output, mostly
@@ -88,13 +89,13 @@ def main() -> None:
         _end(f"error: {message}", EXIT_FAILURE, [message])
     except SystemExit as error:  # of mistakes in the arguments, which typer has printed
         if error.code:
-            told = getattr(error.__context__, "format_message", str)()
-            _end(None, error.code if isinstance(error.code, int) else EXIT_FAILURE, told.splitlines())
+            printed = getattr(error.__context__, "format_message", str)()
+            _end(None, error.code if isinstance(error.code, int) else EXIT_FAILURE, printed.splitlines())
         raise
 
 
 def _end(message: str | None, exit_code: int, parts: Iterable[str], issues: Iterable[ValidationIssue] = ()) -> NoReturn:
-    with suppress(OSError):  # nobody listens any more: the exit code still tells
+    with suppress(OSError):  # nobody reads the stream any more: the exit code still tells
         if message is not None:
             typer.echo(message, err=True)
     with suppress(OSError):

@@ -10,14 +10,12 @@ from nlosrender.cli.stated_error import energies_by_bounce, errors_by_bounce
 from nlosrender.readable import readable_size
 
 SHOWN_LENGTH = 160  # characters of one value in the table; --json has all of it
-_LONGEST = {"mesh": 600}  # names of materials
+_MAX_LENGTH = {"mesh": 600}  # names of materials
 
 
-def summary_table(summary: dict[str, Any]) -> str:
-    """Return the summary of a capture (``analysis.summary.summarise``) as lines of label and text."""
-    rows = [(label, printable(text, _LONGEST.get(label, SHOWN_LENGTH))) for label, text in _rows(summary) if text]
-    width = max(len(label) for label, _ in rows)
-    return "\n".join(f"{label:<{width}}  {text}" for label, text in rows)
+def summary_rows(summary: dict[str, Any]) -> list[tuple[str, str]]:
+    """Return label and text of every line about a capture (``analysis.summary.summarise``)."""
+    return [(label, printable(text, _MAX_LENGTH.get(label, SHOWN_LENGTH))) for label, text in _rows(summary) if text]
 
 
 def _rows(summary: dict[str, Any]) -> list[tuple[str, str]]:
@@ -163,8 +161,8 @@ def _sequence(value: object) -> Sequence[object]:
     return value if isinstance(value, (list, tuple)) else [value]
 
 
-def printable(text: object, longest: int = SHOWN_LENGTH) -> str:
+def printable(text: object, max_length: int = SHOWN_LENGTH) -> str:
     """Return text from a file as one line that is safe to print."""
     # attributes are anybody's: control characters would reach the terminal
     shown = "".join(character if character.isprintable() else ascii(character)[1:-1] for character in str(text))
-    return shown if len(shown) <= longest else shown[:longest] + " ..."
+    return shown if len(shown) <= max_length else shown[:max_length] + " ..."

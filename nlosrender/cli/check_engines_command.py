@@ -2,36 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from nlosrender.cli.json_output import OUTPUT
+from nlosrender.cli.options import AsJson, ConfigFile, Overrides, config_places
 
 if TYPE_CHECKING:
     from nlosrender.analysis.engine_check import EngineCheck, PairCheck
 
 
-def register(app: typer.Typer) -> None:
-    """Add ``check-engines`` to ``app``."""
-    app.command(
-        "check-engines",
-        epilog="Exit code 0: no difference that noise does not explain; 4: a difference; 1: fewer than two techniques "
-        "can render the scene.\n\nExample: nlosrender check-engines configs/z-letter.yaml --points 3   "
-        "(writes nothing; prints per bounce how far path tracing with and without hidden geometry sampling and virtual "
-        "lights are apart at 3 x 3 sensor points, and how small a difference would have been seen)",
-    )(check_engines)
-
-
 def check_engines(
-    config: Annotated[
-        Path, typer.Argument(metavar="CONFIG", help="The YAML file that describes the capture.", readable=False)
-    ],
-    overrides: Annotated[
-        list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Override one key; may be repeated.")
-    ] = None,
+    config: ConfigFile,
+    overrides: Overrides = None,
     points: Annotated[
         int, typer.Option("--points", metavar="N", min=1, max=16, help="Sensor points along each side of the grid.")
     ] = 4,
@@ -46,27 +30,26 @@ def check_engines(
         float,
         typer.Option(metavar="P", min=1e-9, max=0.5, help="Chance of an alarm where all techniques are right."),
     ] = 0.01,
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Render a few sensor points by every technique that can, and test whether they agree.
 
     Light that no technique samples, and a scene that is read wrongly, are the same for all of them: not tested.
+
+    Exit code 0: no difference that noise does not explain; 4: a difference; 1: fewer than two techniques can render
+    the scene.
+
+    Example: nlosrender check-engines configs/z-letter.yaml --points 3 (writes nothing; prints per bounce how far path
+    tracing with and without hidden geometry sampling and virtual lights are apart at 3 x 3 sensor points, and how
+    small a difference would have been seen)
     """
     from nlosrender.analysis import engine_check
     from nlosrender.config.load import load_config
-    from nlosrender.config.places import with_places
-    from nlosrender.errors import (
-        EXIT_COMPARISON_EXCEEDED,
-        EXIT_FAILURE,
-        EXIT_OK,
-        ComparisonError,
-        ConfigError,
-        RenderError,
-    )
+    from nlosrender.errors import EXIT_COMPARISON_EXCEEDED, EXIT_FAILURE, EXIT_OK, ComparisonError, RenderError
 
     changes = list(overrides or [])
     loaded = load_config(config, changes)
-    try:
+    with config_places(config, changes):
         check = engine_check.check_engines(
             loaded,
             points_per_axis=points,
@@ -75,15 +58,12 @@ def check_engines(
             significance=significance,
             progress=lambda name: typer.echo(f"rendering by {name}", err=True),
         )
-    except ConfigError as error:
-        raise with_places(error, config, changes) from error
     apart = [pair for pair in check.pairs if not pair.agrees]
     if as_json:
         failed = EXIT_FAILURE if not check.pairs else EXIT_COMPARISON_EXCEEDED if apart else EXIT_OK
         OUTPUT.print(check.as_json(), failed)
     else:
-        for line in _lines(check):
-            typer.echo(line)
+        _print_check(check)
     for paths in check.unsampled_paths:
         typer.echo(f"warning: no technique samples {paths}; agreement says nothing about this light", err=True)
     if not check.pairs:
@@ -92,33 +72,32 @@ def check_engines(
         raise ComparisonError("\n".join(f"{config}: {' and '.join(p.techniques)} differ: {p.worst}" for p in apart))
 
 
-def _lines(check: EngineCheck) -> Iterator[str]:
+def _print_check(check: EngineCheck) -> None:
     lasers = "" if check.n_lasers == 1 else f", {check.n_lasers} laser points"
-    yield f"points   {check.n_sensors} sensor points{lasers}"
+    typer.echo(f"points   {check.n_sensors} sensor points{lasers}")
     for trial in check.trials:
         if trial.obstacle is None:
-            yield f"{trial.technique}: estimated error {trial.error:.2%} of H after {trial.seconds:.1f} s"
+            typer.echo(f"{trial.technique}: estimated error {trial.error:.2%} of H after {trial.seconds:.1f} s")
         else:
-            yield f"{trial.technique}: not rendered, {trial.obstacle}"
+            typer.echo(f"{trial.technique}: not rendered, {trial.obstacle}")
     for pair in check.pairs:
-        yield from _pair(pair)
+        _print_pair(pair)
 
 
-def _pair(pair: PairCheck) -> Iterator[str]:
-    verdict = "agree" if pair.agrees else "DIFFER"
-    yield f"{pair.techniques[0]} against {pair.techniques[1]}: {verdict}"
+def _print_pair(pair: PairCheck) -> None:
+    typer.echo(f"{' against '.join(pair.techniques)}: {'agree' if pair.agrees else 'DIFFER'}")
     if pair.n_statements == 0:
-        yield "  no bins with enough light to compare: no difference would have been seen"
+        typer.echo("  no bins with enough light to compare: no difference would have been seen")
     else:
-        yield (
-            f"  largest deviation {pair.z:.2f} of {pair.z_limit:.2f} sigma allowed in {pair.n_statements} statements"
-            + (f" ({pair.worst})" if pair.worst else "")
-        )
+        allowed = f"{pair.z_limit:.2f} sigma allowed in {pair.n_statements} statements"
+        worst = f" ({pair.worst})" if pair.worst else ""
+        typer.echo(f"  largest deviation {pair.z:.2f} of {allowed}{worst}")
     for bounce in pair.bounces:
         if bounce.energy is None or bounce.visible_energy is None:
-            yield f"  bounce {bounce.bounce}: no light by {pair.techniques[1]}"
+            found = f"no light by {pair.techniques[1]}"
         else:
-            yield (
-                f"  bounce {bounce.bounce}: energy {bounce.energy:+.2%} (would see differences above "
-                f"{bounce.visible_energy:.2%}), relative L2 {bounce.rel_l2:.2%} ({bounce.expected_rel_l2:.2%} expected)"
+            found = (
+                f"energy {bounce.energy:+.2%} (would see differences above {bounce.visible_energy:.2%}), "
+                f"relative L2 {bounce.rel_l2:.2%} ({bounce.expected_rel_l2:.2%} expected)"
             )
+        typer.echo(f"  bounce {bounce.bounce}: {found}")

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from nlosrender.cli.json_output import OUTPUT
+from nlosrender.cli.options import AsJson
 
 if TYPE_CHECKING:
     from nlosrender.analysis.comparison.captures import Tolerances
@@ -49,27 +50,6 @@ Significance = Annotated[
     float,
     typer.Option(metavar="P", help="Chance that the Z-test raises an alarm where both files show the same."),
 ]
-AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
-
-EXIT_CODES = (
-    "Exit code 0: within all tolerances; 4: beyond one, or made of other grids, bins, frame; 3: a file that is "
-    "damaged or no capture."
-)
-
-
-def register(app: typer.Typer) -> None:
-    """Add this module's commands to ``app``."""
-    app.command(
-        "compare",
-        epilog=f"{EXIT_CODES}\n\nExample: nlosrender compare new.hdf5 old.hdf5 --max-rel-l2 0.02 --max-shift 0.1   "
-        "(creates nothing; prints what differs and where most)",
-    )(compare)
-    app.command(
-        "check",
-        epilog=f"{EXIT_CODES} A file missing from DATASET_DIR fails the check, one missing from the reference does "
-        "not.\n\nExample: nlosrender check out/ --reference tests/reference/ --z-test   "
-        "(creates nothing; prints one line per capture)",
-    )(check)
 
 
 def compare(
@@ -87,10 +67,16 @@ def compare(
     Without any tolerance they have to be equal up to rounding (relative L2 at most 1e-6), as two renders with the
     same seed, version and machine are. Relative numbers are relative to B. Points in another order, and bins that begin
     elsewhere by whole bins, are aligned first.
+
+    Exit code 0: within all tolerances; 4: beyond one, or made of other grids, bins, frame; 3: a file that is damaged
+    or no capture.
+
+    Example: nlosrender compare new.hdf5 old.hdf5 --max-rel-l2 0.02 --max-shift 0.1 (creates nothing; prints what
+    differs and where most)
     """
     from nlosrender.analysis.comparison.captures import compare_captures
     from nlosrender.analysis.comparison.report import comparison_report
-    from nlosrender.cli.comparison_table import comparison_table
+    from nlosrender.cli.comparison_table import print_comparison
     from nlosrender.errors import EXIT_COMPARISON_EXCEEDED, EXIT_OK, ComparisonError
 
     tolerances = _tolerances(max_rel_l2, max_energy, max_shift, z_test, significance)
@@ -99,7 +85,7 @@ def compare(
     if as_json:
         OUTPUT.print(report, EXIT_COMPARISON_EXCEEDED if comparison.failures else EXIT_OK)
     else:
-        typer.echo(comparison_table(report))
+        print_comparison(report)
     if comparison.failures:
         listed = "\n".join(f"{capture}: {failure}" for failure in comparison.failures)
         raise ComparisonError(listed)
@@ -125,7 +111,14 @@ def check(
     significance: Significance = 0.01,
     as_json: AsJson = False,
 ) -> None:
-    """Compare every capture of a reference folder with its namesake, as `nlosrender compare` does."""
+    """Compare every capture of a reference folder with its namesake, as `nlosrender compare` does.
+
+    Exit code 0: within all tolerances; 4: beyond one, or made of other grids, bins, frame; 3: a file that is damaged
+    or no capture. A file missing from DATASET_DIR fails the check, one missing from the reference does not.
+
+    Example: nlosrender check out/ --reference tests/reference/ --z-test (creates nothing; prints one line per
+    capture)
+    """
     from dataclasses import asdict
 
     from nlosrender.analysis.comparison.dataset import check_dataset

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
 from nlosrender.cli.capture_table import printable
+from nlosrender.cli.tables import print_table
 
 if TYPE_CHECKING:
     from nlosrender.analysis.comparison.dataset import CheckedFile
@@ -13,19 +14,29 @@ if TYPE_CHECKING:
 INFINITE = "infinite"  # something against nothing in the reference
 
 
-def comparison_table(report: dict[str, Any]) -> str:
-    """Return a report (``analysis.comparison.report.comparison_report``) as lines."""
-    lines = [f"capture      {report['file']}", f"reference    {report['reference']}"]
-    lines += [printable(f"aligned      {note}") for note in report["aligned"]]
+def print_comparison(report: dict[str, Any]) -> None:
+    """Print a report (``analysis.comparison.report.comparison_report``)."""
+    rows = [("capture", report["file"]), ("reference", report["reference"])]
+    rows += [("aligned", printable(note)) for note in report["aligned"]]
     if report["structure"]:
-        lines.append("not comparable, these differ:")
-        lines += [
-            printable(f"  {difference['name']}: {difference['value']}, reference: {difference['reference']}")
-            for difference in report["structure"]
+        rows.append(("not comparable", "these differ:"))
+        rows += [
+            ("", printable(f"{d['name']}: {d['value']}, reference: {d['reference']}")) for d in report["structure"]
         ]
-        return "\n".join(lines)
+        print_table(rows)
+        return
+    print_table([*rows, *_totals(report)])
+    columns = ("energy", "reference_energy", "relative_energy", "relative_l2")
+    formats = ("{:.5g}".format, "{:.5g}".format, _signed, _number)
+    print_table(
+        [
+            (bounce["bounce"], *(shown(bounce[column]) for column, shown in zip(columns, formats, strict=True)))
+            for bounce in report["bounces"]
+        ],
+        header=("bounce", "energy", "reference", "difference", "relative L2"),
+    )
     verdict = "identical" if report["identical"] else "agrees" if report["agrees"] else "DIFFERS"
-    return "\n".join([*lines, *_numbers(report), *_places(report), *_tolerances(report), f"verdict      {verdict}"])
+    print_table([*_places(report), *_tolerances(report), ("verdict", verdict)])
 
 
 def check_line(file: CheckedFile) -> str:
@@ -37,53 +48,38 @@ def check_line(file: CheckedFile) -> str:
     return f"{file.status:<11} {file.name}" + "".join(f": {text}" for text in (numbers, reason) if text)
 
 
-def _numbers(report: dict[str, Any]) -> Iterator[str]:
-    yield f"relative L2  {_number(report['relative_l2'])}"
-    yield f"energy       {_signed(report['relative_energy'])}"
+def _totals(report: dict[str, Any]) -> Iterator[tuple[str, str]]:
+    yield "relative L2", _number(report["relative_l2"])
+    yield "energy", _signed(report["relative_energy"])
     if report["shift_bins"] is not None:
         worst = report["worst_shift"]
         more = f", most at laser {_point(worst['laser'])}: {worst['bins']:+.3g}" if worst else ""
-        yield f"shift        {report['shift_bins']:+.3g} bins{more}"
-    if report["z_test"]:
-        test = report["z_test"]
-        yield f"Z-test       largest deviation {test['z']:.3g} sigma of {test['statements']} statements"
-    yield f"{'bounce':<11}  {'energy':>12} {'reference':>12} {'difference':>11} {'relative L2':>12}"
-    for bounce in report["bounces"]:
-        yield (
-            f"  {bounce['bounce']:<11}{bounce['energy']:>12.5g} {bounce['reference_energy']:>12.5g} "
-            f"{_signed(bounce['relative_energy']):>11} {_number(bounce['relative_l2']):>12}"
-        )
+        yield "shift", f"{report['shift_bins']:+.3g} bins{more}"
+    if test := report["z_test"]:
+        yield "Z-test", f"largest deviation {test['z']:.3g} sigma of {test['statements']} statements"
 
 
-def _places(report: dict[str, Any]) -> Iterator[str]:
-    worst, largest, test = report["worst"], report["largest_difference"], report["z_test"]
-    if worst:
-        yield (
-            f"differs most laser {_point(worst['laser'])}, sensor {_point(worst['sensor'])}, "
-            f"bounce {worst['bounce']}, bin {worst['bin']} (each by itself; row, column)"
-        )
-    if largest:
-        yield (
-            f"worst sample laser {_point(largest['laser'])}, sensor {_point(largest['sensor'])}, "
-            f"bounce {largest['bounce']}, bin {largest['bin']}: {largest['value']:.5g}, "
-            f"reference {largest['reference']:.5g}"
-        )
-    if test and test["worst"]:
-        least = test["worst"]
-        sensor = "all sensor points" if least["sensor"] is None else f"sensor {_point(least['sensor'])}"
-        yield (
-            f"least likely laser {_point(least['laser'])}, {sensor}, bounce {least['bounce']}, "
-            f"bins {least['first_bin']} to {least['last_bin']}"
-        )
+def _places(report: dict[str, Any]) -> Iterator[tuple[str, str]]:
+    if worst := report["worst"]:
+        yield "differs most", f"{_place(worst)}, bin {worst['bin']} (each by itself; row, column)"
+    if largest := report["largest_difference"]:
+        values = f"{largest['value']:.5g}, reference {largest['reference']:.5g}"
+        yield "worst sample", f"{_place(largest)}, bin {largest['bin']}: {values}"
+    if report["z_test"] and (least := report["z_test"]["worst"]):
+        yield "least likely", f"{_place(least)}, bins {least['first_bin']} to {least['last_bin']}"
 
 
-def _tolerances(report: dict[str, Any]) -> Iterator[str]:
+def _tolerances(report: dict[str, Any]) -> Iterator[tuple[str, str]]:
     for finding in report["tolerances"]:
         value, limit = (
             INFINITE if finding[key] is None else f"{finding[key]:.4g}{finding['unit']}" for key in ("value", "limit")
         )
-        state = "EXCEEDS" if finding["exceeds"] else "within"
-        yield f"{state:<12} {finding['quantity']}: {value}, tolerance {limit}"
+        yield "EXCEEDS" if finding["exceeds"] else "within", f"{finding['quantity']}: {value}, tolerance {limit}"
+
+
+def _place(found: dict[str, Any]) -> str:
+    sensor = "all sensor points" if found["sensor"] is None else f"sensor {_point(found['sensor'])}"
+    return f"laser {_point(found['laser'])}, {sensor}, bounce {found['bounce']}"
 
 
 def _number(value: float | None) -> str:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from nlosrender.cli.json_output import OUTPUT, issue_as_json
+from nlosrender.cli.options import AsJson, Overrides
 from nlosrender.errors import EXIT_BAD_INPUT, EXIT_OK, ConfigError, ValidationIssue
 
 if TYPE_CHECKING:
@@ -26,28 +27,15 @@ class ScanTypeOption(StrEnum):
     line_of_sight = "line_of_sight"
 
 
-def register(app: typer.Typer) -> None:
-    """Add this module's commands to ``app``."""
-    app.command("new", epilog="Example: nlosrender new z.yaml --scan-type single   (writes z.yaml, ready to render)")(
-        new
-    )
-    app.command(
-        "validate",
-        epilog="Example: nlosrender validate z.yaml --set render.spp=64   "
-        "(creates nothing; prints ok or every mistake with its line, exit code 3)",
-    )(validate)
-    app.command(
-        "schema",
-        epilog="Example: nlosrender schema > nlosrender.schema.json   (creates a schema for editors to check by)",
-    )(schema)
-
-
 def new(
     path: Annotated[str, typer.Argument(metavar="[PATH]", help="File to write; - for standard output.")] = "-",
     force: Annotated[bool, typer.Option("--force", help="Overwrite PATH.")] = False,
     scan_type: Annotated[ScanTypeOption, typer.Option(help="Scan the starter is for.")] = ScanTypeOption.confocal,
 ) -> None:
-    """Write a commented starter config that can be rendered as it is."""
+    """Write a commented starter config that can be rendered as it is.
+
+    Example: nlosrender new z.yaml --scan-type single (writes z.yaml, ready to render)
+    """
     import shlex
 
     from nlosrender.config.template import starter_config
@@ -66,12 +54,14 @@ def new(
 
 def validate(
     configs: Annotated[list[Path], typer.Argument(metavar="CONFIG...", help="Config files.", readable=False)],
-    overrides: Annotated[
-        list[str] | None, typer.Option("--set", metavar="a.b.c=VALUE", help="Put a value over the file's; repeatable.")
-    ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+    overrides: Overrides = None,
+    as_json: AsJson = False,
 ) -> None:
-    """Check config files and their meshes, and print every mistake with its place; nothing is rendered."""
+    """Check config files and their meshes, and print every mistake with its place; nothing is rendered.
+
+    Example: nlosrender validate z.yaml --set render.spp=64 (creates nothing; prints ok or every mistake with its
+    line, exit code 3)
+    """
     from nlosrender.config.load import load_config
     from nlosrender.config.places import with_places
     from nlosrender.config.sweep_load import load_sweep
@@ -111,7 +101,10 @@ def validate(
 
 
 def schema() -> None:
-    """Print the JSON Schema of the config."""
+    """Print the JSON Schema of the config.
+
+    Example: nlosrender schema > nlosrender.schema.json (creates a schema for editors to check by)
+    """
     import json
 
     from nlosrender.config.document import Config

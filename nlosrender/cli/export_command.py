@@ -7,16 +7,8 @@ from typing import Annotated
 
 import typer
 
-from nlosrender.cli.file_commands import CaptureFile
 from nlosrender.cli.json_output import OUTPUT
-
-
-def register(app: typer.Typer) -> None:
-    """Add ``export`` to ``app``."""
-    app.command(
-        epilog="Example: `nlosrender export z.hdf5 --format fk --bounces 3` creates z-fk.mat with `meas` and "
-        "`tofgrid`, the third bounce of a confocal capture for f-k migration."
-    )(export)
+from nlosrender.cli.options import AsJson, CaptureFile, beside
 
 
 def export(
@@ -57,11 +49,13 @@ def export(
             show_default="measlr",
         ),
     ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print the report as one JSON object.")] = False,
+    as_json: AsJson = False,
 ) -> None:
-    """Write a capture in the format of another program; what that cannot hold is refused or reported."""
+    """Write a capture in the format of another program; what that cannot hold is refused or reported.
 
-    from nlosrender.cli.output_names import beside
+    Example: `nlosrender export z.hdf5 --format fk --bounces 3` creates z-fk.mat with `meas` and `tofgrid`, the third
+    bounce of a confocal capture for f-k migration.
+    """
     from nlosrender.errors import OptionError
     from nlosrender.files.export.export import export_capture, suffix_of
 

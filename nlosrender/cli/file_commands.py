@@ -7,47 +7,35 @@ from typing import Annotated
 
 import typer
 
-from nlosrender.cli.capture_table import printable, summary_table
+from nlosrender.cli.capture_table import printable, summary_rows
 from nlosrender.cli.json_output import OUTPUT
-
-CaptureFile = Annotated[
-    Path, typer.Argument(metavar="FILE", help="Capture in Z-NLOS HDF5, by any writer.", readable=False)
-]
-
-
-def register(app: typer.Typer) -> None:
-    """Add this module's commands to ``app``."""
-    app.command(
-        "info",
-        epilog="Example: `nlosrender info z.hdf5 --check` prints the grids, the time axis, the bounces and "
-        "where the file comes from, then reads all samples to see that third-party loaders will accept it, or, for a "
-        "file by another program, that it is read right. It creates nothing.",
-    )(info)
-    app.command(
-        "plot",
-        epilog="Example: `nlosrender plot z.hdf5 --pixel 6,8` creates z.png and prints its path.",
-    )(plot)
+from nlosrender.cli.options import AsJson, CaptureFile, beside, two_numbers
+from nlosrender.cli.tables import print_table
 
 
 def info(
     file: CaptureFile,
-    json_output: Annotated[bool, typer.Option("--json", help="Print one JSON object instead of a table.")] = False,
+    as_json: AsJson = False,
     check: Annotated[
         bool, typer.Option("--check", help="Also check the layout and every sample; exit code 3 if anything is wrong.")
     ] = False,
 ) -> None:
-    """Show what a capture file holds, from its metadata alone."""
+    """Show what a capture file holds, from its metadata alone.
+
+    Example: `nlosrender info z.hdf5 --check` prints the grids, the time axis, the bounces and where the file comes
+    from, then reads all samples to see that third-party loaders will accept it, or, for a file by another program,
+    that it is read right. It creates nothing.
+    """
     from nlosrender.analysis.summary import summarise
     from nlosrender.analysis.unfinished import is_unfinished, summarise_unfinished
     from nlosrender.errors import EXIT_BAD_INPUT, EXIT_OK, FileError
 
     if is_unfinished(file):
         unfinished = summarise_unfinished(file)
-        lines = (f"{label.replace('_', ' '):<16}{printable(value)}" for label, value in unfinished.items())
-        if json_output:
+        if as_json:
             OUTPUT.print(unfinished)
         else:
-            typer.echo("\n".join(lines))
+            print_table((label.replace("_", " "), printable(value)) for label, value in unfinished.items())
         return
     summary, violations = summarise(file), ()  # type: dict[str, object], tuple[str, ...]
     if check:
@@ -61,10 +49,10 @@ def info(
             "readable": found.is_ours or not violations,
             "complete": not (violations or found.deviations),
         }
-    if json_output:
+    if as_json:
         OUTPUT.print(summary, EXIT_BAD_INPUT if violations else EXIT_OK)
     else:
-        typer.echo(summary_table(summary))
+        print_table(summary_rows(summary))
     if violations:
         listed = "\n".join(f"{file}: {printable(violation)}" for violation in violations)
         raise FileError(f"{listed}\nThe file deviates from the Z-NLOS layout: other loaders may refuse or misread it.")
@@ -91,22 +79,13 @@ def plot(
         ),
     ] = None,
 ) -> None:
-    """Draw a capture: the relay wall over time, one histogram, the light of each bounce, one row over time."""
-    laser_at, pixel_at = _index(laser, "--laser"), _index(pixel, "--pixel")
+    """Draw a capture: the relay wall over time, one histogram, the light of each bounce, one row over time.
 
+    Example: `nlosrender plot z.hdf5 --pixel 6,8` creates z.png and prints its path.
+    """
     from nlosrender.analysis.plots import plot_capture
-    from nlosrender.cli.output_names import beside
 
+    need = "a row and a column counted from 0, such as 6,8"
+    laser_at, pixel_at = two_numbers(laser, ",", "--laser", need), two_numbers(pixel, ",", "--pixel", need)
     picture = output or beside(file, ".png")
     typer.echo(str(plot_capture(file, picture, laser=laser_at, pixel=pixel_at)))
-
-
-def _index(text: str | None, option: str) -> tuple[int, int] | None:
-    if text is None:
-        return None
-    parts = [part.strip() for part in text.split(",")]
-    if len(parts) != 2 or not all(part.isascii() and part.isdigit() and len(part) < 10 for part in parts):
-        raise typer.BadParameter(
-            f"got {text!r}, need a row and a column counted from 0, such as 6,8", param_hint=option
-        )
-    return int(parts[0]), int(parts[1])

@@ -7,14 +7,7 @@ from typing import Annotated
 
 import typer
 
-
-def register(app: typer.Typer) -> None:
-    """Add ``frames`` to ``app``."""
-    app.command(
-        "frames",
-        epilog="Example: `nlosrender frames cornell-box.hdf5 -o box --format gif` creates box/frames.gif, "
-        "box/steady.exr and box/steady.png and prints the folder; with `-o box.gif` it creates that file alone.",
-    )(frames)
+from nlosrender.cli.options import beside
 
 
 def frames(
@@ -49,9 +42,11 @@ def frames(
     """Write what a camera saw as pictures: one per range of bins, and the steady picture.
 
     Frames that an earlier run left in the folder are replaced.
+
+    Example: `nlosrender frames cornell-box.hdf5 -o box --format gif` creates box/frames.gif, box/steady.exr and
+    box/steady.png and prints the folder; with `-o box.gif` it creates that file alone.
     """
     from nlosrender.analysis.frames import FrameOptions, is_animation, write_frames
-    from nlosrender.cli.output_names import beside
 
     kind = kind or ("gif" if output is not None and is_animation(output) else "exr")
     options = FrameOptions(kind, every, start, end, frames_per_second, exposure)

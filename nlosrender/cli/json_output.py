@@ -7,7 +7,7 @@ import sys
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-from nlosrender.errors import EXIT_OK, ConfigError, ValidationIssue
+from nlosrender.errors import EXIT_OK, ValidationIssue
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -65,11 +65,6 @@ def issue_as_json(issue: ValidationIssue) -> dict[str, Any]:
         file, line, column = match[1], int(match[2]), int(match[3])
     where = {"file": file, "line": line, "column": column}
     return {"place": issue.place, **where, "key": issue.key, "message": issue.message}
-
-
-def issues_of(error: BaseException) -> tuple[ValidationIssue, ...]:
-    """Return the mistakes in a configuration that an error tells of."""
-    return error.issues if isinstance(error, ConfigError) else ()
 
 
 def _finite(value: Any) -> Any:

@@ -2,25 +2,18 @@
 
 from __future__ import annotations
 
-from typing import Annotated
-
 import typer
 
 from nlosrender.cli.json_output import OUTPUT
+from nlosrender.cli.options import AsJson
 
 
-def register(app: typer.Typer) -> None:
-    """Add ``doctor`` to ``app``."""
-    app.command(
-        epilog="Example: nlosrender doctor   (creates nothing; prints one line per LLVM library found and the one that "
-        "is used)"
-    )(doctor)
-
-
-def doctor(as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False) -> None:
+def doctor(as_json: AsJson = False) -> None:
     """Show which LLVM, GPU and package versions were found, what a render would use, and what to install.
 
     Exits with 6 when nothing on this machine can render.
+
+    Example: nlosrender doctor (creates nothing; prints one line per LLVM library found and the one that is used)
     """
     from nlosrender.engine.backend import llvm
     from nlosrender.engine.backend.start import cuda_available, start_backend

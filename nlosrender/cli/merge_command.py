@@ -8,15 +8,8 @@ from typing import Annotated
 import typer
 
 from nlosrender.cli.json_output import OUTPUT
-
-
-def register(app: typer.Typer) -> None:
-    """Add ``merge`` to ``app``."""
-    app.command(
-        "merge",
-        epilog="Example: nlosrender merge part*.hdf5 -o whole.hdf5   "
-        "(creates whole.hdf5, the capture that one render without --shard would have written)",
-    )(merge)
+from nlosrender.cli.options import AsJson, Quiet
+from nlosrender.cli.tables import print_table
 
 
 def merge(
@@ -28,15 +21,19 @@ def merge(
     ],
     output: Annotated[Path, typer.Option("--output", "-o", help="File to write.", readable=False)],
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a file that holds another capture.")] = False,
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress, no report; warnings stay.")] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="Print the report as one JSON object.")] = False,
+    quiet: Quiet = False,
+    as_json: AsJson = False,
 ) -> None:
-    """Put the parts of a capture together; what is missing, there twice, damaged or not its own is named."""
-    from nlosrender.cli.progress import progress_bar
-    from nlosrender.cli.stated_error import energies_by_bounce, stated_error_lines
+    """Put the parts of a capture together; what is missing, there twice, damaged or not its own is named.
+
+    Example: nlosrender merge part*.hdf5 -o whole.hdf5 (creates whole.hdf5, the capture that one render without
+    --shard would have written)
+    """
+    from nlosrender.cli.progress import reporting
+    from nlosrender.cli.stated_error import energies_by_bounce, stated_error_rows
     from nlosrender.files.parts.merge import merge_captures
 
-    with progress_bar("merge", hidden=quiet) as (progress, _, _):
+    with reporting("merge", quiet) as (progress, _, _):
         report = merge_captures(parts, output, progress, overwrite=overwrite)
     if as_json:
         import dataclasses
@@ -44,7 +41,7 @@ def merge(
         OUTPUT.print(dataclasses.asdict(report) | {"output": str(report.output)})
     elif not quiet:
         typer.echo(f"wrote {report.output} from {report.parts} parts")
-        for line in stated_error_lines(report.error_estimate, report.unsampled_paths, report.zero_because):
-            typer.echo(line)
         energies = energies_by_bounce(report.energy, report.energy_error_per_bounce)
-        typer.echo(f"  energy          bounce {energies}; outside the time window: {report.out_of_window:.4g}")
+        rows = stated_error_rows(report.error_estimate, report.unsampled_paths, report.zero_because)
+        outside = f"outside the time window: {report.out_of_window:.4g}"
+        print_table([*rows, ("energy", f"bounce {energies}; {outside}")], indent=2)

@@ -7,16 +7,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from nlosrender.cli.options import one_of
+
 if TYPE_CHECKING:
     from nlosrender.bench.paper.figure import PaperFigure
-
-
-def register(app: typer.Typer) -> None:
-    """Add ``paper`` to ``app``."""
-    app.command(
-        epilog="Example: nlosrender paper --quick --figure 4 -o out/paper   (creates out/paper/index.html, a page with "
-        "the Z letter's capture and its wavefronts)"
-    )(paper)
 
 
 def paper(
@@ -36,17 +30,18 @@ def paper(
         Path, typer.Option("-o", "--output", metavar="DIR", help="Folder to write.", readable=False)
     ] = Path("out/paper"),
 ) -> None:
-    """Reproduce the figures and tables of Royo et al. 2022 into one HTML page."""
+    """Reproduce the figures and tables of Royo et al. 2022 into one HTML page.
+
+    Example: nlosrender paper --quick --figure 4 -o out/paper (creates out/paper/index.html, a page with the Z
+    letter's capture and its wavefronts)
+    """
     from nlosrender.bench.paper.reproduce import FIGURES, reproduce
     from nlosrender.bench.paper.rooms import write_meshes
     from nlosrender.bench.paper.study import Study
-    from nlosrender.errors import EXIT_FAILURE, nearest
+    from nlosrender.errors import EXIT_FAILURE
 
     for name in figure or ():
-        if name not in FIGURES:
-            close = nearest(name, list(FIGURES))
-            hint = f" Did you mean {close}?" if close else ""
-            raise typer.BadParameter(f"got {name!r}, need one of {', '.join(FIGURES)}.{hint}", param_hint="--figure")
+        one_of(name, FIGURES, "--figure")
     if not configs.is_dir():
         raise typer.BadParameter(f"{configs}: there is no such folder", param_hint="--configs")
     study = Study(configs, output, quick, seed, lambda what: typer.echo(what, err=True))

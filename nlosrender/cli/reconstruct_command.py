@@ -7,9 +7,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from nlosrender.cli.file_commands import CaptureFile
 from nlosrender.cli.json_output import OUTPUT
-from nlosrender.cli.progress import progress_bar
+from nlosrender.cli.options import AsJson, CaptureFile, Quiet, beside
+from nlosrender.cli.progress import reporting
+from nlosrender.cli.tables import print_table
 from nlosrender.readable import readable_duration
 
 if TYPE_CHECKING:
@@ -17,15 +18,6 @@ if TYPE_CHECKING:
     from nlosrender.analysis.reconstruction.score import Score
 
 LENGTHS = "W,H,D"
-
-
-def register(app: typer.Typer) -> None:
-    """Add ``reconstruct`` to ``app``."""
-    app.command(
-        epilog="Example: `nlosrender reconstruct z-letter.hdf5 -o z.hdf5 --png --score` creates z.hdf5, a volume of "
-        "128 voxels along its longest edge, and z.png, a picture of it, and prints how well it matches the true "
-        "silhouette."
-    )(reconstruct)
 
 
 def reconstruct(
@@ -73,13 +65,16 @@ def reconstruct(
     score: Annotated[
         bool, typer.Option("--score", help="Compare with the true silhouette (of a file that carries its scene).")
     ] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="Print the report as one JSON object.")] = False,
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress, no report; warnings stay.")] = False,
+    as_json: AsJson = False,
+    quiet: Quiet = False,
 ) -> None:
-    """Reconstruct the hidden scene of a capture with phasor fields or filtered backprojection."""
+    """Reconstruct the hidden scene of a capture with phasor fields or filtered backprojection.
+
+    Example: `nlosrender reconstruct z-letter.hdf5 -o z.hdf5 --png --score` creates z.hdf5, a volume of 128 voxels
+    along its longest edge, and z.png, a picture of it, and prints how well it matches the true silhouette.
+    """
     from nlosrender.analysis.reconstruction.reconstruct import ReconstructionSettings, reconstruct_capture
     from nlosrender.analysis.reconstruction.volume_file import write_volume
-    from nlosrender.cli.output_names import beside
     from nlosrender.errors import OptionError
     from nlosrender.files.atomic_write import check_writable
     from nlosrender.files.file_kinds import PNG, VOLUME
@@ -93,7 +88,7 @@ def reconstruct(
         raise OptionError(f"--output: got {str(volume_path)!r}, the name --png gives the picture. Name it .hdf5")
     if png:
         check_writable(picture_path, PNG, [file])
-    with progress_bar("reconstruct", hidden=quiet) as (progress, warn, _):
+    with reporting("reconstruct", quiet) as (progress, warn, _):
         found = reconstruct_capture(file, settings, progress, warn)
     silhouette, scored = None, None
     if score:
@@ -151,12 +146,12 @@ def _print_report(found: Reconstruction, score: Score | None, written: list[Path
     low, high = found.grid.bounds
     ranges = ", ".join(f"{name} {a:.3g} to {b:.3g}" for name, a, b in zip("xyz", low, high, strict=True))
     typer.echo("wrote " + ", ".join(str(path) for path in written))
-    typer.echo(f"  method   {settings_text(found)}")
-    typer.echo(f"  volume   {ranges} m in the wall's frame")
-    typer.echo(f"  bounces  {', '.join(str(bounce) for bounce in found.bounces)}")
+    rows = [
+        ("method", settings_text(found)),
+        ("volume", f"{ranges} m in the wall's frame"),
+        ("bounces", ", ".join(str(bounce) for bounce in found.bounces)),
+    ]
     if score is not None:
-        typer.echo(
-            f"  score    correlation {score.correlation:.3f}, IoU {score.iou:.3f} with the true silhouette "
-            f"(threshold {score.threshold:.2f} of the largest value)"
-        )
-    typer.echo(f"  took     {readable_duration(found.seconds)}")
+        agreement = f"correlation {score.correlation:.3f}, IoU {score.iou:.3f} with the true silhouette"
+        rows.append(("score", f"{agreement} (threshold {score.threshold:.2f} of the largest value)"))
+    print_table([*rows, ("took", readable_duration(found.seconds))], indent=2)

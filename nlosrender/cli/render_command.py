@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-import re
+import dataclasses
+import functools
+import json
 from contextlib import AbstractContextManager, nullcontext
 from enum import StrEnum
 from pathlib import Path
@@ -12,6 +14,16 @@ import typer
 
 from nlosrender.capture.bounces import LINE_OF_SIGHT
 from nlosrender.cli.json_output import OUTPUT
+from nlosrender.cli.options import (
+    AsJson,
+    ConfigFile,
+    Overrides,
+    Quiet,
+    config_places,
+    refuse_folder,
+    two_numbers,
+)
+from nlosrender.cli.tables import print_table
 from nlosrender.readable import readable_duration
 
 if TYPE_CHECKING:
@@ -27,24 +39,12 @@ class Executor(StrEnum):
     DASK = "dask"
 
 
-def register(app: typer.Typer) -> None:
-    """Add ``render`` to ``app``."""
-    app.command(
-        epilog="Example: nlosrender render configs/z-letter.yaml -o out/z-letter.hdf5   (creates out/z-letter.hdf5, a "
-        "capture of a hidden letter Z)"
-    )(render)
-
-
 def render(
-    config: Annotated[
-        Path, typer.Argument(metavar="CONFIG", help="The YAML file that describes the capture.", readable=False)
-    ],
+    config: ConfigFile,
     output: Annotated[
         Path | None, typer.Option("--output", "-o", help="File to write, instead of output.path.", readable=False)
     ] = None,
-    overrides: Annotated[
-        list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Override one key; may be repeated.")
-    ] = None,
+    overrides: Overrides = None,
     lasers: Annotated[
         str | None, typer.Option(metavar="A:B", help="Render laser points A to B - 1 only, counted row by row from 0.")
     ] = None,
@@ -74,63 +74,53 @@ def render(
         bool,
         typer.Option("--strict", help="Exit 3 before rendering where light is missing that no technique samples."),
     ] = False,
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress, no report; warnings stay.")] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="Print the report as one JSON object.")] = False,
+    quiet: Quiet = False,
+    as_json: AsJson = False,
 ) -> None:
     """Render a capture and write it as one HDF5 file.
 
     What is finished survives Ctrl-C and kill: the same command goes on from there. A configuration with a sweep makes
     a folder of captures and an index.json; --shard then deals whole captures.
+
+    Example: nlosrender render configs/z-letter.yaml -o out/z-letter.hdf5 (creates out/z-letter.hdf5, a capture of a
+    hidden letter Z)
     """
     selection = _selection(shard, lasers)
     if executor is Executor.LOCAL and (scheduler is not None or workers is not None):
         hint = "--workers" if scheduler is None else "--scheduler"
         raise typer.BadParameter("needs --executor dask", param_hint=hint)
 
-    from nlosrender.cli.progress import progress_bar
+    from nlosrender.cli.progress import reporting
     from nlosrender.cli.sweep_command import render_all
     from nlosrender.config.load import load_config
-    from nlosrender.config.places import with_places
     from nlosrender.config.sweep_load import load_sweep
-    from nlosrender.errors import ConfigError, FileError
     from nlosrender.files.atomic_write import refuse_sources
     from nlosrender.pipeline import render_capture
 
     changes = list(overrides or [])
-    if output is not None and output.name in ("", ".."):
-        raise FileError(f"{output}: is a folder. Name a file in it, such as {output / 'capture.hdf5'}")
     if output is not None:
-        changes.append(f"output.path={_quoted(output)}")
+        refuse_folder(output, "capture.hdf5")
+        changes.append(f"output.path={json.dumps(str(output))}")  # JSON is YAML: "1e3" or "yes" stay text
     sweep = load_sweep(config, changes)
     if sweep is not None:
         if lasers is not None:
             raise typer.BadParameter("cuts one capture, not a sweep; use --shard", param_hint="--lasers")
         with _cluster(executor, scheduler, workers) as cluster:
-            render_all(
-                sweep,
-                changes,
-                shard=selection.shard,
-                resume=resume,
-                quiet=quiet,
-                as_json=as_json,
-                cluster=cluster,
-                strict=strict,
-            )
+            how = functools.partial(render_capture, cluster=cluster, strict=strict)
+            render_all(sweep, changes, how, shard=selection.shard, resume=resume, quiet=quiet, as_json=as_json)
         return
     loaded = load_config(config, changes)
     refuse_sources(loaded.output.path, [config])
-    try:
-        with (
-            _cluster(executor, scheduler, workers) as cluster,
-            progress_bar("render", hidden=quiet) as telling,
-        ):
-            report = render_capture(
-                loaded, **telling._asdict(), selection=selection, resume=resume, cluster=cluster, strict=strict
-            )
-    except ConfigError as error:
-        raise with_places(error, config, changes) from error
+    with (
+        config_places(config, changes),
+        _cluster(executor, scheduler, workers) as cluster,
+        reporting("render", quiet) as listeners,
+    ):
+        report = render_capture(
+            loaded, **listeners._asdict(), selection=selection, resume=resume, cluster=cluster, strict=strict
+        )
     if as_json:
-        _print_json(report)
+        OUTPUT.print(dataclasses.asdict(report) | {"output": str(report.output)})
     elif not quiet:
         _print_report(report)
 
@@ -151,54 +141,32 @@ def _selection(shard: str | None, lasers: str | None) -> Selection:
     if shard is not None and lasers is not None:
         raise typer.BadParameter("takes no --shard beside it", param_hint="--lasers")
     need_shard, need_lasers = "I/N with 1 <= I <= N, such as 2/8", "A:B with A < B, such as 0:8"
-    selection = Selection(
-        shard=_two_numbers(shard, "/", "--shard", need_shard), lasers=_two_numbers(lasers, ":", "--lasers", need_lasers)
-    )
-    if selection.shard is not None and not 1 <= selection.shard[0] <= selection.shard[1]:
+    parts = two_numbers(shard, "/", "--shard", need_shard)
+    chosen = two_numbers(lasers, ":", "--lasers", need_lasers)
+    if parts is not None and not 1 <= parts[0] <= parts[1]:
         raise typer.BadParameter(f"got {shard!r}, need {need_shard}", param_hint="--shard")
-    if selection.lasers is not None and selection.lasers[0] >= selection.lasers[1]:
+    if chosen is not None and chosen[0] >= chosen[1]:
         raise typer.BadParameter(f"got {lasers!r}, need {need_lasers}", param_hint="--lasers")
-    return selection
-
-
-def _two_numbers(text: str | None, separator: str, option: str, need: str) -> tuple[int, int] | None:
-    if text is None:
-        return None
-    match = re.fullmatch(rf"([0-9]{{1,9}}){separator}([0-9]{{1,9}})", text.strip(), re.ASCII)
-    if match is None:
-        raise typer.BadParameter(f"got {text!r}, need {need}", param_hint=option)
-    return int(match[1]), int(match[2])
-
-
-def _quoted(path: Path) -> str:
-    import json
-
-    return json.dumps(str(path))  # a JSON string is a YAML string: names such as "1e3" or "yes" stay text
-
-
-def _print_json(report: RenderReport) -> None:
-    import dataclasses
-
-    OUTPUT.print(dataclasses.asdict(report) | {"output": str(report.output)})
+    return Selection(shard=parts, lasers=chosen)
 
 
 def _print_report(report: RenderReport) -> None:
-    from nlosrender.cli.stated_error import energies_by_bounce, errors_by_bounce, stated_error_lines
+    from nlosrender.cli.stated_error import energies_by_bounce, errors_by_bounce, stated_error_rows
 
-    seconds = report.seconds
-    typer.echo(f"wrote {report.output}" + (f", {report.part} of the capture" if report.part else ""))
-    if report.resumed_units:
-        typer.echo(f"  resumed         {report.resumed_units} of {report.units} units were finished by an earlier run")
-    typer.echo(f"  engine          {report.engine}: {report.reason}")
     is_view = report.engine == LINE_OF_SIGHT  # that engine renders nothing else
+    typer.echo(f"wrote {report.output}" + (f", {report.part} of the capture" if report.part else ""))
+    rows = []
+    if report.resumed_units:
+        rows.append(("resumed", f"{report.resumed_units} of {report.units} units were finished by an earlier run"))
+    rows.append(("engine", f"{report.engine}: {report.reason}"))
     paths = f", {report.samples} paths per {'pixel' if is_view else 'sensor point'}" if report.samples else ""
-    for line in stated_error_lines(report.error_estimate, report.unsampled_paths, report.zero_because, paths):
-        typer.echo(line)
-    typer.echo(
-        f"  per bounce      {errors_by_bounce(report.error_estimate_per_bounce)} (relative L2; -: no light or unknown)"
-    )
+    rows += stated_error_rows(report.error_estimate, report.unsampled_paths, report.zero_because, paths)
+    errors = errors_by_bounce(report.error_estimate_per_bounce)
+    rows.append(("per bounce", f"{errors} (relative L2; -: no light or unknown)"))
     energies = energies_by_bounce(report.energy, report.energy_error_per_bounce)
-    counted = "interactions" if is_view else "bounce"
-    typer.echo(f"  energy          {counted} {energies}; outside the time window: {report.out_of_window:.4g}")
-    stages = ", ".join(f"{stage} {readable_duration(spent)}" for stage, spent in seconds.items() if stage != "total")
-    typer.echo(f"  took            {readable_duration(seconds['total'])} ({stages})")
+    outside = f"outside the time window: {report.out_of_window:.4g}"
+    rows.append(("energy", f"{'interactions' if is_view else 'bounce'} {energies}; {outside}"))
+    stages = {stage: readable_duration(seconds) for stage, seconds in report.seconds.items()}
+    total = stages.pop("total")
+    rows.append(("took", f"{total} ({', '.join(f'{stage} {spent}' for stage, spent in stages.items())})"))
+    print_table(rows, indent=2)

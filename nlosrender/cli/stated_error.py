@@ -1,13 +1,16 @@
-"""The stated error of a render or a merge, in words and for JSON."""
+"""The stated error and the energies of a capture, in words."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
+from typing import TypeGuard
 
 
-def error_in_words(error: float, unsampled: Sequence[str], zero_because: Sequence[str]) -> str:
-    """Return the stated error as people read it.
+def stated_error_rows(
+    error: float, unsampled: Sequence[str], zero_because: Sequence[str], remark: str = ""
+) -> Iterator[tuple[str, str]]:
+    """Yield label and text: the stated error with a remark, and why it is not known.
 
     Parameters
     ----------
@@ -15,26 +18,23 @@ def error_in_words(error: float, unsampled: Sequence[str], zero_because: Sequenc
         Relative L2 error of H; NaN: not known; inf: pure noise.
     unsampled, zero_because
         As in the report of a render.
+    remark
+        Follows the error.
     """
     if unsampled:
-        return f"unknown: {len(unsampled)} class{'' if len(unsampled) == 1 else 'es'} of paths not sampled"
-    if zero_because:
-        return "unknown: H is zero everywhere"
-    return f"{error:.2%} (relative L2)" if math.isfinite(error) else "unknown: nothing but noise"
-
-
-def stated_error_lines(
-    error: float, unsampled: Sequence[str], zero_because: Sequence[str], remark: str = ""
-) -> Iterator[str]:
-    """Yield the lines of a report: the stated error and a remark, and why it is not known; parameters as above."""
-    yield f"  error estimate  {error_in_words(error, unsampled, zero_because)}{remark}"
-    yield from (f"  not sampled     {missing}" for missing in unsampled)
-    yield from (f"  zero because    {reason}" for reason in zero_because)
+        text = f"unknown: {len(unsampled)} class{'' if len(unsampled) == 1 else 'es'} of paths not sampled"
+    elif zero_because:
+        text = "unknown: H is zero everywhere"
+    else:
+        text = f"{error:.2%} (relative L2)" if math.isfinite(error) else "unknown: nothing but noise"
+    yield "error estimate", text + remark
+    yield from (("not sampled", missing) for missing in unsampled)
+    yield from (("zero because", reason) for reason in zero_because)
 
 
 def errors_by_bounce(errors: Mapping[str, object]) -> str:
-    """Return the relative errors of bounces that have one, or whose one is not known: "3: 1.2 %, 4: unknown"."""
-    return ", ".join(f"{name}: {_percent(error)}" for name, error in errors.items())
+    """Return the relative errors of bounces: "3: 1.20%, 4: -", a dash where it is not known."""
+    return ", ".join(f"{name}: {f'{error:.2%}' if _is_number(error) else '-'}" for name, error in errors.items())
 
 
 def energies_by_bounce(energies: Mapping[str, object], errors: Mapping[str, object]) -> str:
@@ -42,13 +42,10 @@ def energies_by_bounce(energies: Mapping[str, object], errors: Mapping[str, obje
     return ", ".join(f"{name}: {_with_error(energy, errors.get(name))}" for name, energy in energies.items())
 
 
-def _percent(error: object) -> str:
-    return f"{error:.2%}" if isinstance(error, (int, float)) else "-"
-
-
 def _with_error(energy: object, error: object) -> str:
-    if not isinstance(energy, (int, float)):
-        return str(energy)
-    if not isinstance(error, (int, float)):
-        return f"{energy:.4g}"
-    return f"{energy:.4g} +- {error:.2g}" if error else f"{energy:.4g}"
+    shown = f"{energy:.4g}" if _is_number(energy) else str(energy)
+    return f"{shown} +- {error:.2g}" if _is_number(energy) and _is_number(error) and error else shown
+
+
+def _is_number(value: object) -> TypeGuard[float]:
+    return isinstance(value, (int, float))

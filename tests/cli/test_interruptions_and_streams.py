@@ -17,7 +17,7 @@ from support.partial_captures import write_part
 from support.point_captures import cells, point_light, points_header, write_points
 
 from nlosrender.capture.part import Selection
-from nlosrender.cli.progress import progress_bar
+from nlosrender.cli.progress import reporting
 from nlosrender.engine.backend import start as backend
 from nlosrender.errors import EXIT_BAD_INPUT, EXIT_FAILURE, EXIT_INTERRUPTED, EXIT_OK, FileError
 from nlosrender.files.export.export import export_capture
@@ -286,7 +286,7 @@ def test_a_bar_is_for_terminals_that_can_redraw_a_line(
     printed = stream()
     monkeypatch.setenv("TERM", term)
     monkeypatch.setattr(sys, "stderr", printed)
-    with progress_bar("render", hidden=False) as (progress, warn, _):
+    with reporting("render", False) as (progress, warn, _):
         progress(0.5)
         warn("look out")
     assert ("render" in printed.getvalue(), "\r" in printed.getvalue()) == (shown, shown)

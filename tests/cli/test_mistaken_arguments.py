@@ -78,7 +78,7 @@ def test_a_benchmark_needs_a_name_before_it_runs(tmp_path: Path, given: str) -> 
     (tmp_path / "inner").mkdir()
     done = run(tmp_path, "bench", "--scene", "plate", "--part", "process", "-o", given)
     assert done.returncode == EXIT_BAD_INPUT
-    assert "is a folder. Name files in it" in done.stderr
+    assert "is a folder. Name a file in it" in done.stderr
 
 
 def test_a_benchmark_that_cannot_be_written_does_not_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

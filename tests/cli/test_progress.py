@@ -13,10 +13,14 @@ from pathlib import Path
 import pytest
 from support.commands import run
 
-from nlosrender.cli import progress, progress_log
-from nlosrender.cli.progress_log import LEAST_SECONDS, MOST_SECONDS, ProgressLog
+from nlosrender.cli.progress import LogIntervals, ProgressLog, reporting
+from nlosrender.config.document import Config
+from nlosrender.config.load import load_config
+from nlosrender.config.sweep_load import load_sweep
+from nlosrender.pipeline import render_capture
 from nlosrender.readable import readable_duration
-from nlosrender.rendering.render_report import Standing
+from nlosrender.rendering.render_report import Progress, RenderReport, Standing, Warn
+from nlosrender.rendering.sweep_render import render_sweep
 
 SCENE = """\
 name: plate
@@ -28,6 +32,8 @@ time_axis: {start_opl: 1.5, bin_width_opl: 0.05, n_bins: 130}
 render: {max_bounces: 3, spp: 32, engine: path, memory_limit: 500MB}
 """
 WARNING = "warning: time_axis.start_opl is not 0"
+DEFAULT = LogIntervals()
+ALWAYS = LogIntervals(0.0, 0.0, 0.0)  # a line at every turn
 
 
 class Clock:
@@ -42,7 +48,7 @@ class Clock:
 def logged(shares: list[float], seconds: float, *standings: Standing) -> list[tuple[float, str]]:
     """Return the lines of a log, and when [s] they came, of work that moves on at equal times."""
     clock, lines = Clock(), []
-    log = ProgressLog("render", lambda line: lines.append((clock.now, line)), clock)
+    log = ProgressLog("render", lambda line: lines.append((clock.now, line)), DEFAULT, clock)
     for standing in standings:
         log.watch(standing)
     for number, share in enumerate(shares):
@@ -66,17 +72,17 @@ def test_fast_work_does_not_flood_the_log() -> None:
     """A command of less than 5 s prints nothing; no two lines are closer than 10 s."""
     assert logged([number / 100 for number in range(101)], 4.9) == []
     moments = [moment for moment, _ in logged([number / 100 for number in range(101)], 60.0)]
-    assert min(b - a for a, b in itertools.pairwise(moments)) >= LEAST_SECONDS
+    assert min(b - a for a, b in itertools.pairwise(moments)) >= DEFAULT.min_seconds
 
 
 def test_work_that_stands_still_is_told_every_minute() -> None:
     """Units take minutes: the log goes on, so that a job that hangs is told from one that works."""
     clock, lines = Clock(), []
-    log = ProgressLog("render", lines.append, clock)
+    log = ProgressLog("render", lines.append, DEFAULT, clock)
     for second in range(600):
         clock.now = float(second)
-        log.tell()
-    assert len(lines) == 600 // MOST_SECONDS
+        log.write_if_due()
+    assert len(lines) == 600 // DEFAULT.max_seconds
 
 
 def test_a_line_tells_units_error_time_and_host() -> None:
@@ -95,36 +101,44 @@ def config(tmp_path: Path) -> Path:
     return tmp_path
 
 
-@pytest.fixture
-def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let the log print at every turn."""
-    for name in ("FIRST_SECONDS", "LEAST_SECONDS", "LEAST_SHARE"):
-        monkeypatch.setattr(progress_log, name, 0.0)
-
-
-@pytest.mark.usefixtures("impatient")
 @pytest.mark.parametrize("sweep", ["", "sweep: {keys: {render.seed: [1, 2, 3]}}\n"])
-def test_a_batch_job_has_a_log(config: Path, sweep: str) -> None:
+def test_a_batch_job_has_a_log(
+    config: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], sweep: str
+) -> None:
     """stderr is no terminal: units, share, error, time and host, of a capture as of a sweep, up to 100 %."""
-    (config / "plate.yaml").write_text(SCENE + sweep)
-    done = run(config, "render", "plate.yaml")
-    host = re.escape(socket.gethostname())
+    monkeypatch.chdir(config)
+    path = config / "plate.yaml"
+    path.write_text(SCENE + sweep)
+    with reporting("sweep" if sweep else "render", False, ALWAYS) as listeners:
+        if sweep:
+
+            def render(own: Config, progress: Progress, warn: Warn, resume: bool | None) -> RenderReport:
+                return render_capture(own, progress, warn, resume=resume, watch=listeners.watch)
+
+            render_sweep(load_sweep(path), render, **listeners._asdict())
+        else:
+            render_capture(load_config(path), **listeners._asdict())
+    log, host = capsys.readouterr().err, re.escape(socket.gethostname())
     first = r"sweep: 0 of 3 captures, 0 %" if sweep else r"render: 0 of (\d+) units, 0 %"
-    lines = [line for line in done.stderr.splitlines() if not line.startswith("warning")]
-    assert any(re.match(first, line) for line in lines), done.stderr  # after those of the set-up
+    lines = [line for line in log.splitlines() if not line.startswith("warning")]
+    assert any(re.match(first, line) for line in lines), log  # after those of the set-up
     middle = r"3 of 3 captures, (\d+) of \1 units" if sweep else r"(\d+) of \1 units"
-    assert re.fullmatch(rf"\w+: {middle}, 100 %, error so far [\d.]+ %, after .*, on {host}", lines[-1]), done.stderr
+    assert re.fullmatch(rf"\w+: {middle}, 100 %, error so far [\d.]+ %, after .*, on {host}", lines[-1]), log
 
 
-@pytest.mark.usefixtures("impatient")
 @pytest.mark.parametrize("quiet", [False, True])
-def test_quiet_silences_progress_and_report_but_no_warning(config: Path, quiet: bool) -> None:
-    """What may be wrong with a capture is said in every log."""
+def test_quiet_silences_progress_and_report_but_no_warning(
+    config: Path, capsys: pytest.CaptureFixture[str], quiet: bool
+) -> None:
+    """What may be wrong with a capture is in every log."""
     done = run(config, "render", "plate.yaml", *(["--quiet"] if quiet else []))
     assert done.stderr.count(WARNING) == 1
-    assert ("render: " in done.stderr, "wrote" in done.stdout) == (not quiet, not quiet)
-    if quiet:
-        assert done.stdout == ""
+    assert ("wrote" in done.stdout, done.stdout == "") == (not quiet, quiet)
+    with reporting("render", quiet, ALWAYS) as listeners:
+        listeners.progress(0.5)
+        listeners.warn("look out")
+    assert ("render: " in (log := capsys.readouterr().err)) == (not quiet)
+    assert "warning: look out" in log
 
 
 class Terminal(io.TextIOWrapper):
@@ -145,25 +159,23 @@ class Terminal(io.TextIOWrapper):
         return os.read(self.leader, 65536).decode()
 
 
-@pytest.mark.usefixtures("impatient")
 @pytest.mark.parametrize(("columns", "bar"), [(80, True), (0, False)])
 def test_a_terminal_of_unknown_width_gets_lines(monkeypatch: pytest.MonkeyPatch, columns: int, bar: bool) -> None:
     """A bar of no width shows nothing; containers and batch systems give such terminals."""
     terminal = Terminal(columns)
     monkeypatch.setenv("TERM", "xterm")
     monkeypatch.setattr(sys, "stderr", terminal)
-    with progress.progress_bar("render", hidden=False) as telling:
-        telling.progress(0.5)
+    with reporting("render", False, ALWAYS) as listeners:
+        listeners.progress(0.5)
     assert ("\r" in terminal.shown().replace("\r\n", "\n")) == bar
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="a device of Linux")
-@pytest.mark.usefixtures("impatient")
 def test_a_log_on_a_full_disk_stops_no_work(monkeypatch: pytest.MonkeyPatch) -> None:
     """The render is worth more than its log."""
     full = Path("/dev/full").open("w")  # noqa: SIM115  # closing it would write again
     monkeypatch.setattr(sys, "stderr", full)
-    with progress.progress_bar("render", hidden=False) as telling:
-        telling.progress(0.5)
-        telling.warn("look out")
+    with reporting("render", False, ALWAYS) as listeners:
+        listeners.progress(0.5)
+        listeners.warn("look out")
     os.dup2(os.open(os.devnull, os.O_WRONLY), full.fileno())
