@@ -12,6 +12,7 @@ is missing. Attributes that differ are listed, and count with ``--attributes`` a
 from __future__ import annotations
 
 import argparse
+import contextlib
 import fnmatch
 import hashlib
 import importlib.util
@@ -39,7 +40,7 @@ ATTRIBUTES = (
     *("energy_error", "energy_error_per_bounce", "error_estimate", "error_estimate_per_bounce", "out_of_window_energy"),
 )
 MAX_SECONDS = 240.0  # of one command: 50 times the slowest capture on an idle core
-KILL_DELAYS = (0.15, 0.3, 0.6, 1.0, 0.05, 1.5, 2.2)  # s after the unfinished render appeared, tried in turn
+KILL_AFTER = (5, 8, 3, 12, 6, 9, 4)  # changes of the unfinished render's size, tried in turn: some work items are saved
 
 
 class RecordError(Exception):
@@ -97,7 +98,8 @@ class Recorder:
         begun = time.perf_counter()
         target = self.folder / f"{case.name}.hdf5"
         config = self.inputs / f"{case.name}.yaml"
-        config.write_text(yaml.safe_dump(dict(case.config), sort_keys=False))
+        text = yaml.safe_dump(dict(case.config), sort_keys=False)
+        config.write_text(text)
         report = getattr(self, f"_{case.mode}")(config, target)
         entry = fingerprint(target)
         engine = entry["attributes"].get("render_engine")
@@ -106,7 +108,8 @@ class Recorder:
         if (entry["datasets"]["data"]["sum"] == 0) != case.is_zero:
             raise RecordError(f"{case.name}: the sum of data is {entry['datasets']['data']['sum']}")
         keys = ("units", "resumed_units", "n_triangles")
-        entry |= {"mode": case.mode, "same_as": case.same_as, "report": {k: report[k] for k in keys if k in report}}
+        entry |= {"config": hashlib.sha256(text.encode()).hexdigest(), "mode": case.mode, "same_as": case.same_as}
+        entry |= {"report": {k: report[k] for k in keys if k in report}}
         return entry | {"seconds": round(time.perf_counter() - begun, 2)}
 
     def _render(self, config: Path, target: Path, *options: str) -> dict[str, Any]:
@@ -140,28 +143,36 @@ class Recorder:
 
     def _gone_on_with(self, config: Path, target: Path, number: signal.Signals) -> dict[str, Any]:
         """End a render by a signal when some of it is finished, and go on with the same command."""
-        for delay in KILL_DELAYS:
-            self._interrupted(config, target, number, delay)
+        for changes in KILL_AFTER:
+            self._interrupted(config, target, number, changes)
             done = self._cli("render", str(config), "-o", str(target), "-q", "--json")
             report = json.loads(done.stdout)
             if report["resumed_units"] > 0:
                 return report
         raise RecordError(f"{target.name}: no interruption left some of {report['units']} work items finished")
 
-    def _interrupted(self, config: Path, target: Path, number: signal.Signals, delay: float) -> None:
+    def _interrupted(self, config: Path, target: Path, number: signal.Signals, changes: int) -> None:
+        """Begin a render, and send a signal when what it has saved has changed its size so often."""
         target.unlink(missing_ok=True)
         command = [sys.executable, "-m", "nlosrender", "render", str(config), "-o", str(target), "--overwrite", "-q"]
         pipes = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
         with subprocess.Popen(command, env=self.environment, cwd=self.folder, **pipes) as process:
-            limit = time.monotonic() + MAX_SECONDS
-            while process.poll() is None and not self._is_under_way(target) and time.monotonic() < limit:
-                time.sleep(0.01)
-            time.sleep(delay)
+            limit, size = time.monotonic() + MAX_SECONDS, 0
+            while process.poll() is None and changes > 0 and time.monotonic() < limit:
+                before, size = size, self._saved_bytes(target)
+                changes -= size != before
+                time.sleep(0.003)
             process.send_signal(number)
             process.wait(MAX_SECONDS)
 
-    def _is_under_way(self, target: Path) -> bool:
-        return any(path.name.endswith(".partial") and target.name in path.name for path in self.folder.iterdir())
+    def _saved_bytes(self, target: Path) -> int:
+        """Return the size of all files of an unfinished render: those with ``partial`` in their path."""
+        unfinished = [path for path in self.folder.iterdir() if "partial" in path.name and target.name in path.name]
+        size = 0
+        for path in (file for top in unfinished for file in (top, *top.rglob("*"))):
+            with contextlib.suppress(OSError):
+                size += path.stat().st_size if path.is_file() else 0
+        return size
 
     def _cli(self, *arguments: str) -> subprocess.CompletedProcess[str]:
         return self._python("-m", "nlosrender", *arguments)
@@ -222,6 +233,9 @@ def compare_records(
         if old is None or new is None:
             yield name, "MISSING", f"not in {'BEFORE' if old is None else 'AFTER'}"
             continue
+        if old["config"] != new["config"]:
+            yield name, "DIFFERENT", "another configuration: record both trees with one list"
+            continue
         differing = [key for key in dict.fromkeys((*old["datasets"], *new["datasets"])) if _differ(old, new, key)]
         reference = after["captures"].get(old.get("same_as"))
         if differing:
@@ -230,7 +244,9 @@ def compare_records(
         elif reference and any(_differ(reference, new, key) for key in ("data", "variance")):
             yield name, "DIFFERENT", f"from {old['same_as']} in AFTER, whose samples it has to have"
         else:
-            changed = [k for k in ATTRIBUTES if old["attributes"].get(k) != new["attributes"].get(k)]
+            changed = [
+                k for k in ATTRIBUTES if str(old["attributes"].get(k)) != str(new["attributes"].get(k))
+            ]  # nan equals nan
             yield name, "attributes" if changed else "same", ", ".join(changed)
 
 
