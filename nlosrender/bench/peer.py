@@ -24,7 +24,7 @@ from nlosrender.bench.runs import LoadedScene, Run
 from nlosrender.engine.backend import llvm
 from nlosrender.errors import BackendError
 from nlosrender.scene.hidden_geometry import MeshFile
-from nlosrender.scene.triangle_mesh import TriangleMesh
+from nlosrender.scene.meshes.triangle_mesh import TriangleMesh
 
 CALIBRATION_LEVEL = 2
 # Royo et al. 2022's techniques by their names in mitransient. Hidden geometry sampling is biased under occlusion.

@@ -118,10 +118,10 @@ def _lengths(position: object) -> str:
 
 def _meshes(meshes: object) -> list[str]:
     """Return a line for each mesh; as it stands where it is not ours."""
-    from nlosrender.scene.mesh_report import MOST_LINES, MeshReport
+    from nlosrender.scene.meshes.mesh_report import MAX_LINES, MeshReport
 
-    lines, rest = [], len(_sequence(meshes)) - MOST_LINES
-    for mesh in _sequence(meshes)[:MOST_LINES]:
+    lines, rest = [], len(_sequence(meshes)) - MAX_LINES
+    for mesh in _sequence(meshes)[:MAX_LINES]:
         try:
             lines.append(MeshReport(**mesh).line())  # type: ignore[arg-type]
         except (TypeError, ValueError, AttributeError):

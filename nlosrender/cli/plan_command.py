@@ -51,7 +51,7 @@ def plan(
 
 
 def _rows(plan: RenderPlan) -> Iterator[tuple[str, str]]:
-    from nlosrender.scene.mesh_report import mesh_lines
+    from nlosrender.scene.meshes.mesh_report import mesh_lines
 
     yield "engine", f"{plan.engine}: {plan.reason} ({plan.variant})"
     for item in plan.skipped:

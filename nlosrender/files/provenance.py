@@ -11,7 +11,7 @@ from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from nlosrender.scene.mesh_report import MeshReport
+    from nlosrender.scene.meshes.mesh_report import MeshReport
 
 PACKAGES = ("nlosrender", "mitsuba", "drjit", "numpy", "h5py")
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import drjit as dr
@@ -17,17 +17,17 @@ import numpy as np
 
 from nlosrender.scene.bounding_box import Bounds, box_corners, joined_bounds
 from nlosrender.scene.coincident import PASSES, Overlap, coincident_disks, moved_apart, overlaps
-from nlosrender.scene.double_faces import without_double_faces
 from nlosrender.scene.hidden_geometry import ShapeDescription, Surface
 from nlosrender.scene.materials import area_emitter, check_surface, first_line, load_bsdf, medium_warnings, rejected
-from nlosrender.scene.mesh_attributes import VERTEX_COLOR, attribute_uses
-from nlosrender.scene.mesh_report import MeshReport
 from nlosrender.scene.mesh_surfaces import read_surfaces
+from nlosrender.scene.meshes.double_faces import without_double_faces
+from nlosrender.scene.meshes.mesh_attributes import VERTEX_COLOR, attribute_uses
+from nlosrender.scene.meshes.mesh_report import MeshReport
+from nlosrender.scene.meshes.triangle_mesh import TriangleMesh
 from nlosrender.scene.pictures import upright_bsdf
 from nlosrender.scene.pose import Float64
 from nlosrender.scene.relay_wall import RelayWall
 from nlosrender.scene.round_surfaces import ROUND_PLUGINS, Nested, curvature, nested_surfaces
-from nlosrender.scene.triangle_mesh import TriangleMesh
 
 WALL_ID = "relay_wall"
 MOST_REACH = 1e5  # hidden geometry over the wall's size: float32 then tells points 1 % of the wall apart
@@ -245,7 +245,7 @@ def _in_engine_units(mesh: TriangleMesh, surface: Surface, bsdf: mi.BSDF, unit: 
 
     The former have no normal, and NaN would come of it.
     """
-    mesh = mesh.with_vertices((mesh.vertices / unit).astype(np.float32)).with_area_only()
+    mesh = replace(mesh, vertices=(mesh.vertices / unit).astype(np.float32)).with_area_only()
     if not len(mesh.faces):
         raise rejected(surface.key, f"too small in a scene of {unit:g} m: float32 rounds its triangles to nothing.")
     return without_double_faces(mesh, both_sides=_has_two_sides(bsdf))

@@ -9,15 +9,15 @@ them apart. Visibility then decides as everywhere: what lies behind is dark, and
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from nlosrender.scene.meshes.triangle_mesh import TriangleMesh, unit_rows
 from nlosrender.scene.pose import Float64
-from nlosrender.scene.triangle_mesh import TriangleMesh
 
 GAP = 2e-6  # over 1 + the largest coordinate [engine units]: four times the ray offset
 LEAST_POINTS = 2**16  # tried on all meshes of a scene
@@ -112,10 +112,8 @@ def moved_apart(mesh: TriangleMesh, faces: NDArray[np.bool_], *, both_sides: boo
     at_vertices = np.zeros_like(moved.vertices)
     for corner in range(3):
         np.add.at(at_vertices, moved.faces[:, corner], normals)
-    length = np.linalg.norm(at_vertices, axis=1, keepdims=True)
-    along = np.divide(at_vertices, length, out=np.zeros_like(at_vertices), where=length > 0)
     step = STEP * GAP * (1 + np.abs(moved.vertices).max(axis=1, keepdims=True))
-    moved = moved.with_vertices(moved.vertices + along * step)
+    moved = replace(moved, vertices=moved.vertices + unit_rows(at_vertices) * step)
     return TriangleMesh.merged([mesh.subset(~faces), moved]) if not faces.all() else moved
 
 

@@ -14,14 +14,14 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 
 from nlosrender.scene.bounding_box import Bounds, bounds_of, box_corners
-from nlosrender.scene.letters import letters_mesh
-from nlosrender.scene.mesh_normals import Normals
+from nlosrender.scene.meshes.letters import letters_mesh
+from nlosrender.scene.meshes.mesh_normals import Normals
+from nlosrender.scene.meshes.primitives import box_mesh, rectangle_mesh, room_mesh
+from nlosrender.scene.meshes.triangle_mesh import TriangleMesh
 from nlosrender.scene.pictures import has_picture, readable, round_plugin, upright_bsdf
 from nlosrender.scene.pose import Float64, Pose, euler_xyz
-from nlosrender.scene.primitives import box_mesh, rectangle_mesh, room_mesh
 from nlosrender.scene.round_walls import cylinder_pose
 from nlosrender.scene.transforms import transform_matrix
-from nlosrender.scene.triangle_mesh import TriangleMesh
 
 if TYPE_CHECKING:
     from nlosrender.config.hidden_geometry import CylinderConfig, HiddenItemConfig, MeshConfig, SphereConfig

@@ -10,17 +10,17 @@ from typing import TYPE_CHECKING
 from nlosrender.config.bsdf_table import TRANSMITTING
 from nlosrender.errors import ConfigError
 from nlosrender.scene.bounding_box import box_corners
-from nlosrender.scene.file_mesh import FileMesh
 from nlosrender.scene.hidden_geometry import MeshFile, ShapeDescription, Surface, hidden_surfaces
-from nlosrender.scene.mesh_file import read_mesh_file
-from nlosrender.scene.mesh_normals import with_normals
-from nlosrender.scene.mesh_report import MeshReport, mesh_report
 from nlosrender.scene.mesh_wall import MeshWall
+from nlosrender.scene.meshes.file_mesh import FileMesh
+from nlosrender.scene.meshes.mesh_file import read_mesh_file
+from nlosrender.scene.meshes.mesh_normals import with_normals
+from nlosrender.scene.meshes.mesh_report import MeshReport, mesh_report
+from nlosrender.scene.meshes.triangle_mesh import TriangleMesh
 from nlosrender.scene.pictures import has_picture, readable
 from nlosrender.scene.placing import placed
 from nlosrender.scene.pose import Float64, Pose
 from nlosrender.scene.relay_wall import RelayWall, relay_wall_from_config
-from nlosrender.scene.triangle_mesh import TriangleMesh
 
 if TYPE_CHECKING:
     from nlosrender.config.scene import SceneConfig

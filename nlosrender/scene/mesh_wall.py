@@ -11,12 +11,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from nlosrender.config.fields import LONGEST, SHORTEST
 from nlosrender.errors import ConfigError
-from nlosrender.scene.file_mesh import FileMesh
 from nlosrender.scene.hidden_geometry import mesh_matrix
-from nlosrender.scene.mesh_file import read_mesh_file
-from nlosrender.scene.mesh_normals import with_normals
+from nlosrender.scene.meshes.file_mesh import FileMesh
+from nlosrender.scene.meshes.mesh_file import read_mesh_file
+from nlosrender.scene.meshes.mesh_normals import with_normals
+from nlosrender.scene.meshes.triangle_mesh import TriangleMesh
 from nlosrender.scene.pose import Float64, Pose
-from nlosrender.scene.triangle_mesh import TriangleMesh
 from nlosrender.scene.uv_map import NOWHERE, Indices, UvMap
 from nlosrender.scene.wall_coordinates import on_wall, require_positive
 

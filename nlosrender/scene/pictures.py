@@ -12,8 +12,8 @@ from dataclasses import replace
 
 import numpy as np
 
+from nlosrender.scene.meshes.triangle_mesh import TriangleMesh
 from nlosrender.scene.transforms import transform_matrix
-from nlosrender.scene.triangle_mesh import TriangleMesh
 
 TEXTURES_WITH_A_PLACE = ("bitmap", "checkerboard")  # those that differ between texture coordinates
 _UPSIDE_DOWN = np.array([[1.0, 0, 0, 0], [0, -1, 0, 1], [0, 0, 1, 0], [0, 0, 0, 1]])  # (u, v) -> (u, 1 - v)

@@ -22,10 +22,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from nlosrender.scene.mesh_wall import mesh_wall_from_config
+from nlosrender.scene.meshes.triangle_mesh import TriangleMesh
 from nlosrender.scene.pictures import has_picture
 from nlosrender.scene.pose import Float64, Pose
 from nlosrender.scene.round_walls import CylinderWall, SphereWall, cylinder_pose
-from nlosrender.scene.triangle_mesh import TriangleMesh
 from nlosrender.scene.wall_coordinates import on_wall, require_positive
 
 if TYPE_CHECKING:

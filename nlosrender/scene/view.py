@@ -17,12 +17,12 @@ from nlosrender.scene.build import load_surface, shape_bounds
 from nlosrender.scene.camera import ImagePlane, image_plane
 from nlosrender.scene.hidden_geometry import ShapeDescription, Surface, hidden_surfaces
 from nlosrender.scene.materials import check_surface, medium_warnings, mitsuba_spectrum, rejected
-from nlosrender.scene.mesh_report import MeshReport
 from nlosrender.scene.mesh_surfaces import read_surfaces
+from nlosrender.scene.meshes.mesh_report import MeshReport
+from nlosrender.scene.meshes.triangle_mesh import TriangleMesh
 from nlosrender.scene.pictures import upright_bsdf
 from nlosrender.scene.pose import Float64, Pose
 from nlosrender.scene.relay_wall import relay_wall_from_config
-from nlosrender.scene.triangle_mesh import TriangleMesh
 from nlosrender.scene.xml_loading import WHERE, load_xml_scene
 
 if TYPE_CHECKING:

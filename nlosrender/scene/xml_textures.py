@@ -12,10 +12,10 @@ from nlosrender.config.bsdf_table import TRANSMITTING
 from nlosrender.config.xml_shapes import named, shape_parameters
 from nlosrender.config.xml_tree import place_of
 from nlosrender.scene.hidden_geometry import MESH_PLUGINS
-from nlosrender.scene.mesh_attributes import AttributeUse
+from nlosrender.scene.meshes.mesh_attributes import AttributeUse
+from nlosrender.scene.meshes.triangle_mesh import TriangleMesh
 from nlosrender.scene.pictures import TEXTURES_WITH_A_PLACE
 from nlosrender.scene.pose import Float64
-from nlosrender.scene.triangle_mesh import TriangleMesh
 
 OWN_BUFFERS = ("vertex_positions", "vertex_normals", "vertex_texcoords", "vertex_count", "face_count")
 

@@ -15,7 +15,7 @@ from support.rendering import configured, flat_wall, render
 
 from nlosrender import pipeline
 from nlosrender.engine.backend.start import start_backend
-from nlosrender.scene.triangle_mesh import TriangleMesh
+from nlosrender.scene.meshes.triangle_mesh import TriangleMesh
 
 SENSORS = (3, 2)
 ENGINES = {

@@ -14,7 +14,7 @@ from support.views import view_config
 from nlosrender import pipeline
 from nlosrender.engine.backend.start import start_backend
 from nlosrender.errors import ConfigError
-from nlosrender.scene.mesh_file import read_mesh
+from nlosrender.scene.meshes.mesh_file import read_mesh
 
 CENTER = np.array([0.2, 0.1, 0.8])
 WIDTH, HEIGHT = 0.6, 0.4

@@ -14,7 +14,7 @@ from damage import damaged
 from support.rendering import configured, flat_wall, render
 
 from nlosrender.errors import ConfigError
-from nlosrender.scene.mesh_file import read_mesh
+from nlosrender.scene.meshes.mesh_file import read_mesh
 
 CORNERS = np.array([[-0.5, -0.5, 0], [0.5, -0.5, 0], [0.5, 0.5, 0], [-0.5, 0.5, 0.1]])
 TRIANGLES = ((0, 2, 1), (0, 3, 2))

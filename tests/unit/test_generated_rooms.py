@@ -16,8 +16,8 @@ from nlosrender.bench.paper.rooms import ROOMS, Room, write_meshes
 from nlosrender.bench.paper.study import Study
 from nlosrender.config.load import config_hash, load_config
 from nlosrender.errors import ConfigError, FileError
-from nlosrender.scene.mesh_file import read_mesh
-from nlosrender.scene.triangle_mesh import TriangleMesh
+from nlosrender.scene.meshes.mesh_file import read_mesh
+from nlosrender.scene.meshes.triangle_mesh import TriangleMesh
 
 PROJECT = Path(__file__).parents[2]
 

@@ -7,10 +7,10 @@ import pytest
 
 from nlosrender.scene.bounding_box import joined_bounds
 from nlosrender.scene.hidden_geometry import MeshFile, ShapeDescription, Surface, hidden_surfaces
+from nlosrender.scene.meshes.triangle_mesh import TriangleMesh
 from nlosrender.scene.pose import Pose, euler_xyz
 from nlosrender.scene.relay_wall import RectangleWall
 from nlosrender.scene.transforms import transform_matrix
-from nlosrender.scene.triangle_mesh import TriangleMesh
 
 WALL = RectangleWall(Pose.from_normal_up([5.0, -2.0, 1.0], [1, 0.5, 0.2], [0, 0.3, 1]), 2.0, 1.5)
 BSDF = {"type": "diffuse", "reflectance": 0.4}

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import shapely
 
-from nlosrender.scene.letters import CHARACTERS, letters_mesh, letters_outline
+from nlosrender.scene.meshes.letters import CHARACTERS, letters_mesh, letters_outline
 from nlosrender.scene.pose import Pose
 
 GLYPHS = CHARACTERS.replace(" ", "")

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import shapely
 
-from nlosrender.scene.obj import read_obj
-from nlosrender.scene.ply import read_ply
+from nlosrender.scene.meshes.obj import read_obj
+from nlosrender.scene.meshes.ply import read_ply
 
 ELL = np.array([[0, 0], [0, 0.8], [0.24, 0.8], [0.24, 0.24], [0.8, 0.24], [0.8, 0]])  # area 0.8^2 - 0.56^2
 PLATE = "v 0 0 1\nv 2 0 1\nv 2 1 1\nv 0 1 1\n"

@@ -16,8 +16,8 @@ from nlosrender.capture.grids import build_capture
 from nlosrender.errors import ConfigError
 from nlosrender.pipeline import place_scene
 from nlosrender.scene.mesh_wall import MeshWall, mesh_wall_from_config
+from nlosrender.scene.meshes.triangle_mesh import TriangleMesh
 from nlosrender.scene.pose import Pose
-from nlosrender.scene.triangle_mesh import TriangleMesh
 
 WIDTH, HEIGHT = 2.0, 1.6
 

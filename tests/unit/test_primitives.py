@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
+from nlosrender.scene.meshes.primitives import box_mesh, rectangle_mesh, room_mesh
+from nlosrender.scene.meshes.triangle_mesh import TriangleMesh
 from nlosrender.scene.pose import Pose
-from nlosrender.scene.primitives import box_mesh, rectangle_mesh, room_mesh
-from nlosrender.scene.triangle_mesh import TriangleMesh
 
 POSE = Pose.from_normal_up([0.3, -0.2, 1.1], [0.2, -0.4, -1.0], [0.1, 1.0, 0.3])
 MIRROR = np.diag([-1.0, 1.0, 1.0, 1.0])

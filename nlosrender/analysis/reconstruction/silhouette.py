@@ -13,9 +13,9 @@ from nlosrender.config.load import parse_config
 from nlosrender.errors import ConfigError, FileError
 from nlosrender.files.layout import Float64
 from nlosrender.scene.hidden_geometry import MeshFile, Surface, hidden_surfaces
-from nlosrender.scene.mesh_file import read_mesh
+from nlosrender.scene.meshes.mesh_file import read_mesh
+from nlosrender.scene.meshes.triangle_mesh import TriangleMesh
 from nlosrender.scene.relay_wall import relay_wall_from_config
-from nlosrender.scene.triangle_mesh import TriangleMesh
 
 if TYPE_CHECKING:
     from shapely.geometry.base import BaseGeometry

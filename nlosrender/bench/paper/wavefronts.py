@@ -11,7 +11,7 @@ from nlosrender.bench.paper.drawing import new_figure, save, show_row, show_wall
 from nlosrender.bench.paper.figure import Check, PaperFigure, Picture
 from nlosrender.bench.paper.study import Rendered, Study
 from nlosrender.capture.grids import build_capture
-from nlosrender.scene.triangle_mesh import TriangleMesh
+from nlosrender.scene.meshes.triangle_mesh import TriangleMesh
 
 Float64 = NDArray[np.float64]
 SPACING = 0.01  # m between the points that arrivals are looked for at: ways of 2 m are then right to 0.02 mm

@@ -1,7 +1,7 @@
 """Text as flat or solid letters, generated from strokes: A-Z, 0-9 and space.
 
 The centre lines of each glyph (``glyphs``) are widened to the stroke width, united, cut off at baseline and cap
-height, and triangulated.
+height, and triangulated. No font is read, so that letters stay the same on every machine and for every release.
 """
 
 from __future__ import annotations
@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from nlosrender.scene.glyphs import Glyph, Point, glyph_table
+from nlosrender.scene.meshes.glyphs import Glyph, Point, glyph_table
+from nlosrender.scene.meshes.triangle_mesh import TriangleMesh
 from nlosrender.scene.pose import Float64, Pose
-from nlosrender.scene.triangle_mesh import TriangleMesh
 
 if TYPE_CHECKING:
     from shapely.geometry.base import BaseGeometry
@@ -33,21 +33,7 @@ def letters_outline(
 ) -> BaseGeometry:
     """Return the inked area of ``text`` as a shapely (multi)polygon, centred on the origin in x and y.
 
-    Parameters
-    ----------
-    text
-        Characters of ``CHARACTERS``, at least one of them not a space.
-    height
-        Cap height [m], > 0.
-    stroke_width
-        Width of the strokes [m]; 0.2 * height when None, below 0.5 * height (legible up to 0.25).
-    spacing
-        Gap between neighbouring characters [m], >= 0; 0.2 * height when None.
-
-    Raises
-    ------
-    ValueError
-        The text is empty or has other characters, or a size is out of range.
+    Parameters and errors as of ``letters_mesh``.
     """
     import shapely
     from shapely import affinity
@@ -92,8 +78,7 @@ def letters_mesh(
     spacing
         Gap between neighbouring characters [m], >= 0; 0.2 * height when None.
     pose
-        Centre of the text's extent, reading direction (x), up (y) and front normal (z) in the mesh's frame; the frame
-        itself when None.
+        Centre of the text's extent, reading direction (x), up (y) and front normal (z); the mesh's frame when None.
 
     Returns
     -------

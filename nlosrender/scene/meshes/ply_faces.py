@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from nlosrender.scene.ply_text import PlyRows
-from nlosrender.scene.polygons import cut_polygons
+from nlosrender.scene.meshes.ply_records import Lists
+from nlosrender.scene.meshes.ply_rows import PlyRows
+from nlosrender.scene.meshes.polygons import cut_polygons
+from nlosrender.scene.meshes.triangle_mesh import Int64, TriangleMesh, distinct_columns
 from nlosrender.scene.pose import Float64
-from nlosrender.scene.triangle_mesh import TriangleMesh
 
-Int64 = NDArray[np.int64]
-Lists = list[NDArray]  # of one list property: runs of records of equal length, (records, length)
-CornerUvs = Float64  # (m, 3, 2)
 _END_OF_STRIP = -1
 
 
@@ -23,14 +21,14 @@ class TriangleCorners:
     """Triangles of an element."""
 
     faces: Int64  # (m, 3) vertices
-    uvs: CornerUvs | None = None
-    lacking_uvs: str = ""  # what is said of texture coordinates that only some faces have
+    uvs: Float64 | None = None  # (m, 3, 2) texture coordinates of their corners
+    lacking_uvs: str = ""  # what a message says where only some faces have texture coordinates
 
 
 def polygon_corners(
     runs: Lists, uv_runs: Lists | None, positions: Float64, text: PlyRows | None
 ) -> tuple[TriangleCorners, tuple[str, ...]]:
-    """Return the triangles of polygons, and sentences about what is doubtful of these.
+    """Return the triangles of polygons, and sentences about bent polygons.
 
     Parameters
     ----------
@@ -75,12 +73,7 @@ def polygon_corners(
 def strip_corners(runs: Lists, n_vertices: int) -> TriangleCorners:
     """Return the triangles of strips: each vertex makes one with the two before it, every second one turned round.
 
-    A strip ends at the index -1.
-
-    Raises
-    ------
-    ValueError
-        An index is out of range or not an integer.
+    A strip ends at the index -1. ValueError for an index that is out of range or not an integer.
     """
     ended = [np.pad(whole_numbers(run), ((0, 0), (0, 1)), constant_values=_END_OF_STRIP).ravel() for run in runs]
     flat = np.concatenate([np.zeros(0, np.int64), *ended])
@@ -96,28 +89,15 @@ def strip_corners(runs: Lists, n_vertices: int) -> TriangleCorners:
     return TriangleCorners(faces[(faces != _END_OF_STRIP).all(axis=1)])
 
 
-def with_corner_uvs(mesh: TriangleMesh, uvs: CornerUvs) -> TriangleMesh:
+def with_corner_uvs(mesh: TriangleMesh, uvs: Float64) -> TriangleMesh:
     """Return a mesh with texture coordinates (m, 3, 2) for each corner of its faces: a vertex for each that differ."""
     vertices, flat = mesh.faces.ravel().astype(np.int64), uvs.reshape(-1, 2)
-    order = np.lexsort((flat[:, 1], flat[:, 0], vertices))
-    differs = (np.diff(vertices[order]) != 0) | (np.diff(flat[order], axis=0) != 0).any(axis=1)
-    which = np.empty(len(order), np.int64)
-    which[order] = np.append(0, np.cumsum(differs))[: len(order)]
-    first = np.empty(int(which.max(initial=-1)) + 1, np.int64)
-    first[which] = np.arange(len(which))
-    normals = None if mesh.normals is None else mesh.normals[vertices[first]]
-    colors = None if mesh.colors is None else mesh.colors[vertices[first]]
-    return TriangleMesh(mesh.vertices[vertices[first]], which.reshape(-1, 3), flat[first], normals, colors)
+    first, which = distinct_columns(np.stack([flat[:, 1], flat[:, 0], vertices]))
+    return replace(mesh.reindexed(vertices[first], which.reshape(-1, 3)), uvs=flat[first])
 
 
 def whole_numbers(values: NDArray) -> Int64:
-    """Return indices as integers.
-
-    Raises
-    ------
-    ValueError
-        One is no integer.
-    """
+    """Return indices as integers; ValueError for one that is none."""
     if values.dtype.kind == "f" and not (np.abs(values) < 2**53).all():
         raise ValueError("a face has an index that is no number, or far too large")
     indices = values.astype(np.int64)

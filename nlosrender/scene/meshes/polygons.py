@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from nlosrender.scene.meshes.triangle_mesh import Int64, unit_rows
 from nlosrender.scene.pose import Float64
 
-Int64 = NDArray[np.int64]
-SLIVER = 1e-6  # of a polygon's size squared: areas below are rounding, also when they are negative
-BENT = 1e-2  # of its size: a polygon whose corners lie so far from its plane has no single surface
+SLIVER = 1e-6  # of a polygon's size squared: areas below, also negative ones, are rounding of float32 coordinates
+BENT = 1e-2  # of a polygon's size: farther from their plane its corners show that it has no single surface
+MAX_CORNERS = 1000  # of a polygon; more is a damaged count
 
 Cut = tuple[Int64, Int64]  # which polygon each triangle is part of, (m,); and which of its corners it has, (m, 3)
 
@@ -25,7 +25,7 @@ def cut_polygons(groups: Sequence[Float64], named: Callable[[int, int], str]) ->
         Corners of the polygons, (polygons, corners, 3), one array per number of corners; those of less than 3 have
         no area. Finite.
     named
-        Returns how a message calls a polygon, by its group and its number in it.
+        Returns the name of a polygon in messages, from its group and its number in it.
 
     Returns
     -------
@@ -68,8 +68,7 @@ def _local(points: Float64) -> tuple[Float64, Float64]:
         size = np.abs(local).max(axis=(1, 2), keepdims=True)
         local = np.nan_to_num(np.divide(local, size, out=np.zeros_like(local), where=size > 0))
     normals = np.cross(local, np.roll(local, -1, axis=1)).sum(axis=1)  # Newell: twice the area, whatever the shape
-    length = np.linalg.norm(normals, axis=1, keepdims=True)
-    return local, np.divide(normals, length, out=np.zeros_like(normals), where=length > SLIVER)
+    return local, unit_rows(normals, SLIVER)
 
 
 def _fan_starts(local: Float64, normals: Float64) -> Int64:

@@ -1,6 +1,6 @@
 """Reads .obj meshes: positions, texture coordinates and normals of polygons, in float64.
 
-No other file is opened; materials, lines and curves are told (``FileMesh``), not taken.
+No other file is opened; materials, lines and curves are counted (``FileMesh``), not read.
 """
 
 from __future__ import annotations
@@ -10,34 +10,23 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from nlosrender.scene.file_mesh import BYTE_ORDER_MARK, FileMesh
-from nlosrender.scene.obj_text import ObjText, shown
-from nlosrender.scene.polygons import cut_polygons
+from nlosrender.scene.meshes.file_mesh import BYTE_ORDER_MARK, NO_UVS, FileMesh, numbers_in
+from nlosrender.scene.meshes.obj_lines import ObjLines, shown
+from nlosrender.scene.meshes.polygons import MAX_CORNERS, cut_polygons
+from nlosrender.scene.meshes.triangle_mesh import Int64, TriangleMesh, distinct_columns
 from nlosrender.scene.pose import Float64
-from nlosrender.scene.triangle_mesh import TriangleMesh, numbers_in
 
-Int64 = NDArray[np.int64]
-
-MOST_CORNERS = 1000  # of a polygon
 ABSENT = 0  # in place of an index; the first of each kind is 1
-_LARGEST_INDEX = 2**40
+MAX_INDEX = 2**40  # digits beyond are damage; sums with line counts stay below 2^63
 _KINDS = {b"v": (3, 3), b"vt": (1, 2), b"vn": (3, 3)}  # numbers needed, and read; more may follow (weights, colours)
 _NAMES = ("vertex", "texture coordinate", "normal")
 
 
 def read_obj(content: bytes) -> FileMesh:
-    """Return the mesh of an .obj file.
+    """Return the mesh of an .obj file from its bytes, in the file's coordinates.
 
-    Parameters
-    ----------
-    content
-        The file's bytes.
-
-    Returns
-    -------
-    FileMesh
-        In the file's coordinates; texture coordinates are kept when every corner has them. The vertical texture
-        coordinate is turned round, as images in .obj files have it. Polygons are cut into triangles.
+    Polygons are cut into triangles. Texture coordinates are kept when every corner has them; the vertical one is turned
+    round, as images in .obj files have it.
 
     Raises
     ------
@@ -45,9 +34,9 @@ def read_obj(content: bytes) -> FileMesh:
         A number or an index cannot be, or a polygon crosses itself; names the line.
     """
     if b"\0" in content:
-        hint = " It may be UTF-16: save it as UTF-8" if content[:2] in (b"\xff\xfe", b"\xfe\xff") else ""
-        raise ValueError(f"it holds a zero byte, so it is not text.{hint}".removesuffix("."))
-    text = ObjText.of(content.removeprefix(BYTE_ORDER_MARK))
+        hint = ". It may be UTF-16: save it as UTF-8" if content[:2] in (b"\xff\xfe", b"\xfe\xff") else ""
+        raise ValueError(f"it holds a zero byte, so it is not text{hint}")
+    text = ObjLines.of(content.removeprefix(BYTE_ORDER_MARK))
     positions, uvs, normals = (_numbers(text, kind) for kind in _KINDS)
     for kind, what in ((b"v", "vertices"), (b"f", "faces")):
         if not text.rows(kind):
@@ -56,12 +45,13 @@ def read_obj(content: bytes) -> FileMesh:
     groups = _polygons(text)
     corners, bent = _triangles(text, groups, positions)
     has = corners >= 0
-    no_uvs = "it has no texture coordinates"
+    no_uvs = NO_UVS
     if has[:, 1].any():
         no_uvs = "" if has[:, 1].all() else f"its face at {_first_without_uvs(text, groups)} has no texture coordinates"
     has_normals = bool(has[:, 2].any())
-    chosen, faces = _distinct(corners, [0] + [1] * (not no_uvs) + [2] * has_normals)
-    n_flat = sum(len(rows) for rows, indices in groups if indices.shape[1] < 3)
+    # corners with the same position, texture coordinate and normal, as far as these are kept, are one vertex
+    first, faces = distinct_columns(corners.T[[2] * has_normals + [1] * (not no_uvs) + [0]])
+    chosen = corners[first]
     mesh = TriangleMesh(
         positions[chosen[:, 0]],
         faces.reshape(-1, 3),
@@ -69,28 +59,31 @@ def read_obj(content: bytes) -> FileMesh:
         # the row that -1 finds: a corner without a normal
         np.append(normals, [[0.0, 0.0, 0.0]], axis=0)[chosen[:, 2]] if has_normals else None,
     )
+    n_flat = sum(len(rows) for rows, indices in groups if indices.shape[1] < 3)
     dropped = [f"{n_flat} faces of less than 3 corners"] * bool(n_flat)
     dropped += ["texture coordinates of some faces"] * bool(no_uvs and has[:, 1].any())
-    return FileMesh(mesh, text.materials(), (*dropped, *text.dropped()), bent + text.doubts(), no_uvs)
+    return FileMesh(mesh, text.materials(), (*dropped, *text.dropped()), (*bent, *text.doubts()), no_uvs)
 
 
-def _numbers(text: ObjText, kind: bytes) -> Float64:
+def _numbers(text: ObjLines, kind: bytes) -> Float64:
     """Return the numbers of all lines of one kind, (lines, 2 or 3); zero where they may be left away."""
-    least, need = _KINDS[kind]
+    n_needed, n_read = _KINDS[kind]
     rows = text.rows(kind)
     lines = [text.lines[row] for row in rows]
     if not lines:
-        return np.zeros((0, need))
+        return np.zeros((0, n_read))
     width = len(lines[0].split()) - 1
     values = _parsed(lines, np.float64)
-    if width >= need and len(values) == width * len(lines) and all(len(line.split()) == width + 1 for line in lines):
-        return values.reshape(-1, width)[:, :need]
-    found = np.zeros((len(lines), need))
+    if width >= n_read and len(values) == width * len(lines) and all(len(line.split()) == width + 1 for line in lines):
+        return values.reshape(-1, width)[:, :n_read]
+    found = np.zeros((len(lines), n_read))
     for row, line in enumerate(lines):
         numbers = _parsed([line], np.float64)
-        if len(numbers) < least or len(numbers) != len(line.split()) - 1:
-            raise ValueError(f"{text.place(rows[row])}: need {least} numbers after {kind.decode()}, got {shown(line)}")
-        found[row, : len(numbers)] = numbers[:need]
+        if len(numbers) < n_needed or len(numbers) != len(line.split()) - 1:
+            raise ValueError(
+                f"{text.place(rows[row])}: need {n_needed} numbers after {kind.decode()}, got {shown(line)}"
+            )
+        found[row, : len(numbers)] = numbers[:n_read]
     return found
 
 
@@ -100,8 +93,8 @@ def _parsed(lines: Sequence[bytes], dtype: type) -> NDArray:
     return numbers_in(b" ".join(parts[1] for parts in words if len(parts) > 1).replace(b"/", b" "), dtype)
 
 
-def _triangles(text: ObjText, groups: Sequence[tuple[Int64, Int64]], positions: Float64) -> tuple[Int64, tuple]:
-    """Return the corners (3 m, 3) of the triangles that polygons are cut into, and what there is to say of these."""
+def _triangles(text: ObjLines, groups: Sequence[tuple[Int64, Int64]], positions: Float64) -> tuple[Int64, tuple]:
+    """Return the corners (3 m, 3) of the triangles that polygons are cut into, and sentences about bent polygons."""
     polygons = [(rows, indices) for rows, indices in groups if indices.shape[1] > 2]
     cuts, bent = cut_polygons(
         [positions[indices[..., 0]] for _, indices in polygons],
@@ -111,34 +104,34 @@ def _triangles(text: ObjText, groups: Sequence[tuple[Int64, Int64]], positions: 
     return np.concatenate([np.zeros((0, 3, 3), np.int64), *parts]).reshape(-1, 3), bent
 
 
-def _polygons(text: ObjText) -> list[tuple[Int64, Int64]]:
-    """Return polygons grouped by how their lines are built: their lines (faces,), and the indices from 0 of their
-    corners (faces, corners, 3), -1 where absent."""
-    at, defined = np.asarray(text.rows(b"f")), [np.asarray(text.rows(kind), dtype=np.int64) for kind in _KINDS]
-    lines = [text.lines[row] for row in at]
+def _polygons(text: ObjLines) -> list[tuple[Int64, Int64]]:
+    """Return polygons grouped by how their lines are built: the lines (faces,), and the corners (faces, corners, 3) as
+    indices of position, texture coordinate and normal from 0, -1 where absent."""
+    face_rows, defined = np.asarray(text.rows(b"f")), [np.asarray(text.rows(kind), np.int64) for kind in _KINDS]
     groups: dict[tuple[int, int, bytes], list[int]] = {}
-    for number, line in enumerate(lines):
+    for row in face_rows:
+        line = text.lines[row]
         pattern = line.translate(None, b"+-0123456789")
-        groups.setdefault((len(line.split()) - 1, line.count(b"//"), pattern), []).append(number)
+        groups.setdefault((len(line.split()) - 1, line.count(b"//"), pattern), []).append(row)
     found = []
-    for (n_corners, gaps, pattern), numbers in groups.items():
-        if n_corners > MOST_CORNERS:
-            raise ValueError(f"{text.place(at[numbers[0]])}: {n_corners} corners, need at most {MOST_CORNERS}")
-        rows = at[numbers]
-        written = _corners(text, rows, n_corners, _parts(n_corners, gaps, pattern.split()[1:]))
+    for (n_corners, n_gaps, pattern), members in groups.items():
+        rows = np.asarray(members)
+        if n_corners > MAX_CORNERS:
+            raise ValueError(f"{text.place(rows[0])}: {n_corners} corners, need at most {MAX_CORNERS}")
+        written = _corners(text, rows, n_corners, _parts(n_corners, n_gaps, pattern.split()[1:]))
         found.append((rows, _from_zero(text, written, rows, defined)))
     return found
 
 
-def _from_zero(text: ObjText, written: Int64, rows: Int64, defined: Sequence[Int64]) -> Int64:
-    """Return indices from 0, -1 where absent.
+def _from_zero(text: ObjLines, written: Int64, rows: Int64, defined: Sequence[Int64]) -> Int64:
+    """Return indices from 0, -1 where absent, of indices as the lines have them: negative ones count back.
 
     Parameters
     ----------
     written
-        (faces, corners, 3) as the lines have them: a negative index counts back from those above its line.
+        (faces, corners, 3).
     rows
-        Lines of the faces.
+        Lines of the faces; a negative index counts from the last definition above its line.
     defined
         Lines that define positions, texture coordinates and normals.
     """
@@ -157,33 +150,27 @@ def _from_zero(text: ObjText, written: Int64, rows: Int64, defined: Sequence[Int
     return indices
 
 
-def _parts(n_corners: int, gaps: int, slashes: Sequence[bytes]) -> list[int]:
+def _parts(n_corners: int, n_gaps: int, slashes: Sequence[bytes]) -> list[int]:
     """Return which of position, texture coordinate and normal the corners of a line have; empty: not all the same.
 
-    Parameters
-    ----------
-    n_corners, gaps
-        Corners of the line, and how many of its slashes follow another one.
-    slashes
-        What is left of the corners without their digits.
+    ``n_gaps`` slashes follow another one; ``slashes`` is what is left of the corners without their digits.
     """
     if not slashes:
         return [0]
-    if len(slashes) != n_corners or len(set(slashes)) > 1:
-        return []
-    if slashes[0] == b"/":
-        return [0, 1]
-    if slashes[0] == b"//" and gaps in (0, n_corners):
-        return [0, 2] if gaps else [0, 1, 2]
+    if len(slashes) == n_corners and len(set(slashes)) == 1:
+        if slashes[0] == b"/":
+            return [0, 1]
+        if slashes[0] == b"//" and n_gaps in (0, n_corners):
+            return [0, 2] if n_gaps else [0, 1, 2]
     return []
 
 
-def _corners(text: ObjText, rows: Int64, n_corners: int, parts: Sequence[int]) -> Int64:
-    """Return the indices as written, (lines, corners, 3)."""
+def _corners(text: ObjLines, rows: Int64, n_corners: int, parts: Sequence[int]) -> Int64:
+    """Return the indices as written, (lines, corners, 3): all lines at once where they are alike, else word by word."""
     lines = [text.lines[row] for row in rows]
     found = np.full((len(lines), n_corners, 3), ABSENT, dtype=np.int64)
     numbers = _parsed(lines, np.int64) if parts else np.zeros(0, dtype=np.int64)
-    if len(numbers) == len(lines) * n_corners * len(parts) > 0 and np.abs(numbers).max() < _LARGEST_INDEX:
+    if len(numbers) == len(lines) * n_corners * len(parts) > 0 and np.abs(numbers).max() < MAX_INDEX:
         found[..., parts] = numbers.reshape(len(lines), n_corners, len(parts))
         return found
     for face, line in enumerate(lines):
@@ -192,7 +179,7 @@ def _corners(text: ObjText, rows: Int64, n_corners: int, parts: Sequence[int]) -
                 written = [int(part) if part else ABSENT for part in word.split(b"/")]
             except ValueError:
                 written = []
-            if not 1 <= len(written) <= 3 or any(abs(index) >= _LARGEST_INDEX for index in written):
+            if not 1 <= len(written) <= 3 or any(abs(index) >= MAX_INDEX for index in written):
                 raise ValueError(
                     f"{text.place(rows[face])}: {shown(word)} is no corner, need v, v/vt, v//vn or v/vt/vn"
                 )
@@ -200,16 +187,6 @@ def _corners(text: ObjText, rows: Int64, n_corners: int, parts: Sequence[int]) -
     return found
 
 
-def _first_without_uvs(text: ObjText, groups: Sequence[tuple[Int64, Int64]]) -> str:
+def _first_without_uvs(text: ObjLines, groups: Sequence[tuple[Int64, Int64]]) -> str:
     lacking = [rows[(indices[..., 1] < 0).any(axis=1)] for rows, indices in groups if indices.shape[1] > 2]
     return text.place(int(np.concatenate(lacking).min()))
-
-
-def _distinct(corners: Int64, parts: Sequence[int]) -> tuple[Int64, Int64]:
-    """Return the different corners (n, 3), told by ``parts`` of their indices, and which of them each corner is."""
-    ids = corners[:, 0]
-    for part in parts[1:]:
-        # below 2^63: the first factor counts lines of the file at most; from 0 where -1 is absent
-        ids = np.unique(ids, return_inverse=True)[1] * (int(corners[:, part].max(initial=0)) + 2) + corners[:, part] + 1
-    _, first, which = np.unique(ids, return_index=True, return_inverse=True)
-    return corners[first], which

@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
-from nlosrender.scene.ply_header import PlyElement, PlyHeader
+from nlosrender.scene.meshes.file_mesh import numbers_in
+from nlosrender.scene.meshes.ply_header import PlyElement, PlyHeader
+from nlosrender.scene.meshes.triangle_mesh import Int64
 from nlosrender.scene.pose import Float64
-from nlosrender.scene.triangle_mesh import numbers_in
 
 
 @dataclass(eq=False)
@@ -17,7 +17,7 @@ class PlyRows:
     """The lines of the body that are not blank, taken element by element."""
 
     lines: list[bytes]
-    numbers: NDArray[np.int64]  # of the lines in the file, from 1
+    numbers: Int64  # of the lines in the file, from 1
     taken: int = 0
     first_rows: dict[str, int] = field(default_factory=dict)  # of the elements taken so far
 
@@ -31,7 +31,7 @@ class PlyRows:
 
     def place(self, element: str, record: int) -> str:
         """Return the name of the line of a record in messages."""
-        return self._place(self.first_rows[element] + record)
+        return f"line {self.numbers[self.first_rows[element] + record]}"
 
     def take(self, element: PlyElement) -> Float64:
         """Return the values of the next rows, those of an element.
@@ -46,19 +46,14 @@ class PlyRows:
         rows = self.lines[self.taken : self.taken + element.count]
         self.first_rows[element.name] = self.taken
         n_words = np.array([len(row.split()) for row in rows], dtype=np.int64)
-        ends = np.cumsum(n_words)
         values = numbers_in(b"\n".join(rows), np.float64)
-        if len(rows) < element.count and len(values) == n_words.sum():
-            raise element.cut_short(len(rows))
         if len(values) < n_words.sum():
-            row, word = next(
-                (row, word)
-                for row, line in enumerate(rows)
-                for word in line.split()
-                if not len(numbers_in(word, float))
-            )
+            words = ((row, word) for row, line in enumerate(rows) for word in line.split())
+            row, word = next((row, word) for row, word in words if not len(numbers_in(word, float)))
             raise ValueError(f"{self.place(element.name, row)}: {word[:60].decode('latin-1')!r} is no number")
-        self._check_rows(element, values, ends - n_words, ends)
+        if len(rows) < element.count:
+            raise element.cut_short(len(rows))
+        self._check_rows(element, values, np.cumsum(n_words), n_words)
         self.taken += element.count
         return values
 
@@ -68,30 +63,23 @@ class PlyRows:
         if rest:
             more = f" and {rest - 1} more" if rest > 1 else ""
             raise ValueError(
-                f"{self._place(self.taken)}{more}: values are left over after what its header promises: "
+                f"line {self.numbers[self.taken]}{more}: values are left over after what its header promises: "
                 f"{header.promised()}"
             )
 
-    def _check_rows(
-        self, element: PlyElement, values: Float64, starts: NDArray[np.int64], ends: NDArray[np.int64]
-    ) -> None:
-        at = starts.copy()  # of the next property in each row
+    def _check_rows(self, element: PlyElement, values: Float64, ends: Int64, n_words: Int64) -> None:
+        at = ends - n_words  # of the next property in each row
         for prop in element.properties:
-            if prop.count_dtype is not None and len(values):
-                inside = at < ends
-                lengths = np.where(inside, values[np.minimum(at, len(values) - 1)], 0.0)
-                is_length = (lengths >= 0) & (lengths <= element.longest_list) & (lengths == np.floor(lengths))
+            if prop.count_kind is not None and len(values):
+                lengths = np.where(at < ends, values[np.minimum(at, len(values) - 1)], 0.0)
+                is_length = (lengths >= 0) & (lengths <= element.max_list) & (lengths == np.floor(lengths))
                 for row in np.flatnonzero(~is_length)[:1]:
                     raise ValueError(f"{self.place(element.name, row)}: {element.no_length(row, lengths[row])}")
                 at += lengths.astype(np.int64)
             at += 1
-        wrong = np.flatnonzero(at != ends)
-        if len(wrong):
-            row, missing = int(wrong[0]), int(at[wrong[0]] - ends[wrong[0]])
-            place, what = self.place(element.name, row), f"element {element.name} of its header"
+        for row in np.flatnonzero(at != ends)[:1]:
+            missing, what = int(at[row] - ends[row]), f"element {element.name} of its header"
+            fault = f"are missing ({missing}), {what} has more"
             if missing < 0:
-                raise ValueError(f"{place}: values are left over ({-missing}), {what} has no place for them")
-            raise ValueError(f"{place}: values are missing ({missing}), {what} has more")
-
-    def _place(self, row: int) -> str:
-        return f"line {self.numbers[row]}"
+                fault = f"are left over ({-missing}), {what} has no place for them"
+            raise ValueError(f"{self.place(element.name, row)}: values {fault}")

@@ -1,13 +1,14 @@
-"""The lines of an .obj file by their keywords: continued ones joined, comments cut off, what is not read counted."""
+"""The lines of an .obj file by their keywords: continued ones joined, comments cut off, unread ones counted."""
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from nlosrender.scene.file_mesh import some_of
+from nlosrender.scene.meshes.file_mesh import some_of
 
 _READ = (b"v", b"vt", b"vn", b"f")
 _NO_SURFACE = {b"l": "lines", b"p": "points", b"curv": "curves", b"curv2": "curves", b"vp": "points of curves"}
@@ -22,25 +23,15 @@ _NO_MATERIAL = "none"
 
 
 @dataclass(frozen=True, eq=False)
-class ObjText:
-    """Lines of an .obj file; a line that ends in a backslash is one with the next.
+class ObjLines:
+    """Lines of an .obj file; a line that ends in a backslash is one with the next."""
 
-    Parameters
-    ----------
-    lines
-        Of v, vt, vn and f without their comments.
-    numbers
-        Where each begins in the file, from 1.
-    rows_by_keyword
-        Which lines begin with a keyword.
-    """
-
-    lines: Sequence[bytes]
-    numbers: Sequence[int]
-    rows_by_keyword: dict[bytes, list[int]]
+    lines: Sequence[bytes]  # those of v, vt, vn and f without their comments
+    numbers: Sequence[int]  # where each begins in the file, from 1
+    rows_by_keyword: dict[bytes, list[int]]  # indices into ``lines``
 
     @classmethod
-    def of(cls, content: bytes) -> ObjText:
+    def of(cls, content: bytes) -> ObjLines:
         """Return the lines of a file."""
         lines, numbers = _joined(content)
         rows: dict[bytes, list[int]] = {}
@@ -53,7 +44,7 @@ class ObjText:
         return cls(lines, numbers, rows)
 
     def rows(self, keyword: bytes) -> list[int]:
-        """Return which lines begin with a keyword."""
+        """Return the indices of the lines that begin with a keyword."""
         return self.rows_by_keyword.get(keyword, [])
 
     def place(self, row: int) -> str:
@@ -64,36 +55,37 @@ class ObjText:
         """Return the names of the materials that faces have, in the order of the file; "none" for faces without."""
         if not self.rows(b"usemtl"):
             return ()
-        owners = np.unique(np.searchsorted(self.rows(b"usemtl"), self.rows(b"f")))
-        names = [_NO_MATERIAL, *(self.lines[row] for row in self.rows(b"usemtl"))]
-        found = [names[owner] for owner in owners]
-        return tuple(dict.fromkeys(name if isinstance(name, str) else _argument(name) for name in found))
+        lines = [self.lines[row] for row in self.rows(b"usemtl")]
+        names = ["", *(" ".join(word.decode("utf-8", "replace") for word in line.split()[1:]) for line in lines)]
+        owners = np.unique(np.searchsorted(self.rows(b"usemtl"), self.rows(b"f")))  # 0: before the first usemtl
+        return tuple(dict.fromkeys(names[owner] or _NO_MATERIAL for owner in owners))
 
     def dropped(self) -> tuple[str, ...]:
         """Return what the file has beside surfaces, with how many of it."""
-        counts: dict[str, int] = {}
+        counts: Counter[str] = Counter()
         for keyword, what in _NO_SURFACE.items():
-            counts[what] = counts.get(what, 0) + len(self.rows(keyword))
+            counts[what] += len(self.rows(keyword))
         found = [f"{count} {what}" for what, count in counts.items() if count]
         first = self.lines[self.rows(b"v")[0]] if self.rows(b"v") else b""
         return (*found, "vertex colours") if len(first.split()) >= 7 else tuple(found)
 
-    def doubts(self) -> tuple[str, ...]:
-        """Return a sentence for each kind of line that may have held a part of the surface."""
-        return tuple(self._doubts())
-
-    def _doubts(self) -> Iterator[str]:
+    def doubts(self) -> Iterator[str]:
+        """Yield a sentence for each kind of line that may have held a part of the surface."""
         surfaces = sorted({what for keyword, what in _SURFACES.items() if self.rows(keyword)})
         if surfaces:
             yield f"its {some_of(surfaces)} are left out, only polygons (f) are read."
         known = {*_READ, *_NO_SURFACE, *_SURFACES, *_NO_EFFECT}
-        unknown = sorted(rows[0] for keyword, rows in self.rows_by_keyword.items() if keyword not in known)
+        unknown = [row for keyword, rows in self.rows_by_keyword.items() if keyword not in known for row in rows]
         if unknown:
-            count = sum(len(rows) for keyword, rows in self.rows_by_keyword.items() if keyword not in known)
             yield (
-                f"{count} of its lines mean nothing in an .obj file and are left out, first "
-                f"{self.place(unknown[0])}: {shown(self.lines[unknown[0]])}."
+                f"{len(unknown)} of its lines mean nothing in an .obj file and are left out, first "
+                f"{self.place(min(unknown))}: {shown(self.lines[min(unknown)])}."
             )
+
+
+def shown(text: bytes) -> str:
+    """Return a line or word for a message."""
+    return repr(text[:60].decode("latin-1"))
 
 
 def _joined(content: bytes) -> tuple[list[bytes], Sequence[int]]:
@@ -111,12 +103,3 @@ def _joined(content: bytes) -> tuple[list[bytes], Sequence[int]]:
         goes_on = line.endswith(b"\\") and b"#" not in line  # a comment may end in the name of a folder
         parts[-1].append(line[:-1] if goes_on else line)
     return [b" ".join(part) for part in parts], numbers
-
-
-def _argument(line: bytes) -> str:
-    return " ".join(word.decode("utf-8", "replace") for word in line.split()[1:]) or _NO_MATERIAL
-
-
-def shown(text: bytes) -> str:
-    """Return a line or word for a message."""
-    return repr(text[:60].decode("latin-1"))

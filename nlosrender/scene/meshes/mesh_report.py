@@ -1,4 +1,4 @@
-"""One line per mesh: what has been read of its file, and what about it may not be as its author meant it."""
+"""One line per mesh: what has been read of its file, and what about it its author may not have meant."""
 
 from __future__ import annotations
 
@@ -8,65 +8,41 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from nlosrender.scene.file_mesh import FileMesh, some_of
-from nlosrender.scene.mesh_normals import normal_cosines, same_places
+from nlosrender.scene.bounding_box import bounds_of
+from nlosrender.scene.meshes.file_mesh import FileMesh, some_of
+from nlosrender.scene.meshes.mesh_normals import normal_cosines
+from nlosrender.scene.meshes.triangle_mesh import TriangleMesh, equal_columns
 from nlosrender.scene.pose import Float64
-from nlosrender.scene.triangle_mesh import TriangleMesh
 
 _NORMALS = {"flat": "flat", "file": "normals of the file", "smoothed": "smoothed normals"}
-MOST_LINES = 20  # of a scene: some have thousands of meshes
-CONTRADICTED = 0.01  # share of the area whose normals contradict its faces from which on it is told
+MAX_LINES = 20  # of a scene: some have thousands of meshes
+MIN_CONTRADICTING_SHARE = 0.01  # below, the few normals along seams that are averaged over sharp edges
 
 
 @dataclass(frozen=True)
 class MeshReport:
-    """What ``plan``, ``validate`` and ``info`` say of a mesh.
+    """What ``plan``, ``validate`` and ``info`` print of a mesh."""
 
-    Parameters
-    ----------
-    key, name, file
-        Where it is configured, what it is called, which file it is read from.
-    triangles, area, extent
-        Their number; their area [m^2]; their size along the relay wall's axes [m].
-    facing_share
-        Share of the area whose front some point of the relay wall may see; None without a wall.
-    normals
-        flat, file or smoothed.
-    largest_angle_deg
-        Between a vertex normal and its face's.
-    contradicting_share
-        Share of the area whose vertex normals point to the back of its faces.
-    edges, disagreeing_edges
-        Edges of two faces; those whose faces disagree which side is the front.
-    has_uvs
-        Texture coordinates.
-    materials, dropped
-        Names of the file's materials, which are not read; what else of the file is not.
-    """
-
-    key: str
+    key: str  # where it is configured
     name: str
     file: str
     triangles: int
-    area: float
-    extent: tuple[float, ...]
-    facing_share: float | None
-    normals: str
-    largest_angle_deg: float
-    contradicting_share: float
-    edges: int
-    disagreeing_edges: int
+    area: float  # m^2
+    extent: tuple[float, ...]  # along the relay wall's axes [m]
+    facing_share: float | None  # of the area whose front some point of the relay wall may see; None without a wall
+    normals: str  # flat, file or smoothed
+    largest_angle_deg: float  # between a vertex normal and its face's
+    contradicting_share: float  # of the area whose vertex normals point to the back of its faces
+    edges: int  # of two faces
+    disagreeing_edges: int  # of these, whose faces disagree which side is the front
     has_uvs: bool
-    materials: tuple[str, ...] = ()
-    dropped: tuple[str, ...] = ()
+    materials: tuple[str, ...] = ()  # names of the file's materials, which are not read
+    dropped: tuple[str, ...] = ()  # what else of the file is not read
 
     def line(self) -> str:
         """Return all of it as one line."""
-        parts = [
-            f"{self.triangles} triangles",
-            f"{self.area:.4g} m^2",
-            " x ".join(f"{e:.3g}" for e in self.extent) + " m",
-        ]
+        parts = [f"{self.triangles} triangles", f"{self.area:.4g} m^2"]
+        parts.append(" x ".join(f"{extent:.3g}" for extent in self.extent) + " m")
         if self.facing_share is not None:
             parts.append(f"{100 * self.facing_share:.3g} % of its area faces the wall")
         is_flat = self.normals == "flat"
@@ -82,7 +58,7 @@ class MeshReport:
         return f"{self.name} ({self.file}): {', '.join(parts)}"
 
     def warnings(self, read: FileMesh, *, has_two_sides: bool) -> Iterator[str]:
-        """Yield a sentence for each thing that is hardly meant; ``has_two_sides``: its back reflects, too."""
+        """Yield a sentence for each likely mistake of the file; ``has_two_sides``: its back reflects, too."""
         where = f"{self.key} ({self.name})"
         yield from (f"{where}: {doubt}" for doubt in read.doubts)
         if len(self.materials) > 1:
@@ -96,7 +72,7 @@ class MeshReport:
                 "the front: what shows its back is black. Make the winding consistent (mesh programs: recalculate "
                 "normals, outside), or wrap its bsdf in {type: twosided}."
             )
-        if self.contradicting_share > CONTRADICTED:
+        if self.contradicting_share > MIN_CONTRADICTING_SHARE:
             yield (
                 f"{where}: the file's normals contradict its faces on {100 * self.contradicting_share:.3g} % of its "
                 "area. Light goes by the normals. Use normals: flat to go by the order of the faces' corners, or write "
@@ -106,15 +82,15 @@ class MeshReport:
 
 def mesh_lines(meshes: Sequence[MeshReport]) -> Iterator[str]:
     """Yield the lines of the first meshes, and how many more there are."""
-    yield from (mesh.line() for mesh in meshes[:MOST_LINES])
-    if len(meshes) > MOST_LINES:
-        yield f"and {len(meshes) - MOST_LINES} more, which --json has"
+    yield from (mesh.line() for mesh in meshes[:MAX_LINES])
+    if len(meshes) > MAX_LINES:
+        yield f"and {len(meshes) - MAX_LINES} more, which --json has"
 
 
 def mesh_report(
-    key: str, name: str, file: str, read: FileMesh, placed: TriangleMesh, normals: str, wall_box: Float64 | None
+    key: str, name: str, file: str, read: FileMesh, placed: TriangleMesh, normals: str, wall_corners: Float64 | None
 ) -> MeshReport:
-    """Return what there is to say of a mesh.
+    """Return the report of a mesh.
 
     Parameters
     ----------
@@ -124,30 +100,29 @@ def mesh_report(
         As its file has it.
     placed
         In the relay wall's frame [m], with the normals that are rendered.
-    wall_box
-        (8, 3) corners of a box around the wall [m]; None: there is none.
+    wall_corners
+        (8, 3) of a box around the wall [m]; None: there is none.
     """
     cosines, areas = normal_cosines(placed), placed.areas()
     low, high = placed.bounds()
-    edges, disagreeing = edge_counts(same_places(read.mesh.vertices)[read.mesh.faces])
+    edges, disagreeing = edge_counts(equal_columns(read.mesh.vertices.T)[read.mesh.faces])
     total = float(areas.sum())
-    facing = None if wall_box is None else float(areas[_faces_wall(placed, wall_box)].sum()) / total
     return MeshReport(
-        key,
-        name,
-        file,
-        len(placed.faces),
-        total,
-        tuple((high - low).tolist()),
-        facing,
-        normals,
-        float(np.degrees(np.arccos(np.clip(cosines.min(), -1, 1)))),
-        float(areas[cosines.sum(axis=1) < 0].sum()) / total,
-        edges,
-        disagreeing,
-        placed.uvs is not None,
-        read.materials,
-        read.dropped,
+        key=key,
+        name=name,
+        file=file,
+        triangles=len(placed.faces),
+        area=total,
+        extent=tuple((high - low).tolist()),
+        facing_share=None if wall_corners is None else float(areas[_faces_wall(placed, wall_corners)].sum()) / total,
+        normals=normals,
+        largest_angle_deg=float(np.degrees(np.arccos(np.clip(cosines.min(), -1, 1)))),
+        contradicting_share=float(areas[cosines.sum(axis=1) < 0].sum()) / total,
+        edges=edges,
+        disagreeing_edges=disagreeing,
+        has_uvs=placed.uvs is not None,
+        materials=read.materials,
+        dropped=read.dropped,
     )
 
 
@@ -158,17 +133,15 @@ def edge_counts(faces: NDArray[np.int64]) -> tuple[int, int]:
     """
     start, end = faces.ravel(), np.roll(faces, -1, axis=1).ravel()
     keys = np.minimum(start, end) * (int(faces.max(initial=0)) + 1) + np.maximum(start, end)
-    order = np.argsort(keys, kind="stable")
-    keys, forwards = keys[order], (start < end)[order]
-    first = np.flatnonzero(np.append(True, keys[1:] != keys[:-1])) if len(keys) else np.zeros(0, np.int64)
-    pairs = first[np.diff(np.append(first, len(keys))) == 2]
-    return len(pairs), int((forwards[pairs] == forwards[pairs + 1]).sum())
+    _, edge, counts = np.unique(keys, return_inverse=True, return_counts=True)
+    is_pair, n_forwards = counts == 2, np.bincount(edge, start < end)
+    return int(is_pair.sum()), int((is_pair & (n_forwards != 1)).sum())
 
 
-def _faces_wall(mesh: TriangleMesh, wall_box: Float64) -> NDArray[np.bool_]:
+def _faces_wall(mesh: TriangleMesh, wall_corners: Float64) -> NDArray[np.bool_]:
     """Return which faces turn their front, by the normals that are rendered, to some point of the wall's box."""
     normals = mesh.face_normals() if mesh.normals is None else mesh.normals[mesh.faces].mean(axis=1)
-    low, high = wall_box.min(axis=0), wall_box.max(axis=0)
+    low, high = bounds_of(wall_corners)
     corners = mesh.vertices[mesh.faces]
     farthest = np.where(normals > 0, high, low) - corners.mean(axis=1)
     is_above = corners[..., 2].max(axis=1) > low[2]

@@ -4,17 +4,18 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
+from nlosrender.scene.meshes.polygons import MAX_CORNERS
+
 MAX_HEADER = 2**16  # bytes; the header of a scan with long comments takes a few thousand
-TYPES = {"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4"}
-TYPES |= {"int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4"}
-TYPES |= {"float": "f4", "float32": "f4", "double": "f8", "float64": "f8"}
+KINDS = {"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4"}
+KINDS |= {"int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4"}
+KINDS |= {"float": "f4", "float32": "f4", "double": "f8", "float64": "f8"}
 BYTE_ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
-MOST_CORNERS = 1000  # of a polygon; more is a damaged count
-LONGEST_LIST = 2**31 - 1  # of anything else: one strip may hold all triangles of a mesh
+MAX_LIST = 2**31 - 1  # of anything but a polygon: one strip may hold all triangles of a mesh
 
 
 @dataclass(frozen=True)
@@ -22,9 +23,8 @@ class PlyProperty:
     """A value, or a list of values, of each record of an element."""
 
     name: str
-    dtype: str
-    count_dtype: str | None  # of a list's length; None: one value
-    written_as: str = ""  # type of the value in the header, which an ASCII file is not read as
+    kind: str  # numpy type of a value, such as u1
+    count_kind: str | None = None  # of a list's length; None: one value
 
 
 @dataclass(frozen=True)
@@ -34,26 +34,32 @@ class PlyElement:
     name: str
     count: int
     properties: tuple[PlyProperty, ...]
+    byte_order: str  # one of BYTE_ORDERS
+
+    def stored(self, kind: str) -> str:
+        """Return the type of a value in the body; an ASCII body has been read as float64."""
+        return "=f8" if self.byte_order == "=" else self.byte_order + kind
 
     def dtype(self, lengths: Sequence[int], n_properties: int | None = None) -> np.dtype:
         """Return the layout of the first properties of a record, all of them by default, whose lists have lengths."""
         fields: list[tuple] = []
         of_lists = iter(lengths)
         for index, prop in enumerate(self.properties[:n_properties]):
-            if prop.count_dtype is None:
-                fields.append((f"{index}", prop.dtype))
+            if prop.count_kind is None:
+                fields.append((f"{index}", self.stored(prop.kind)))
             else:
-                fields += [(f"{index}n", prop.count_dtype), (f"{index}", prop.dtype, (next(of_lists),))]
+                fields.append((f"{index}n", self.stored(prop.count_kind)))
+                fields.append((f"{index}", self.stored(prop.kind), (next(of_lists),)))
         return np.dtype(fields)
 
     @property
-    def longest_list(self) -> int:
+    def max_list(self) -> int:
         """The most values that a list of this element can have."""
-        return MOST_CORNERS if self.name == "face" else LONGEST_LIST
+        return MAX_CORNERS if self.name == "face" else MAX_LIST
 
     def no_length(self, record: int, length: float) -> str:
-        """Return the message about a list that cannot be so long."""
-        return f"{self.name} {record} has a list of {length:g} values, need 0 to {self.longest_list}"
+        """Return the message about a list whose length cannot be."""
+        return f"{self.name} {record} has a list of {length:g} values, need 0 to {self.max_list}"
 
     def cut_short(self, found: int) -> ValueError:
         """Return the error of a file that has only some of the records."""
@@ -68,14 +74,9 @@ class PlyHeader:
     elements: tuple[PlyElement, ...]
     size: int  # bytes: where the body begins
 
-    def names(self, element: str) -> tuple[str, ...]:
-        """Return the names of the properties of an element; none if there is no such element."""
-        return tuple(prop.name for own in self.elements if own.name == element for prop in own.properties)
-
-    def written_as(self, element: str, name: str) -> str:
-        """Return the type of a value of an element as the header has it, such as u1."""
-        properties = [prop for own in self.elements if own.name == element for prop in own.properties]
-        return next(prop.written_as for prop in properties if prop.name == name)
+    def kinds(self, element: str) -> dict[str, str]:
+        """Return the types of the properties of an element by their names; none if there is no such element."""
+        return {prop.name: prop.kind for own in self.elements if own.name == element for prop in own.properties}
 
     def promised(self) -> str:
         """Return how many of which elements there are, for messages."""
@@ -100,31 +101,20 @@ def read_header(content: bytes) -> PlyHeader:
         raise ValueError(f"its header has no line end_header within {MAX_HEADER} bytes")
     order, elements = "", list[tuple[str, int, list[PlyProperty]]]()
     for number, line in enumerate(content[: end.start()].decode("latin-1").splitlines()[1:], start=2):
-        words = line.split()
-        match words:
+        match line.split():
             case [] | ["comment" | "obj_info", *_]:
                 continue
             case ["format", name, _] if name in BYTE_ORDERS:
                 order = BYTE_ORDERS[name]
             case ["element", name, count] if count.isdecimal() and len(count) < 20:
                 elements.append((name, int(count), []))
-            case ["property", "list", length, kind, name] if elements and {length, kind} <= set(TYPES):
-                elements[-1][2].append(PlyProperty(name, TYPES[kind], TYPES[length]))
-            case ["property", kind, name] if elements and kind in TYPES:
-                elements[-1][2].append(PlyProperty(name, TYPES[kind], None, TYPES[kind]))
+            case ["property", "list", length, kind, name] if elements and {length, kind} <= set(KINDS):
+                elements[-1][2].append(PlyProperty(name, KINDS[kind], KINDS[length]))
+            case ["property", kind, name] if elements and kind in KINDS:
+                elements[-1][2].append(PlyProperty(name, KINDS[kind]))
             case _:
                 raise ValueError(f"line {number} of its header means nothing: {line[:60]!r}")
     if not order:
         raise ValueError(f"its header has no line format, one of {', '.join(BYTE_ORDERS)}")
-    ordered = [
-        PlyElement(name, count, tuple(_ordered(prop, order) for prop in props)) for name, count, props in elements
-    ]
+    ordered = (PlyElement(name, count, tuple(properties), order) for name, count, properties in elements)
     return PlyHeader(order == "=", tuple(ordered), end.end())
-
-
-def _ordered(prop: PlyProperty, byte_order: str) -> PlyProperty:
-    """Return the property as it stands in the body; in an ASCII file, everything has been read as float64."""
-    if byte_order == "=":
-        return replace(prop, dtype="=f8", count_dtype=None if prop.count_dtype is None else "=f8")
-    count = None if prop.count_dtype is None else byte_order + prop.count_dtype
-    return replace(prop, dtype=byte_order + prop.dtype, count_dtype=count)

@@ -1,35 +1,23 @@
-"""Triangle meshes in float64: what primitives and letters are generated as."""
+"""Triangle meshes in float64."""
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from nlosrender.scene.bounding_box import Bounds, bounds_of
 from nlosrender.scene.pose import Float64
 
-UInt32 = NDArray[np.uint32]
+Int64 = NDArray[np.int64]
+_WIDTHS = {"uvs": 2, "normals": 3, "colors": 3}  # of what vertices may have beside a position
 
 
 @dataclass(frozen=True, eq=False)
 class TriangleMesh:
     """A triangle mesh; counter-clockwise faces are seen from the side their normal points to.
-
-    Parameters
-    ----------
-    vertices
-        (n, 3) float64 [m].
-    faces
-        (m, 3) vertex indices, kept as uint32.
-    uvs
-        (n, 2) texture coordinates, or None.
-    normals
-        (n, 3) shading normals, or None for flat faces.
-    colors
-        (n, 3) reflectances of the vertices, linear r, g, b from 0 to 1; or None.
 
     Raises
     ------
@@ -37,11 +25,11 @@ class TriangleMesh:
         A shape is wrong, a number is not finite, or an index is out of range; names the first bad vertex or face.
     """
 
-    vertices: Float64
-    faces: NDArray[np.integer]
-    uvs: Float64 | None = None
-    normals: Float64 | None = None
-    colors: Float64 | None = None
+    vertices: Float64  # (n, 3) m
+    faces: NDArray[np.integer]  # (m, 3) vertex indices, kept as uint32
+    uvs: Float64 | None = None  # (n, 2) texture coordinates
+    normals: Float64 | None = None  # (n, 3) shading normals; None: flat faces
+    colors: Float64 | None = None  # (n, 3) reflectances, linear r, g, b from 0 to 1
 
     def __post_init__(self) -> None:
         vertices = _per_vertex("vertices", self.vertices, 3, None)
@@ -56,7 +44,7 @@ class TriangleMesh:
             raise ValueError(f"face {bad[0]} is {face}: indices must lie between 0 and {len(vertices) - 1}")
         object.__setattr__(self, "vertices", _frozen(vertices))
         object.__setattr__(self, "faces", _frozen(faces.astype(np.uint32)))
-        for name, width in (("uvs", 2), ("normals", 3), ("colors", 3)):
+        for name, width in _WIDTHS.items():
             rows = getattr(self, name)
             if rows is not None:
                 object.__setattr__(self, name, _frozen(_per_vertex(name, rows, width, len(vertices))))
@@ -72,22 +60,13 @@ class TriangleMesh:
 
     def face_normals(self) -> Float64:
         """Return the unit normal of each face, (m, 3); zero for a face without area."""
-        cross = self._cross_products()
-        length = np.linalg.norm(cross, axis=1, keepdims=True)
-        return np.divide(cross, length, out=np.zeros_like(cross), where=length > 0)
+        return unit_rows(self._cross_products())
 
-    def bounds(self) -> tuple[Float64, Float64]:
-        """Return the smallest and largest coordinates of the faces' vertices, (3,) and (3,) [m].
-
-        Raises
-        ------
-        ValueError
-            The mesh has no faces.
-        """
+    def bounds(self) -> Bounds:
+        """Return the smallest and largest coordinates of the faces' vertices [m]; ValueError without faces."""
         if not len(self.faces):
             raise ValueError("a mesh without faces has no bounds")
-        corners = self.vertices[self.faces].reshape(-1, 3)
-        return corners.min(axis=0), corners.max(axis=0)
+        return bounds_of(self.vertices[self.faces].reshape(-1, 3))
 
     def transformed(self, matrix: ArrayLike) -> TriangleMesh:
         """Return the mesh under an affine map.
@@ -110,44 +89,29 @@ class TriangleMesh:
             raise ValueError("transform: need a finite affine 4 x 4 matrix with last row [0, 0, 0, 1]")
         linear = matrix[:3, :3]
         determinant = float(np.linalg.det(linear))
-        if abs(determinant) <= 1e-15 * float(np.linalg.norm(linear)) ** 3:
+        if abs(determinant) <= 1e-15 * float(np.linalg.norm(linear)) ** 3:  # rounding of a determinant of 0
             raise ValueError("transform: the matrix is singular, it would flatten the mesh")
-        normals = self.normals
-        if normals is not None:
-            normals = normals @ np.linalg.inv(linear)
-            length = np.linalg.norm(normals, axis=1, keepdims=True)
-            normals = np.divide(normals, length, out=np.zeros_like(normals), where=length > 0)
+        normals = None if self.normals is None else unit_rows(self.normals @ np.linalg.inv(linear))
         faces = self.faces if determinant > 0 else self.faces[:, ::-1]
         return TriangleMesh(self.vertices @ linear.T + matrix[:3, 3], faces, self.uvs, normals, self.colors)
 
     def turned_round(self) -> TriangleMesh:
         """Return the mesh seen from the other side: faces run the other way, normals point the other way."""
-        normals = None if self.normals is None else -self.normals
-        return TriangleMesh(self.vertices, self.faces[:, ::-1], self.uvs, normals, self.colors)
+        return replace(self, faces=self.faces[:, ::-1], normals=None if self.normals is None else -self.normals)
+
+    def reindexed(self, rows: NDArray[np.integer], faces: NDArray[np.integer]) -> TriangleMesh:
+        """Return a mesh of the vertices ``rows`` (k,) of this one, which may repeat, and ``faces`` that index them."""
+        columns = (getattr(self, name) for name in _WIDTHS)
+        parts = (None if values is None else values[rows] for values in columns)
+        return TriangleMesh(self.vertices[rows], faces, *parts)
 
     def subset(self, mask: ArrayLike) -> TriangleMesh:
-        """Return the faces where ``mask`` (m,) is true, without the vertices they do not use.
-
-        Raises
-        ------
-        ValueError
-            The mask is not boolean with one entry per face.
-        """
+        """Return the faces where ``mask`` (m,) is true, without the vertices they do not use."""
         mask = np.asarray(mask)
         if mask.dtype != np.bool_ or mask.shape != (len(self.faces),):
             raise ValueError(f"mask has shape {mask.shape} and type {mask.dtype}: need ({len(self.faces)},) booleans")
         used, indices = np.unique(self.faces[mask], return_inverse=True)
-        return TriangleMesh(
-            self.vertices[used],
-            indices.reshape(-1, 3).astype(np.uint32),
-            None if self.uvs is None else self.uvs[used],
-            None if self.normals is None else self.normals[used],
-            None if self.colors is None else self.colors[used],
-        )
-
-    def with_vertices(self, vertices: Float64) -> TriangleMesh:
-        """Return the same faces with other vertices (n, 3)."""
-        return replace(self, vertices=vertices)
+        return self.reindexed(used, indices.reshape(-1, 3))
 
     def with_area_only(self) -> TriangleMesh:
         """Return the mesh without faces of no area and without vertices that no face uses; itself if it has neither."""
@@ -158,38 +122,45 @@ class TriangleMesh:
 
     @staticmethod
     def merged(meshes: Sequence[TriangleMesh]) -> TriangleMesh:
-        """Return one mesh with the faces of all, in order; uvs, normals, colors are kept when every part has them.
-
-        Raises
-        ------
-        ValueError
-            There is no mesh to merge.
-        """
+        """Return one mesh with the faces of all, in order; uvs, normals, colors are kept when every part has them."""
         if not meshes:
             raise ValueError("no meshes to merge: need at least one")
         offsets = np.cumsum([0] + [len(mesh.vertices) for mesh in meshes[:-1]])
         faces = [mesh.faces.astype(np.int64) + offset for mesh, offset in zip(meshes, offsets, strict=True)]
-
-        def joined(name: str) -> Float64 | None:
-            rows = [values for mesh in meshes if (values := getattr(mesh, name)) is not None]
-            return np.concatenate(rows) if len(rows) == len(meshes) else None
-
-        vertices = np.concatenate([mesh.vertices for mesh in meshes])
-        return TriangleMesh(vertices, np.concatenate(faces), *(joined(name) for name in ("uvs", "normals", "colors")))
+        columns = ([getattr(mesh, name) for mesh in meshes] for name in _WIDTHS)
+        return TriangleMesh(
+            np.concatenate([mesh.vertices for mesh in meshes]),
+            np.concatenate(faces),
+            *(None if any(part is None for part in parts) else np.concatenate(parts) for parts in columns),
+        )
 
     def _cross_products(self) -> Float64:
         a, b, c = (self.vertices[self.faces[:, corner]] for corner in range(3))
         return np.cross(b - a, c - a)
 
 
-def numbers_in(text: bytes, dtype: type) -> NDArray:
-    """Return the numbers in a text, separated by white space, up to the first word that is none."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DeprecationWarning)  # how numpy reports such a word
-        try:
-            return np.fromstring(text.decode("latin-1"), dtype=dtype, sep=" ")
-        except ValueError:  # the first word already
-            return np.zeros(0, dtype=dtype)
+def unit_rows(vectors: Float64, min_length: float = 0.0) -> Float64:
+    """Return vectors (n, 3) at length 1, those of at most ``min_length`` as zero."""
+    with np.errstate(over="ignore"):  # an absurd vector has infinite length and becomes zero
+        length = np.linalg.norm(vectors, axis=1, keepdims=True)
+    return np.divide(vectors, length, out=np.zeros_like(vectors), where=length > min_length)
+
+
+def equal_columns(keys: NDArray) -> Int64:
+    """Return for each column of ``keys`` (k, n) its number among the different columns, in order of the last key."""
+    order = np.lexsort(keys)
+    is_new = (np.diff(keys[:, order], axis=1) != 0).any(axis=0)
+    numbers = np.empty(len(order), np.int64)
+    numbers[order] = np.append(0, np.cumsum(is_new))[: len(order)]
+    return numbers
+
+
+def distinct_columns(keys: NDArray) -> tuple[Int64, Int64]:
+    """Return the index of one column of ``keys`` (k, n) of each kind, and which of these each column equals, (n,)."""
+    numbers = equal_columns(keys)
+    first = np.empty(int(numbers.max(initial=-1)) + 1, np.int64)
+    first[numbers] = np.arange(len(numbers))
+    return first, numbers
 
 
 def _per_vertex(name: str, rows: ArrayLike, width: int, count: int | None) -> Float64:

@@ -1,0 +1,1 @@
+"""Triangle meshes: generated ones, and those of .ply and .obj files."""
