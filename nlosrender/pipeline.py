@@ -1,6 +1,6 @@
 """THE MAP: a capture from its configuration to its file, as one list of stages. Read this first.
 
-configuration (``config/``) -> scene, capture and plan, engine (``rendering/set_up.py``, which lists these stages)
+configuration (``config/``) -> scene, capture and plan, engine (``rendering/stages.py``, which lists these stages)
 -> work items, one after the other, rendered and written (``rendering/local_executor.py``, or
 ``dask_executor.py`` on a cluster) -> one file (``files/partial/partial_capture.py``).
 Mitsuba and Dr.Jit are imported only when a render starts, after the backend has been chosen.
@@ -31,34 +31,10 @@ from nlosrender.rendering.outcome import Outcome, missing_light
 from nlosrender.rendering.process_layout import ONE_PROCESS
 from nlosrender.rendering.render_report import Progress, RenderReport, Stopwatch, Warn, Warnings, Watch
 from nlosrender.rendering.render_warnings import render_warnings
-from nlosrender.rendering.set_up import (
-    calibrated_budget,
-    describe_capture,
-    describe_file,
-    load_scene,
-    load_view,
-    place_scene,
-    prepare,
-    set_up_engine,
-    started_backend,
-)
+from nlosrender.rendering.stages import calibrated_budget, set_up_engine, started_backend
 
 if TYPE_CHECKING:
     from nlosrender.rendering.dask_cluster import Cluster
-
-__all__ = [
-    "calibrated_budget",
-    "describe_capture",
-    "describe_file",
-    "load_scene",
-    "load_view",
-    "missing_light",
-    "place_scene",
-    "prepare",
-    "render_capture",
-    "set_up_engine",
-    "started_backend",
-]
 
 
 def render_capture(

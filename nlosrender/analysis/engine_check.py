@@ -26,7 +26,7 @@ from nlosrender.capture.relative_error import relative_l2_error
 from nlosrender.config.document import Config
 from nlosrender.errors import NlosError, OptionError
 from nlosrender.rendering.outcome import missing_light
-from nlosrender.rendering.set_up import bounce_axis, describe_capture, load_scene, prepare, started_backend
+from nlosrender.rendering.stages import bounce_axis, describe_capture, load_scene, prepare, started_backend
 
 if TYPE_CHECKING:
     from nlosrender.engine.engines import Engine

@@ -16,7 +16,7 @@ from nlosrender.readable import readable_duration
 from nlosrender.rendering.outcome import missing_light
 from nlosrender.rendering.render_report import Warnings
 from nlosrender.rendering.render_warnings import expected_file_size, render_warnings
-from nlosrender.rendering.set_up import set_up_engine, started_backend
+from nlosrender.rendering.stages import set_up_engine, started_backend
 from nlosrender.scene.meshes.mesh_report import MeshReport
 
 if TYPE_CHECKING:

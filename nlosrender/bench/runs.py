@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from nlosrender import pipeline
 from nlosrender.bench.scenes import BenchScene
 from nlosrender.capture.grids import Capture
 from nlosrender.capture.time_axis import TimeAxis
 from nlosrender.engine.backend.start import Backend, start_backend
 from nlosrender.errors import RenderError
+from nlosrender.rendering import stages
 
 if TYPE_CHECKING:
     from nlosrender.capture.plan import Plan
@@ -85,8 +85,8 @@ def load(scene: BenchScene) -> LoadedScene:
     """
     config = scene.config()
     backend = start_backend(config.render.backend)
-    built = pipeline.load_scene(config)
-    capture, time_axis = pipeline.describe_capture(config, built.wall, built)
+    built = stages.load_scene(config)
+    capture, time_axis = stages.describe_capture(config, built.wall, built)
     return LoadedScene(scene, backend, built, capture, time_axis)
 
 
@@ -101,7 +101,7 @@ def virtual_lights_of(loaded: LoadedScene) -> tuple[Plan, VirtualLightEngine]:
     from nlosrender.engine.virtual_lights.engine import VirtualLightEngine
 
     config = loaded.scene.config(engine="virtual_lights", split_bounces=False)
-    plan, engine = pipeline.prepare(config, loaded.backend, loaded.built, loaded.capture, loaded.time_axis)
+    plan, engine = stages.prepare(config, loaded.backend, loaded.built, loaded.capture, loaded.time_axis)
     if not isinstance(engine, VirtualLightEngine):
         raise RenderError(f"{loaded.scene.name}: the virtual-light engine does not take this scene")
     return plan, engine
@@ -130,7 +130,7 @@ def render(loaded: LoadedScene, budget: Budget, seed: int = 0, options: Mapping[
     noise = squares = 0.0
     samples: list[int] = []
     timer = Timer()
-    plan, engine = pipeline.prepare(config, loaded.backend, loaded.built, loaded.capture, loaded.time_axis)
+    plan, engine = stages.prepare(config, loaded.backend, loaded.built, loaded.capture, loaded.time_axis)
     if isinstance(engine, VirtualLightEngine):
         engine.set_up()
     _, setup_seconds = timer.read()
@@ -152,5 +152,5 @@ def render(loaded: LoadedScene, budget: Budget, seed: int = 0, options: Mapping[
 def chosen_engine(loaded: LoadedScene) -> str:
     """Return the name of the engine that ``engine: auto`` takes for a scene."""
     config = loaded.scene.config(split_bounces=False)
-    _, engine = pipeline.prepare(config, loaded.backend, loaded.built, loaded.capture, loaded.time_axis)
+    _, engine = stages.prepare(config, loaded.backend, loaded.built, loaded.capture, loaded.time_axis)
     return engine.name

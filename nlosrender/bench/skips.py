@@ -139,12 +139,12 @@ def _of_reciprocity(loaded: LoadedScene) -> Iterator[Saving]:
 
 def of_paths(loaded: LoadedScene) -> Iterator[Saving]:
     """Yield what the path engine leaves out: rays nothing can stop, the technique that is not needed."""
-    from nlosrender import pipeline
     from nlosrender.engine.path.engine import PathEngine
     from nlosrender.engine.path.full_loop import load_path_integrator
+    from nlosrender.rendering import stages
 
     config = loaded.scene.config(engine="path", split_bounces=False, spp=PATHS)
-    plan, engine = pipeline.prepare(config, loaded.backend, loaded.built, loaded.capture, loaded.time_axis)
+    plan, engine = stages.prepare(config, loaded.backend, loaded.built, loaded.capture, loaded.time_axis)
     if not isinstance(engine, PathEngine):
         return
 
@@ -174,14 +174,14 @@ def of_paths(loaded: LoadedScene) -> Iterator[Saving]:
 
 def _of_late_light(loaded: LoadedScene) -> Iterator[Saving]:
     """Yield what is left out that comes after the window: of as many paths, and of walks to the same error."""
-    from nlosrender import pipeline
     from nlosrender.engine.path.engine import Budget, PathEngine
     from nlosrender.engine.virtual_lights.engine import VirtualLightEngine
+    from nlosrender.rendering import stages
 
     built, capture, time_axis = loaded.built, loaded.capture, loaded.time_axis
     for name in ("path", "virtual_lights"):
         config = loaded.scene.config(engine=name, split_bounces=False)
-        plan, engine = pipeline.prepare(config, loaded.backend, built, capture, time_axis)
+        plan, engine = stages.prepare(config, loaded.backend, built, capture, time_axis)
         options = replace(engine.options, has_time_gate=False)
         if isinstance(engine, VirtualLightEngine):
             patient: Engine = VirtualLightEngine(built, capture, time_axis, options, engine.lanes)

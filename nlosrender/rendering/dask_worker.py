@@ -24,7 +24,7 @@ from nlosrender.files.sums import Sums
 from nlosrender.rendering.local_executor import render_timed
 from nlosrender.rendering.process_layout import ProcessLayout
 from nlosrender.rendering.render_report import Stopwatch
-from nlosrender.rendering.set_up import set_up_engine
+from nlosrender.rendering.stages import set_up_engine
 
 if TYPE_CHECKING:
     from nlosrender.rendering.work_items import Engine

@@ -13,8 +13,8 @@ import pytest
 from support.quadrature import Setup, rectangle_cells, third_bounce
 from support.rendering import configured, flat_wall, render
 
-from nlosrender import pipeline
 from nlosrender.engine.backend.start import start_backend
+from nlosrender.rendering import stages
 from nlosrender.scene.meshes.triangle_mesh import TriangleMesh
 
 SENSORS = (3, 2)
@@ -154,7 +154,7 @@ def test_a_disk_in_the_plane_of_a_plate_is_said(gap: float) -> None:
     start_backend("llvm", colored=False, polarized=False)
     shape = {"type": "disk", "to_world": [[0.2, 0, 0, 0], [0, 0.2, 0, 0], [0, 0, -1, 1 - gap], [0, 0, 0, 1]]}
     items = [plate(0.6, 0.6, (0, 0, 1), 0.8), {"type": "mitsuba", "shape": shape}]
-    warnings = pipeline.load_scene(configured(flat_wall(*items))).warnings
+    warnings = stages.load_scene(configured(flat_wall(*items))).warnings
     assert any("a disk in one place" in text for text in warnings) == (gap == 0)
 
 
@@ -174,7 +174,7 @@ def test_a_disk_in_the_plane_of_a_plate_is_said(gap: float) -> None:
 def test_concentric_surfaces_are_said(items: tuple[dict[str, Any], ...], is_said: bool) -> None:
     """Not those farther apart, beside each other along an axis, or seen from opposite sides."""
     start_backend("llvm", colored=False, polarized=False)
-    warnings = pipeline.load_scene(configured(flat_wall(*items))).warnings
+    warnings = stages.load_scene(configured(flat_wall(*items))).warnings
     assert any("closer than rays tell apart" in text for text in warnings) == is_said
 
 

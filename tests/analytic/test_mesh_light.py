@@ -57,7 +57,7 @@ def test_warnings_go_by_the_normals_that_light_goes_by(tmp_path: Path, normal: i
 
     from nlosrender.capture.part import WHOLE
     from nlosrender.engine.preflight.scene_warnings import scene_warnings
-    from nlosrender.pipeline import set_up_engine
+    from nlosrender.rendering.stages import set_up_engine
 
     corners = ["v -0.1 -0.1 0.8", "v -0.1 0.3 0.8", "v 0.5 0.3 0.8"]
     face = "f " + " ".join(f"{v}//1" for v in faces.split())

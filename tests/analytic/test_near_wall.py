@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from support.rendering import Rendering, configured, flat_wall, render
 
-from nlosrender import pipeline
 from nlosrender.engine.backend.start import start_backend
+from nlosrender.rendering import stages
 
 POINT = (0.05, 0.05, 0.0)  # one of the four sensor points
 WALKS = {"engine": "path", "max_bounces": 5, "spp": 65536}
@@ -40,9 +40,9 @@ def warnings_of(config: dict[str, Any]) -> tuple[str, ...]:
     from nlosrender.engine.preflight.scene_warnings import scene_warnings
 
     validated = configured(config)
-    built = pipeline.load_scene(validated)
-    capture, time_axis = pipeline.describe_capture(validated, built.wall, built)
-    _, engine = pipeline.prepare(validated, backend, built, capture, time_axis)
+    built = stages.load_scene(validated)
+    capture, time_axis = stages.describe_capture(validated, built.wall, built)
+    _, engine = stages.prepare(validated, backend, built, capture, time_axis)
     return scene_warnings(engine)
 
 

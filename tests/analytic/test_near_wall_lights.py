@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from support.agreement import relative_l2
 from support.rendering import Rendering, configured, flat_wall, render
 
-from nlosrender import pipeline
 from nlosrender.engine.backend.start import start_backend
+from nlosrender.rendering import stages
 
 TARGET = 0.01
 CENTER = (0.05, 0.05)
@@ -52,9 +52,9 @@ def set_up(config: dict[str, Any]) -> Any:
     """Return the engine that a configuration leads to."""
     validated = configured(config)
     backend = start_backend("llvm")
-    built = pipeline.load_scene(validated)
-    capture, time_axis = pipeline.describe_capture(validated, built.wall, built)
-    return pipeline.prepare(validated, backend, built, capture, time_axis)[1]
+    built = stages.load_scene(validated)
+    capture, time_axis = stages.describe_capture(validated, built.wall, built)
+    return stages.prepare(validated, backend, built, capture, time_axis)[1]
 
 
 def before_plate(laser: NDArray, sensor: NDArray, height: float) -> float:

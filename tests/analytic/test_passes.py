@@ -12,12 +12,12 @@ import pytest
 from support.rendering import configured, flat_wall
 from support.views import view_config
 
-from nlosrender import pipeline
 from nlosrender.capture.plan import Batch, WorkItem
 from nlosrender.capture.tile import Tile
 from nlosrender.engine.backend.start import start_backend
 from nlosrender.engine.launch.passes import Passes, SavedStages, Snapshot
 from nlosrender.files.partial.work_item_state import read_state, write_state
+from nlosrender.rendering import stages
 from nlosrender.rendering.work_items import render_item
 
 PLATE = {"type": "rectangle", "width": 0.8, "height": 0.6, "center": [0.1, 0, 1.0], "normal": [0, 0, -1]}
@@ -68,8 +68,8 @@ def prepared(scene: dict[str, Any]) -> Callable[[Passes], Any]:
     from nlosrender.engine.path.engine import Budget
 
     def render(passes: Passes) -> Any:
-        plan, engine, _ = pipeline.set_up_engine(config, backend)
-        budget = pipeline.calibrated_budget(config, engine)
+        plan, engine, _ = stages.set_up_engine(config, backend)
+        budget = stages.calibrated_budget(config, engine)
         assert isinstance(budget, Budget)
         (item,) = plan.work_items
         if scene is SCENES["two batches"]:

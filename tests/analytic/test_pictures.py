@@ -16,8 +16,8 @@ from support.quadrature import Array, Frame, Setup, grid_points, rectangle_cells
 from support.rendering import configured, flat_wall, render
 from support.views import view_config
 
-from nlosrender import pipeline
 from nlosrender.engine.backend.start import start_backend
+from nlosrender.rendering import stages
 
 TEXELS = np.array([[0.1, 0.9, 0.3], [0.6, 0.2, 0.8]], dtype=np.float32)  # not symmetric in any way
 ROWS, COLUMNS = TEXELS.shape
@@ -134,7 +134,7 @@ def test_a_picture_lies_the_right_way_up_on_a_hidden_item(name: str, picture: di
     """The texel of row i and column j lies (j + 1/2)/columns from the left, (i + 1/2)/rows from the top."""
     item, place = ITEMS[name]
     config = configured(flat_wall({**item, "center": CENTER.tolist(), "bsdf": picture}, wall=WALL_POSE))
-    built = pipeline.load_scene(config)
+    built = stages.load_scene(config)
     np.testing.assert_allclose(seen(built, built.hidden_shapes[0], place, built.wall.pose.to_local), TEXELS, rtol=1e-6)
 
 
@@ -145,7 +145,7 @@ def test_a_picture_lies_the_right_way_up_on_the_sides_of_a_room(out: Array, up: 
     """As seen from within; ceiling and floor have their first row at the far side."""
     size = np.array([3.0, 2.0, 4.0])
     config = configured(flat_wall({"type": "room", "size": size.tolist(), "bsdf": picture}, wall=WALL_POSE))
-    built = pipeline.load_scene(config)
+    built = stages.load_scene(config)
     place = side(out, up, size, center=np.array([0.0, 0.0, 2.0]), within=True)  # in the wall's frame
     np.testing.assert_allclose(seen(built, built.hidden_shapes[0], place, np.asarray), TEXELS, rtol=1e-6)
 
@@ -155,7 +155,7 @@ def test_a_picture_spans_letters_the_right_way_up(picture: dict[str, Any]) -> No
     import mitsuba as mi
 
     item = {"type": "letters", "text": "HZ", "height": 0.5, "center": CENTER.tolist(), "bsdf": picture, **TURNED}
-    built = pipeline.load_scene(configured(flat_wall(item, wall=WALL_POSE)))
+    built = stages.load_scene(configured(flat_wall(item, wall=WALL_POSE)))
     frame = Frame.of(TURNED["normal"], TURNED["up"])
     mesh = built.surfaces[0].shape
     own = (built.wall.pose.to_scene(mesh.vertices) - CENTER) @ np.column_stack([frame.x, frame.y])
@@ -180,7 +180,7 @@ def test_an_obj_quad_shows_what_a_rectangle_shows(picture: dict[str, Any], tmp_p
     lines += ["vt 0 0", "vt 1 0", "vt 1 1", "vt 0 1", "f 1/1 2/2 3/3 4/4"]
     (tmp_path / "quad.obj").write_text("\n".join(lines), encoding="utf-8")
     item = {"type": "mesh", "filename": "quad.obj", "bsdf": picture}
-    built = pipeline.load_scene(configured(flat_wall(item), folder=tmp_path))
+    built = stages.load_scene(configured(flat_wall(item), folder=tmp_path))
     place = flat(CENTER, TURNED["normal"], TURNED["up"], 0.9, 0.5)
     np.testing.assert_allclose(seen(built, built.hidden_shapes[0], place, np.asarray), TEXELS, rtol=1e-6)
 
@@ -190,7 +190,7 @@ def test_mitsubas_own_rectangle_keeps_its_convention(kind: str, picture: dict[st
     """v grows upwards there, so the first row of a picture lies at the lower edge."""
     if kind == "item":
         shape = {"type": "rectangle", "to_world": [{"translate": [0, 0, 1]}]}
-        built = pipeline.load_scene(configured(flat_wall({"type": "mitsuba", "shape": shape, "bsdf": picture})))
+        built = stages.load_scene(configured(flat_wall({"type": "mitsuba", "shape": shape, "bsdf": picture})))
     else:
         (tmp_path / "scene.xml").write_text(
             "<scene version='3.0.0'><shape type='rectangle'><transform name='to_world'><translate z='1'/></transform>"
@@ -199,7 +199,7 @@ def test_mitsubas_own_rectangle_keeps_its_convention(kind: str, picture: dict[st
             "</shape></scene>"
         )
         view = view_config(emitters=[LAMP], color="grey", scene={"mitsuba": "scene.xml"})
-        built = pipeline.load_view(configured(view, folder=tmp_path))
+        built = stages.load_view(configured(view, folder=tmp_path))
     place = flat([0, 0, 1], Z, Y, 2.0, 2.0)
     np.testing.assert_allclose(seen(built, built.hidden_shapes[0], place, np.asarray), TEXELS[::-1], rtol=1e-6)
 
@@ -220,7 +220,7 @@ def test_a_picture_on_a_mesh_wall_lies_as_the_file_says(name: str, picture: dict
     (tmp_path / name).write_text("\n".join(lines) + "\n", encoding="utf-8")
     config = flat_wall()
     config["scene"]["relay_wall"] = {"type": "mesh", "filename": name, "bsdf": picture}
-    built = pipeline.load_scene(configured(config, folder=tmp_path))
+    built = stages.load_scene(configured(config, folder=tmp_path))
     expected = TEXELS if name.endswith("obj") else TEXELS[::-1]
     np.testing.assert_allclose(seen(built, built.wall_shape, places, built.wall.pose.to_local), expected, rtol=1e-6)
     np.testing.assert_allclose(built.wall.positions([0.3, 0.4]), [0.3, 0.4, 0], atol=1e-6)
@@ -238,7 +238,7 @@ def test_a_picture_in_a_scene_file_on_a_mesh_without_texture_coordinates_is_told
     told = []
     for corners in ("1 2 3", "1/1 2/1 3/1"):
         (tmp_path / "a.obj").write_text(f"v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nf {corners}\n", encoding="utf-8")
-        told.append(pipeline.load_view(configured(config, folder=tmp_path)).warnings)
+        told.append(stages.load_view(configured(config, folder=tmp_path)).warnings)
     assert told[1] == ()
     (warning,) = told[0]
     assert "line 2: <shape type='obj'> has a picture, but its file no texture coordinates at every corner" in warning
@@ -259,7 +259,7 @@ def test_a_picture_lies_the_right_way_up_on_the_relay_wall(name: str, picture: d
     wall, height = WALLS[name]
     config = flat_wall()
     config["scene"]["relay_wall"] = {**wall, "center": CENTER.tolist(), "bsdf": picture}
-    built = pipeline.load_scene(configured(config))
+    built = stages.load_scene(configured(config))
     if wall["type"] == "rectangle":
         place = flat(CENTER, TURNED["normal"], TURNED["up"], 2.0, 1.6)
     else:
@@ -285,7 +285,7 @@ def test_the_pictures_own_transform_comes_last(name: str, picture: dict[str, Any
     if name != "relay wall":
         item, place = ITEMS[name]
         config = flat_wall({**item, "center": CENTER.tolist(), "bsdf": picture})
-    built = pipeline.load_scene(configured(config))
+    built = stages.load_scene(configured(config))
     shape = built.wall_shape if name == "relay wall" else built.hidden_shapes[0]
     expected = np.roll(TEXELS, (-1, -1), axis=(0, 1))
     np.testing.assert_allclose(seen(built, shape, place, built.wall.pose.to_local), expected, rtol=1e-6)

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from support.rendering import configured, flat_wall
 
-from nlosrender import pipeline
 from nlosrender.engine.backend.start import start_backend
+from nlosrender.rendering import stages
 
 GREY = {"type": "diffuse", "reflectance": 0.6}
 PLATE = {"type": "rectangle", "width": 0.8, "height": 0.6, "center": [0.1, 0, 1.0], "normal": [0, 0, -1], "bsdf": GREY}
@@ -26,9 +26,9 @@ def engine_of(
     config["capture"] |= {"sensor_grid": GRID, "laser_grid": GRID | (lasers or {}), **capture}
     validated = configured(config, folder=folder)
     backend = start_backend("llvm")
-    built = pipeline.load_scene(validated)
-    described, time_axis = pipeline.describe_capture(validated, built.wall, built)
-    plan, engine = pipeline.prepare(validated, backend, built, described, time_axis)
+    built = stages.load_scene(validated)
+    described, time_axis = stages.describe_capture(validated, built.wall, built)
+    plan, engine = stages.prepare(validated, backend, built, described, time_axis)
     return engine, plan.batches[0]
 
 

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from support.rendering import configured, flat_wall
 
-from nlosrender import pipeline
 from nlosrender.capture.plan import Batch, Tile
 from nlosrender.engine.backend.start import start_backend
+from nlosrender.rendering import stages
 
 ROOM = {"type": "room", "size": [2.0, 1.6, 1.2], "bsdf": {"type": "diffuse", "reflectance": 0.5}}
 PLATE = {"type": "rectangle", "width": 0.8, "height": 0.6, "center": [0, 0, 1.0], "normal": [0, 0, -1]}
@@ -20,9 +20,9 @@ def engine_of(*hidden: dict, scan: str = "single", sensors: tuple[int, int] = SE
     """Return the virtual-light engine of a scene."""
     config = configured(flat_wall(*hidden, scan=scan, sensors=sensors, engine="virtual_lights", spp=None, **more))
     backend = start_backend("llvm")
-    built = pipeline.load_scene(config)
-    capture, time_axis = pipeline.describe_capture(config, built.wall, built)
-    return pipeline.prepare(config, backend, built, capture, time_axis)[1]
+    built = stages.load_scene(config)
+    capture, time_axis = stages.describe_capture(config, built.wall, built)
+    return stages.prepare(config, backend, built, capture, time_axis)[1]
 
 
 @pytest.fixture

@@ -13,13 +13,13 @@ import pytest
 from support.rendering import configured, flat_wall
 from support.views import View, see, view_config
 
-from nlosrender import pipeline
 from nlosrender.config.bsdf_table import MEDIA, METALS
 from nlosrender.config.document import Config
 from nlosrender.config.mitsuba_xml import read_mitsuba_xml
 from nlosrender.config.xml_shapes import placement
 from nlosrender.engine.backend.start import start_backend
 from nlosrender.errors import ConfigError
+from nlosrender.rendering import stages
 from nlosrender.scene.transforms import transform_matrix
 
 PINHOLE = {"fov_deg": 0.01}  # what is seen is a point: 0.7 mm across at 4 m
@@ -125,7 +125,7 @@ def test_a_mask_of_a_scene_file(tmp_path: Path, opacity: str, warns: bool) -> No
 
 def bent_and_unbent(config: Config) -> list[str]:
     """What is said of light that crosses a surface in two ways, before a render."""
-    _, engine, _ = pipeline.set_up_engine(config, pipeline.started_backend(config))
+    _, engine, _ = stages.set_up_engine(config, stages.started_backend(config))
     from nlosrender.engine.preflight.scene_warnings import scene_warnings
 
     return [text for text in scene_warnings(engine) if "bent as well as unbent" in text]

@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 from support.rendering import Scene, configured, flat_wall, render
 
-from nlosrender import pipeline
 from nlosrender.engine.backend.start import start_backend
+from nlosrender.rendering import stages
+from nlosrender.rendering.outcome import missing_light
 
 GREY = {"type": "diffuse", "reflectance": 0.7}
 BLACK = {"type": "diffuse", "reflectance": 0.0}
@@ -31,8 +32,8 @@ def found(*hidden: Scene, **settings: Any) -> set[tuple[str, int]]:
     """Notation and first bounce of what the engine of a scene does not sample."""
     config = configured(flat_wall(*hidden, **({"max_bounces": 5} | settings)))
     backend = start_backend("llvm", colored=config.is_colored, polarized=config.render.polarized)
-    _, engine, _ = pipeline.set_up_engine(config, backend)
-    return {(paths.notation, paths.first_bounce) for paths in pipeline.missing_light(engine)}
+    _, engine, _ = stages.set_up_engine(config, backend)
+    return {(paths.notation, paths.first_bounce) for paths in missing_light(engine)}
 
 
 # the laser at x = 0.3 lights it from the left and below, and is mirrored to the right and upwards
@@ -132,8 +133,8 @@ def test_before_a_camera_lamps_without_extent_are_not_found_in_mirrors(
     """What a mirror sends from a point lamp to a surface (two interactions) is found by no connection."""
     text = VIEW.replace("LAMP", LAMPS[lamp]).replace("BSDF", bsdf).replace("HIGHEST", str(highest))
     config = configured(text)
-    _, engine, _ = pipeline.set_up_engine(config, start_backend("llvm"))
-    assert {(paths.notation, paths.first_bounce) for paths in pipeline.missing_light(engine)} == expected
+    _, engine, _ = stages.set_up_engine(config, start_backend("llvm"))
+    assert {(paths.notation, paths.first_bounce) for paths in missing_light(engine)} == expected
 
 
 def test_what_a_point_misses_is_what_a_spot_finds() -> None:

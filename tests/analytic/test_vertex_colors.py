@@ -11,9 +11,9 @@ from support.quadrature import Array, Setup, grid_points, rectangle_cells, third
 from support.rendering import configured, flat_wall, render
 from support.views import view_config
 
-from nlosrender import pipeline
 from nlosrender.engine.backend.start import start_backend
 from nlosrender.errors import ConfigError
+from nlosrender.rendering import stages
 from nlosrender.scene.meshes.mesh_file import read_mesh
 
 CENTER = np.array([0.2, 0.1, 0.8])
@@ -100,7 +100,7 @@ def test_attributes_that_are_not_there_or_cannot_be_are_refused(
     config = configured(flat_wall(item), folder=tmp_path)
     start_backend("llvm", colored=True, polarized=False)
     with pytest.raises(ConfigError, match=message) as caught:
-        pipeline.load_scene(config)
+        stages.load_scene(config)
     assert caught.value.issues[0].key == "scene.hidden_geometry.0.bsdf"
 
 
@@ -109,7 +109,7 @@ def test_a_relay_wall_has_no_attributes() -> None:
     config = configured(flat_wall(wall={"bsdf": colored("")["bsdf"]}))
     start_backend("llvm", colored=True, polarized=False)
     with pytest.raises(ConfigError, match="a relay wall's points have no attribute vertex_color; use a bitmap"):
-        pipeline.load_scene(config)
+        stages.load_scene(config)
 
 
 @pytest.mark.parametrize("referred", ["", "bsdf", "texture"])
@@ -139,7 +139,7 @@ def test_attributes_in_a_mitsuba_scene(
     config = configured(view_config(emitters=[lamp], scene={"mitsuba": "scene.xml"}), folder=tmp_path)
     start_backend("llvm", colored=True, polarized=False)
     if not message:
-        assert pipeline.load_view(config).n_triangles == 3
+        assert stages.load_view(config).n_triangles == 3
         return
     with pytest.raises(ConfigError, match=message):
-        pipeline.load_view(config)
+        stages.load_view(config)

@@ -18,8 +18,8 @@ from support.quadrature import (
 )
 from support.rendering import Rendering, configured, flat_wall, render
 
-from nlosrender import pipeline
 from nlosrender.engine.backend.start import start_backend
+from nlosrender.rendering import stages
 
 pytestmark = pytest.mark.usefixtures("backend")
 
@@ -57,9 +57,9 @@ def start(config: dict):
     """Return the built scene, the capture, the time axis, the plan and the engine that a configuration leads to."""
     validated = configured(config)
     backend = start_backend("llvm", colored=validated.is_colored)
-    built = pipeline.load_scene(validated)
-    capture, time_axis = pipeline.describe_capture(validated, built.wall, built)
-    return built, capture, time_axis, *pipeline.prepare(validated, backend, built, capture, time_axis)
+    built = stages.load_scene(validated)
+    capture, time_axis = stages.describe_capture(validated, built.wall, built)
+    return built, capture, time_axis, *stages.prepare(validated, backend, built, capture, time_axis)
 
 
 def gathered(*hidden: dict, scan: str = "single", error: float = 0.01, **more) -> tuple[np.ndarray, float, object]:

@@ -9,8 +9,8 @@ import pytest
 from support.agreement import assert_agrees
 from support.rendering import Rendering, configured, flat_wall, render
 
-from nlosrender import pipeline
 from nlosrender.engine.backend.start import start_backend
+from nlosrender.rendering import stages
 
 REPLICAS = 32
 GREY = {"type": "diffuse", "reflectance": 0.8}
@@ -32,9 +32,9 @@ def path_engine(config: dict, **options: object):
     backend = start_backend("llvm", colored=False)
     from nlosrender.engine.path.engine import PathEngine
 
-    built = pipeline.load_scene(validated)
-    capture, time_axis = pipeline.describe_capture(validated, built.wall, built)
-    plan, engine = pipeline.prepare(validated, backend, built, capture, time_axis)
+    built = stages.load_scene(validated)
+    capture, time_axis = stages.describe_capture(validated, built.wall, built)
+    plan, engine = stages.prepare(validated, backend, built, capture, time_axis)
     return plan, PathEngine(built, capture, time_axis, replace(engine.options, **options))
 
 

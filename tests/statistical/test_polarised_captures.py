@@ -9,8 +9,8 @@ import pytest
 from support.agreement import assert_agrees, t_limit, worst_t
 from support.rendering import configured, flat_wall, render
 
-from nlosrender import pipeline
 from nlosrender.errors import ConfigError
+from nlosrender.rendering import stages
 
 METAL = {"type": "roughconductor", "eta": 1.5, "k": 0.1, "alpha": 0.35}  # black glass: it polarises strongly
 LASER, SENSOR = np.array([1.8, -0.2, 0.5]), np.array([-1.6, 0.9, 0.5])  # m, at angles that polarise
@@ -142,8 +142,8 @@ def test_what_cannot_be_polarised(changes: dict[str, Any], key: str, message: st
 def test_only_paths_carry_polarised_light() -> None:
     """The planner says why it takes the path engine."""
     config = configured(flat_wall(plate(), polarized=True, engine="auto", spp=None, target_error=0.1))
-    backend = pipeline.started_backend(config)
-    _, engine, header = pipeline.set_up_engine(config, backend)
+    backend = stages.started_backend(config)
+    _, engine, header = stages.set_up_engine(config, backend)
     assert (backend.variant, engine.name, engine.reason) == (
         "llvm_ad_mono_polarized",
         "path",

@@ -11,9 +11,9 @@ from scipy import stats
 from support.agreement import FALSE_ALARM
 from support.rendering import configured, flat_wall
 
-from nlosrender import pipeline
 from nlosrender.engine.backend.start import start_backend
 from nlosrender.engine.launch.recurrence import recurrence_steps
+from nlosrender.rendering import stages
 
 N = 2**20
 SPHERE = {"type": "sphere", "center": [0.4, 0.2, 0.7], "radius": 0.2}
@@ -49,7 +49,7 @@ def sampled() -> Sampled:
 
     from nlosrender.engine.launch.surface_sampler import SurfaceSampler
 
-    built = pipeline.load_scene(config)
+    built = stages.load_scene(config)
     sampler = SurfaceSampler(built)
     rng = np.random.default_rng(1)
     bits = mi.UInt32(rng.integers(0, 2**32, N, dtype=np.uint32))
@@ -182,7 +182,7 @@ def test_the_guide_leads_to_the_entry_that_covers_a_number() -> None:
 
     from nlosrender.engine.launch.surface_sampler import SurfaceSampler
 
-    sampler = SurfaceSampler(pipeline.load_scene(config))
+    sampler = SurfaceSampler(stages.load_scene(config))
     edges = np.array(sampler._table.edges).astype(np.int64)
     assert len(np.unique(edges)) > 10
     wanted = np.concatenate([edges, edges - 1, edges + 1, np.random.default_rng(2).integers(0, 2**32, 5000)])

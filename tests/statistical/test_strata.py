@@ -25,13 +25,13 @@ TINY_LAUNCHES = 1e-9  # seconds: one path per lane and launch after the first
 
 def path_engine(config: dict):
     """Return the path engine of a configuration, and its plan."""
-    from nlosrender import pipeline
+    from nlosrender.rendering import stages
 
     validated = configured(config)
     backend = start_backend("llvm", colored=False)
-    built = pipeline.load_scene(validated)
-    capture, time_axis = pipeline.describe_capture(validated, built.wall, built)
-    return pipeline.prepare(validated, backend, built, capture, time_axis)
+    built = stages.load_scene(validated)
+    capture, time_axis = stages.describe_capture(validated, built.wall, built)
+    return stages.prepare(validated, backend, built, capture, time_axis)
 
 
 @pytest.mark.parametrize(("first", "n"), [(0, 1), (0, 7), (32, 4096), (5, 100_003)])

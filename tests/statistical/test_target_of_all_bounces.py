@@ -10,6 +10,7 @@ from support.rendering import configured, flat_wall
 
 from nlosrender import pipeline
 from nlosrender.engine.backend.start import start_backend
+from nlosrender.rendering import stages
 from nlosrender.rendering.outcome import MISSED_BY
 
 BOWL = {"type": "sphere", "center": [0, 0, 3], "radius": 3, "inside": True}
@@ -40,7 +41,7 @@ def test_the_second_bounce_counts_for_the_target(tmp_path: Path, engine: str) ->
     backend = start_backend("llvm")
     from nlosrender.engine.path.engine import Budget
 
-    engines = [pipeline.set_up_engine(config, backend)[1] for _ in range(2)]
+    engines = [stages.set_up_engine(config, backend)[1] for _ in range(2)]
     engines[1].paths.second_squares = lambda batch: 0.0  # as if the third bounce were all
     fine = [each.calibrate(Budget(target_error=TARGET)).patch_scale for each in engines]
     assert fine[0] > 1.2 * fine[1]

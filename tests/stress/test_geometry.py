@@ -10,9 +10,9 @@ from conftest import Ledger
 from stressed import BOTH, Array, noise_of, relative_difference, scene
 from support.rendering import Rendering, configured, render
 
-from nlosrender import pipeline
 from nlosrender.bench.meshes import write_ply
 from nlosrender.errors import ConfigError
+from nlosrender.rendering import stages
 
 TWO_SIDED = {"type": "twosided", "inner": {"type": "diffuse", "reflectance": 1.0}}
 QUAD = np.array([[-0.3, -0.2, 0.0], [0.3, -0.2, 0.0], [0.3, 0.2, 0.0], [-0.3, 0.2, 0.0]])
@@ -202,7 +202,7 @@ def test_an_item_on_top_of_another_counts_once(engine: str, tmp_path: Path, ledg
     difference, allowed = relative_difference(overlaid.mean, alone.mean), noise_of(overlaid, alone)
     ledger.check(f"an item on top of another counts once ({engine})", difference, allowed)
     with_overlap = scene(first, both | grey, **settings)
-    built = pipeline.load_scene(configured(with_overlap))
+    built = stages.load_scene(configured(with_overlap))
     assert any("1: 50 % of its area lies where scene.hidden_geometry.0" in text for text in built.warnings)
 
 

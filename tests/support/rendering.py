@@ -12,7 +12,6 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from nlosrender import pipeline
 from nlosrender.capture.bounces import BounceAxis
 from nlosrender.capture.grids import Capture
 from nlosrender.capture.plan import Plan, plan_capture
@@ -20,6 +19,7 @@ from nlosrender.capture.time_axis import TimeAxis
 from nlosrender.config.document import Config
 from nlosrender.config.load import parse_config
 from nlosrender.engine.backend.start import start_backend
+from nlosrender.rendering import stages
 
 Array = NDArray[np.float64]
 Scene = Mapping[str, Any]
@@ -128,9 +128,9 @@ def render(
     backend = start_backend("llvm", colored=validated.is_colored, polarized=validated.render.polarized)
     from nlosrender.engine.path.engine import Budget, PathEngine
 
-    built = pipeline.load_scene(validated)
-    capture, time_axis = pipeline.describe_capture(validated, built.wall, built)
-    plan, engine = pipeline.prepare(validated, backend, built, capture, time_axis)
+    built = stages.load_scene(validated)
+    capture, time_axis = stages.describe_capture(validated, built.wall, built)
+    plan, engine = stages.prepare(validated, backend, built, capture, time_axis)
     if options:
         engine = PathEngine(built, capture, time_axis, replace(engine.options, **options))
     bounces, channels = engine.options.bounces, engine.options.channels

@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from nlosrender import pipeline
 from nlosrender.engine.backend.start import start_backend
+from nlosrender.rendering import stages
 from support.rendering import configured, flat_wall
 
 Array = NDArray[np.float64]
@@ -87,9 +87,9 @@ class Stage:
         """Set up the engine that a configuration leads to."""
         validated = configured(config, folder=folder)
         backend = start_backend("llvm", colored=validated.is_colored)
-        built = pipeline.load_scene(validated)
-        capture, time_axis = pipeline.describe_capture(validated, built.wall, built)
-        plan, engine = pipeline.prepare(validated, backend, built, capture, time_axis)
+        built = stages.load_scene(validated)
+        capture, time_axis = stages.describe_capture(validated, built.wall, built)
+        plan, engine = stages.prepare(validated, backend, built, capture, time_axis)
         first = plan.batches[0]
         grids = {"sensors": capture.sensor_grid, "lasers": capture.laser_grid}
         whole = {

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from nlosrender import pipeline
 from nlosrender.config.document import Config
 from nlosrender.engine.backend.start import start_backend
+from nlosrender.rendering import stages
 from support.rendering import configured
 
 Array = NDArray[np.float64]
@@ -72,7 +72,7 @@ def see(
     from nlosrender.engine.launch.sample_schedule import Budget
     from nlosrender.engine.line_of_sight.engine import LineOfSightEngine
 
-    _, engine, _ = pipeline.set_up_engine(validated, backend)
+    _, engine, _ = stages.set_up_engine(validated, backend)
     engine = LineOfSightEngine(
         engine.built, engine.capture, engine.time_axis, replace(engine.options, replicas=replicas)
     )

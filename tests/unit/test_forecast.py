@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from support.rendering import configured, flat_wall
 
-from nlosrender import pipeline
 from nlosrender.analysis.render_plan import plan_render
 from nlosrender.capture.bounces import BounceAxis
 from nlosrender.capture.limits import refuse_impossible_grids, refuse_impossible_samples
@@ -19,6 +18,7 @@ from nlosrender.capture.plan import Batch, Plan, Tile, WorkItem
 from nlosrender.engine.backend.start import start_backend
 from nlosrender.errors import ConfigError
 from nlosrender.files.size_estimate import FileSize, disk_warnings, forecast_size
+from nlosrender.rendering import stages
 
 BOX = (np.array([-0.4, -0.7, 0.5]), np.array([0.9, 0.2, 1.6]))
 PLATE = {"type": "rectangle", "width": 0.5, "height": 0.4, "center": [0.1, 0, 0.9], "normal": [0, 0, -1]}
@@ -47,10 +47,10 @@ def test_an_unpacked_file_has_exactly_the_size_forecast(scan_type, variance, tmp
     from nlosrender.files.writer import CaptureWriter
 
     config = configured(flat_wall(PLATE, scan=scan_type, sensors=(101, 97), lasers=(2, 3), bins=(0.0, 0.5, 29)))
-    wall, _ = pipeline.place_scene(config)
+    wall, _ = stages.place_scene(config)
     built = SimpleNamespace(wall=wall, hidden_bounds=BOX)
-    capture, time_axis = pipeline.describe_capture(config, wall, built)
-    header = pipeline.describe_file(config, built, capture, time_axis)
+    capture, time_axis = stages.describe_capture(config, wall, built)
+    header = stages.describe_file(config, built, capture, time_axis)
     size = forecast_size(header.sizes, header.confocal, (0.0, 0.5), compression="none", variance=variance)
     block = np.ones(
         [header.sizes[a] for a in ("channel", "bounce", "laser_y", "laser_x", "sensor_y", "sensor_x", "bin")]
@@ -83,7 +83,7 @@ def test_what_the_pilot_saw_tightens_the_size_and_never_loosens_it():
 
     config = configured(flat_wall(PLATE, BALL, sensors=(50, 30), max_bounces=5))
     _, _, engine = prepared(config)
-    header = pipeline.describe_file(config, engine.built, engine.capture, engine.time_axis)
+    header = stages.describe_file(config, engine.built, engine.capture, engine.time_axis)
     bound, dark, loose = (
         expected_file_size(config, header, engine, lit).disk_bytes_estimate
         for lit in (None, (0.0, None, 0.0, 0.0), (1.0, None, 1.0, 1.0))
@@ -150,9 +150,9 @@ def test_possible_sizes_are_not_refused():
 
 def prepared(config):
     backend = start_backend("llvm", colored=config.is_colored)
-    built = pipeline.load_scene(config)
-    capture, time_axis = pipeline.describe_capture(config, built.wall, built)
-    plan, engine = pipeline.prepare(config, backend, built, capture, time_axis)
+    built = stages.load_scene(config)
+    capture, time_axis = stages.describe_capture(config, built.wall, built)
+    plan, engine = stages.prepare(config, backend, built, capture, time_axis)
     return backend, plan, engine
 
 

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from nlosrender import pipeline
 from nlosrender.bench.paper.figure import PaperFigure, Table
 from nlosrender.bench.paper.rooms import ROOMS, write_mesh
 from nlosrender.bench.paper.study import Study
 from nlosrender.engine.backend.start import start_backend
+from nlosrender.rendering import stages
 
 OWN = {
     "z-letter": "the Z letter",
@@ -30,7 +30,7 @@ def scenes_table(study: Study) -> PaperFigure:
         overrides = (f"scene.hidden_geometry.1.filename={meshes[name]}",) if name in meshes else ()
         config = study.config(name, *overrides)
         start_backend(config.render.backend, colored=config.is_colored)
-        built = pipeline.load_scene(config)
+        built = stages.load_scene(config)
         grid = config.capture.sensor_grid
         points = "" if grid is None else f"{grid.nx} x {grid.ny}"
         rows.append((name, stands_for, f"{built.n_triangles:,}", points, str(config.time_axis.n_bins)))

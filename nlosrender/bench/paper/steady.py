@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from nlosrender import pipeline
 from nlosrender.capture.grids import Capture
 from nlosrender.config.document import Config
 from nlosrender.engine.backend.start import start_backend
+from nlosrender.rendering import stages
 
 if TYPE_CHECKING:
     from nlosrender.scene.view import BuiltView
@@ -36,8 +36,8 @@ def steady_picture(config: Config, spp: int) -> tuple[Float64, Float64]:
     """
     polarized = config.render.polarized
     start_backend(config.render.backend, colored=config.is_colored, polarized=polarized)
-    built = pipeline.load_view(config)
-    capture, _ = pipeline.describe_capture(config, built.wall, built)
+    built = stages.load_view(config)
+    capture, _ = stages.describe_capture(config, built.wall, built)
     return mitsuba_picture(built, capture, config.render.max_bounces, polarized, max(1, spp // SEEDS), SEEDS)
 
 

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from nlosrender import pipeline
 from nlosrender.analysis.theme import MARK
 from nlosrender.bench.paper.drawing import new_figure, save, show_row, show_wall
 from nlosrender.bench.paper.figure import Check, PaperFigure, Picture
 from nlosrender.bench.paper.study import Rendered, Study
 from nlosrender.capture.grids import build_capture
+from nlosrender.rendering import stages
 from nlosrender.scene.meshes.triangle_mesh import TriangleMesh
 
 Float64 = NDArray[np.float64]
@@ -72,7 +72,7 @@ def arrivals(study: Study, name: str, *overrides: str, rows: slice = slice(None)
     Of the sensor points in ``rows``. Occlusion is not looked at: of a thick letter the sides count as well.
     """
     config = study.config(name, *overrides)
-    wall, surfaces = pipeline.place_scene(config)
+    wall, surfaces = stages.place_scene(config)
     capture = build_capture(config.capture, wall)
     meshes = [surface.shape for surface in surfaces if isinstance(surface.shape, TriangleMesh)]
     points = np.concatenate([_points_on(mesh) for mesh in meshes])

@@ -35,7 +35,7 @@ import pathlib, sys
 from nlosrender.engine.backend.llvm import load_library
 load_library(sys.argv[1])
 import drjit
-from nlosrender import pipeline
+from nlosrender.rendering import stages
 from nlosrender.config.load import parse_config
 from nlosrender.engine.backend.start import start_backend
 for engine in ("virtual_lights", "path"):
@@ -47,9 +47,9 @@ for engine in ("virtual_lights", "path"):
         " render: {max_bounces: 5, target_error: 0.2, engine: " + engine + "}}",
         "probe.yaml", pathlib.Path("."))
     backend = start_backend("llvm")
-    built = pipeline.load_scene(config)
-    capture, time_axis = pipeline.describe_capture(config, built.wall, built)
-    plan, renderer = pipeline.prepare(config, backend, built, capture, time_axis)
+    built = stages.load_scene(config)
+    capture, time_axis = stages.describe_capture(config, built.wall, built)
+    plan, renderer = stages.prepare(config, backend, built, capture, time_axis)
     from nlosrender.engine.path.engine import Budget
     energy = renderer.render(plan.batches[0], Budget(target_error=0.2)).mean.sum()
     print("works" if energy > 0 else "no light")
