@@ -17,7 +17,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from nlosrender.bench.meshes import write_ply
+from nlosrender.bench.generated_meshes import write_ply
 from nlosrender.bench.race import FIRST_SAMPLES, Contender
 from nlosrender.bench.references import Reference
 from nlosrender.bench.runs import LoadedScene, Run

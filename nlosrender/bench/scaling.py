@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from nlosrender.bench.curve import power_law
-from nlosrender.bench.meshes import grid_faces, write_ply
+from nlosrender.bench.generated_meshes import grid_faces, write_ply
 from nlosrender.bench.runs import Timer, load, render
 from nlosrender.bench.scenes import BenchScene, closed_room, many_lasers, plate, wavy_sheet
 

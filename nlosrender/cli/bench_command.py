@@ -43,8 +43,8 @@ def bench(
     Example: nlosrender bench --scene plate --part curves --seconds 30 -o out/bench (prints a table, creates
     out/bench.json and out/bench.png)
     """
+    from nlosrender.bench.bench_report import table, write_json, write_plot
     from nlosrender.bench.benchmark import PARTS, run_benchmark
-    from nlosrender.bench.report import table, write_json, write_plot
     from nlosrender.bench.scenes import built_in_scenes
     from nlosrender.engine.backend.start import start_backend
 

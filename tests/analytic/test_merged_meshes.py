@@ -12,7 +12,7 @@ from support.agreement import relative_l2
 from support.rendering import flat_wall
 from support.varied_scenes import Stage
 
-from nlosrender.bench.meshes import grid_faces, write_ply
+from nlosrender.bench.generated_meshes import grid_faces, write_ply
 
 pytestmark = pytest.mark.usefixtures("backend")
 

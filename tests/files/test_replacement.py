@@ -18,8 +18,8 @@ from nlosrender.analysis.frames import FrameOptions, write_frames
 from nlosrender.analysis.plots import plot_capture
 from nlosrender.analysis.reconstruction.reconstruct import ReconstructionSettings, reconstruct_capture
 from nlosrender.analysis.reconstruction.volume_file import write_volume
-from nlosrender.bench.meshes import write_ply
-from nlosrender.bench.report import write_json
+from nlosrender.bench.bench_report import write_json
+from nlosrender.bench.generated_meshes import write_ply
 from nlosrender.capture.part import Selection
 from nlosrender.errors import EXIT_FAILURE, DiskError, FileError
 from nlosrender.files.atomic_write import partial_folder, replacing

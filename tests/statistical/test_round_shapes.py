@@ -10,7 +10,7 @@ from support.agreement import assert_agrees
 from support.quadrature import Array, Cells, Setup, cylinder_cells, grid_points, sphere_cells, third_bounces
 from support.rendering import flat_wall, render
 
-from nlosrender.bench.meshes import write_ply
+from nlosrender.bench.generated_meshes import write_ply
 
 REPLICAS = 32
 BINS = (0.7, 0.05, 40)

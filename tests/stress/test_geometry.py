@@ -10,7 +10,7 @@ from conftest import Ledger
 from stressed import BOTH, Array, noise_of, relative_difference, scene
 from support.rendering import Rendering, configured, render
 
-from nlosrender.bench.meshes import write_ply
+from nlosrender.bench.generated_meshes import write_ply
 from nlosrender.errors import ConfigError
 from nlosrender.rendering import stages
 

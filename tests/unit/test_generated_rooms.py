@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from support.rendering import configured, flat_wall
 
-from nlosrender.bench.meshes import grid_faces, write_ply
+from nlosrender.bench.generated_meshes import grid_faces, write_ply
 from nlosrender.bench.paper.room_meshes import block, ellipsoid, write_furniture, write_statue
 from nlosrender.bench.paper.rooms import ROOMS, Room, write_meshes
 from nlosrender.bench.paper.study import Study

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from nlosrender.bench.meshes import grid_faces, write_ply
+from nlosrender.bench.generated_meshes import grid_faces, write_ply
 
 Float64 = NDArray[np.float64]
 Mesh = tuple[Float64, NDArray[np.int64]]
