@@ -111,8 +111,8 @@ def render_capture(
             )
             partial.open(header, provenance | identity_attributes(identity), output.compression, output.variance)
             warnings.emit(partial.damage)
-            earlier = len(partial.tally.items)
-            items = remaining_items(plan, header.confocal, partial.tally.items)
+            earlier = len(partial.finished.items)
+            items = remaining_items(plan, header.confocal, partial.finished.items)
             if cluster is None:
                 render = functools.partial(render_items, items, engine, budget, partial, stop)
             else:
@@ -125,7 +125,7 @@ def render_capture(
                 warn=lambda text: warnings.emit([text]),
                 watch=(lambda standing: watch(replace(standing, error=None))) if unsampled else watch,
             )
-            tally = partial.tally
+            tally = partial.finished
             outcome = Outcome.of(config.render, engine, unsampled, tally.sums)
             warnings.emit(outcome.warnings)
             results = outcome.attributes(stopwatch.report(), is_whole=selection == WHOLE)

@@ -5,8 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from nlosrender.errors import FileError
-from nlosrender.files.partial.journal import read_records
-from nlosrender.files.partial.partial_folder import JOURNAL
+from nlosrender.files.partial.journal import JOURNAL, read_records
 from nlosrender.files.partial.work_item_log import JournalState
 from nlosrender.files.reading.reader import explained_read
 
@@ -36,7 +35,7 @@ def summarise_unfinished(folder: str | Path) -> dict[str, object]:
         state = JournalState.from_records(read_records(folder / JOURNAL))
     if not state.first:
         raise FileError(f"{folder}: nothing has been rendered into it yet")
-    tally, identity = state.tally, state.first["identity"]
+    tally, identity = state.finished, state.first["identity"]
     confocal = identity["config"].get("capture", {}).get("scan_type") == "confocal"
     pairs = sum(sensors.size * (1 if confocal else lasers.size) for sensors, lasers in tally.items)
     error = tally.sums.error_estimate

@@ -18,6 +18,7 @@ from pathlib import Path
 
 from nlosrender.errors import DiskError, FileError
 from nlosrender.files.file_kinds import FileKind
+from nlosrender.interruption import uninterrupted
 
 DISK_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)
 
@@ -84,7 +85,7 @@ def replacing(path: str | Path, kind: FileKind, sources: Iterable[str | Path] = 
             yield partial
             publish(path, partial, target, kind)
         finally:
-            with suppress(OSError):
+            with uninterrupted(), suppress(OSError):
                 partial.unlink(missing_ok=True)
 
 

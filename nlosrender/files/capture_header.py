@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from nlosrender.capture.bounces import FILE_BOUNCES, LINE_OF_SIGHT, first_bounce_of
+from nlosrender.files.chunk_shape import CHUNK_SAMPLES, chunk_shape
 from nlosrender.files.layout import FRAMES, SCAN_TYPES, Float64
 from nlosrender.scene.pose import Pose
 
@@ -54,6 +55,8 @@ class CaptureHeader:
         Whether the relay wall is a plane.
     shared_samples
         Which samples have errors in common, in words: their variances may not be summed. Empty where none have.
+    chunk_samples
+        Samples of a chunk of the file at most.
 
     Raises
     ------
@@ -83,6 +86,7 @@ class CaptureHeader:
     frame: str = "znlos"
     planar_wall: bool = True
     shared_samples: str = ""
+    chunk_samples: int = CHUNK_SAMPLES
 
     def __post_init__(self) -> None:
         _require(self.scan_type in SCAN_TYPES, "scan_type", self.scan_type, f"one of {', '.join(SCAN_TYPES)}")
@@ -122,6 +126,11 @@ class CaptureHeader:
             "sensor_x": sensor_x,
             "bin": self.n_bins,
         }
+
+    @property
+    def chunks(self) -> tuple[int, ...]:
+        """Shape of the chunks of ``data``, in the file's axis order."""
+        return chunk_shape(self.sizes, self.confocal, self.chunk_samples)
 
     def bounce_name(self, slot: int) -> str:
         """Return what the in-memory bounce index ``slot`` holds, in words."""

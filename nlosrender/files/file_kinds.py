@@ -103,7 +103,6 @@ _READABLE_CAPTURE = _hdf5(
 )
 VOLUME = _hdf5("a reconstruction by nlosrender", lambda file: {"volume", *"xyz"} <= file.keys())
 TAL = _hdf5("an HDF5_TAL file", lambda file: {"H", "H_format"} <= file.keys())
-NOTHING = FileKind(lambda path: "exists already. Name another output, or allow it to be overwritten.")
 
 
 def _is_damaged_capture(path: Path) -> bool:

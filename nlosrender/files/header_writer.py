@@ -1,6 +1,8 @@
-"""From a ``CaptureHeader`` to the datasets and attributes of a Z-NLOS file, samples excepted."""
+"""From a ``CaptureHeader`` to a Z-NLOS file without light: all small datasets, attributes, and no chunk of samples."""
 
 from __future__ import annotations
+
+from collections.abc import Mapping
 
 import h5py
 import numpy as np
@@ -28,8 +30,61 @@ _STOKES_TEXT = (
 )
 
 
+GZIP_LEVEL = 4  # told to HDF5, which packs only chunks that are filled in parts
+
+
+def create_capture(
+    file: h5py.File, header: CaptureHeader, attributes: Mapping[str, object], compression: str, store_variance: bool
+) -> None:
+    """Create everything of a capture file but its light.
+
+    Parameters
+    ----------
+    file
+        Empty and open for writing.
+    header, attributes
+        Description of the capture; further attributes, such as its provenance.
+    compression
+        ``gzip`` (with shuffle: the one filter pair that every HDF5 build has) or ``none``.
+    store_variance
+        Also create a dataset ``variance`` shaped as ``data``.
+
+    Raises
+    ------
+    ValueError
+        One of ``attributes`` belongs to the layout.
+    """
+    write_header(file, header)
+    filters = {"compression": "gzip", "compression_opts": GZIP_LEVEL, "shuffle": True} if compression == "gzip" else {}
+    for name in layout.sample_names(store_variance):
+        shape = layout.data_shape(header.sizes, header.confocal)
+        samples = file.create_dataset(name, shape, layout.FLOAT, chunks=header.chunks, fillvalue=0.0, **filters)
+        meaning = "H" if name == layout.DATA else "variance of each sample of data"
+        described = sample_attributes(header) | {"meaning": meaning}
+        if name == layout.VARIANCE:
+            described["unit"] = f"({layout.DATA_UNIT})^2"
+            if header.shared_samples:
+                described["not_to_be_summed"] = header.shared_samples
+        set_attributes(samples, described)
+    add_attributes(file, header, attributes)
+
+
+def add_attributes(file: h5py.File, header: CaptureHeader, attributes: Mapping[str, object]) -> None:
+    """Add attributes to a capture file.
+
+    Raises
+    ------
+    ValueError
+        One of them belongs to the layout.
+    """
+    taken = sorted(root_attributes(header).keys() & attributes.keys())
+    if taken:
+        raise ValueError(f"attributes: {', '.join(taken)} already set by the layout, choose another name")
+    set_attributes(file, attributes)
+
+
 def write_header(file: h5py.File, header: CaptureHeader) -> None:
-    """Create every dataset but ``data`` in ``file``, and the attributes that explain them."""
+    """Create every dataset but the samples, and the attributes that explain them."""
     for name, values in dataset_values(header).items():
         spec = layout.SPECS[name]
         dataset = file.create_dataset(name, data=np.asarray(values, dtype=spec.dtype))

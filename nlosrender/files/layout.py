@@ -95,15 +95,9 @@ def in_file_order(by_axis: Mapping[str, T], confocal: bool) -> tuple[T, ...]:
     return tuple(by_axis[axis] for axis in file_axes(confocal))
 
 
-def to_file_order(array: NDArray[np.float32], axes: tuple[str, ...], confocal: bool) -> NDArray[np.float32]:
-    """Transpose an array whose axes are named ``axes`` (a subset of the file's) into the order of the file."""
-    return array.transpose([axes.index(axis) for axis in file_axes(confocal) if axis in axes])
-
-
-def from_file_order(array: NDArray[np.float32], axes: tuple[str, ...], confocal: bool) -> NDArray[np.float32]:
-    """Transpose what was read from the file's axes (those in ``axes``) into the order given by ``axes``."""
-    stored = [axis for axis in file_axes(confocal) if axis in axes]
-    return array.transpose([stored.index(axis) for axis in axes])
+def sample_names(has_variance: bool) -> tuple[str, ...]:
+    """Return the datasets of samples of a capture."""
+    return (DATA, VARIANCE) if has_variance else (DATA,)
 
 
 def resolve_shape(spec: DatasetSpec, sizes: Mapping[str, int]) -> tuple[int, ...]:

@@ -82,13 +82,13 @@ def render_on_cluster(
     if len(items) < workers:
         warn(f"--workers: the capture is cut into {len(items)} units, so that some of {workers} workers have no work.")
     if budget.time_limit_s is not None and items:
-        left = max(0.0, budget.time_limit_s - partial.tally.sums.seconds / workers)
+        left = max(0.0, budget.time_limit_s - partial.finished.sums.seconds / workers)
         budget = replace(budget, time_limit_s=left * workers / len(items))
-    total = len(partial.tally.items) + len(items)
+    total = len(partial.finished.items) + len(items)
     flight = _Flight(items, job, budget, store_variance, cluster)
     writer = ItemWriter(partial, stopwatch)
-    done = len(partial.tally.items)
-    so_far = partial.tally.sums
+    done = len(partial.finished.items)
+    so_far = partial.finished.sums
     watch(standing(so_far, done, total))
     try:
         for arrived in flight.arrivals(stop, warn):
@@ -101,7 +101,7 @@ def render_on_cluster(
         writer.wait()
     except (BackendError, IncompleteRender) as error:
         writer.wait()
-        begins_anew = isinstance(error, IncompleteRender) and not partial.tally.items
+        begins_anew = isinstance(error, IncompleteRender) and not partial.finished.items
         kind = RenderError if begins_anew else type(error)
         raise kind(f"{partial.path}: {error} The render stopped{saved_suffix(partial, total)}") from error
     finally:

@@ -85,12 +85,12 @@ def render_items(
     RenderError, FileError
         A work item cannot be rendered or stored.
     """
-    earlier = len(partial.tally.items)
+    earlier = len(partial.finished.items)
     total = earlier + len(items)
-    spent = partial.tally.sums.seconds
+    spent = partial.finished.sums.seconds
     begun = time.perf_counter()
     writer = ItemWriter(partial, stopwatch)
-    so_far = partial.tally.sums  # which the writer is a work item behind of, later on
+    so_far = partial.finished.sums  # which the writer is a work item behind of, later on
     watch(standing(so_far, earlier, total))
     try:
         for number, item in enumerate(items):
@@ -174,7 +174,7 @@ def standing(sums: Sums, done: int, total: int) -> Standing:
 
 def saved_suffix(partial: PartialCapture, total: int | None = None) -> str:
     """Return the end of a sentence: what is saved, of ``total`` work items."""
-    finished = len(partial.tally.items)
+    finished = len(partial.finished.items)
     if not partial.is_resumable:
         return " before anything was finished; nothing is kept."
     of_all = "" if total is None else f" of {total}"

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from nlosrender.capture.plan import WorkItem
 from nlosrender.engine.launch.passes import Passes, Snapshot
 from nlosrender.files import layout
-from nlosrender.files.chunking import Chunker, PackedChunk, packed_chunks
+from nlosrender.files.chunking import Chunker, PackedChunk
 from nlosrender.files.partial.partial_capture import PartialCapture
 from nlosrender.files.sums import Sums, sums_of
 from nlosrender.interruption import uninterrupted
@@ -116,7 +116,7 @@ class RenderedItem:
     def chunks(self, chunker: Chunker) -> Iterator[PackedChunk]:
         """Yield the work item's chunks, packed."""
         for name, block in self.samples.items():
-            yield from packed_chunks(chunker, name, block, self.laser_at, (self.item.sensors.y0, self.item.sensors.x0))
+            yield from chunker.chunks(name, block, self.laser_at, (self.item.sensors.y0, self.item.sensors.x0))
 
 
 def finished_item(

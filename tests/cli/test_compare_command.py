@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 from support import commands
 from support.commands import Done
+from support.partial_captures import write_capture
 from typer.testing import CliRunner
 
 from nlosrender.cli.app import app
 from nlosrender.errors import EXIT_BAD_INPUT, EXIT_COMPARISON_EXCEEDED, EXIT_OK, EXIT_USAGE
 from nlosrender.files.capture_header import CaptureHeader
-from nlosrender.files.writer import CaptureWriter
 from nlosrender.scene.pose import Pose
 
 ROWS, COLUMNS, BINS = 3, 5, 7
@@ -55,9 +55,7 @@ def write(path: Path, factor: float = 1.0, bin_width: float = 0.003, variance: b
     )
     path.parent.mkdir(parents=True, exist_ok=True)
     block = np.random.default_rng(0).random((1, 2, 1, 1, ROWS, COLUMNS, BINS)) * factor
-    with CaptureWriter(path, header, store_variance=variance) as writer:
-        writer.write(block, variance=(0.1 * block) ** 2 if variance else None)
-    return path
+    return write_capture(path, header, block, (0.1 * block) ** 2 if variance else None)
 
 
 @pytest.fixture

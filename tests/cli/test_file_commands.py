@@ -10,12 +10,12 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
+from support.partial_captures import write_capture
 from typer.testing import CliRunner
 
 from nlosrender.cli.app import app
 from nlosrender.errors import EXIT_BAD_INPUT, EXIT_USAGE, FileError, OptionError
 from nlosrender.files.capture_header import CaptureHeader
-from nlosrender.files.writer import CaptureWriter
 from nlosrender.scene.pose import Pose
 
 RUN = "import sys; from nlosrender.cli.app import main; sys.argv[0] = 'nlosrender'; main()"
@@ -54,9 +54,8 @@ def capture(tmp_path: Path) -> Path:
         pose=Pose.identity(),
     )
     path = tmp_path / "two planes.hdf5"
-    with CaptureWriter(path, header, attributes={"error_estimate": 0.0123, "note": "x"}) as writer:
-        writer.write(np.random.default_rng(0).random((1, 2, 1, 1, 4, 5, 7)))
-    return path
+    block = np.random.default_rng(0).random((1, 2, 1, 1, 4, 5, 7))
+    return write_capture(path, header, block, attributes={"error_estimate": 0.0123, "note": "x"})
 
 
 def test_info_table(capture: Path) -> None:

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import support.partial_captures
 
 from nlosrender.files.capture_header import CaptureHeader
-from nlosrender.files.writer import CaptureWriter
 from nlosrender.scene.pose import Pose
 
 N_ROWS, N_COLUMNS, LASER_ROWS, LASER_COLUMNS, N_BINS = 4, 5, 2, 3, 7
@@ -64,9 +64,10 @@ WriteCapture = Callable[..., np.ndarray]
 
 
 @pytest.fixture
-def header_of() -> Callable[..., CaptureHeader]:
-    """Builder of headers: ``header_of(scan_type, **changed_fields)``."""
-    return make_header
+def header_of(request: pytest.FixtureRequest) -> Callable[..., CaptureHeader]:
+    """Builder of headers: ``header_of(scan_type, **changed_fields)``; a module's SMALL_CHUNKS are its chunk_samples."""
+    chunks = {"chunk_samples": request.module.SMALL_CHUNKS} if hasattr(request.module, "SMALL_CHUNKS") else {}
+    return lambda scan_type="exhaustive", /, **changes: make_header(scan_type, **(chunks | changes))
 
 
 @pytest.fixture
@@ -81,8 +82,8 @@ def write_capture() -> WriteCapture:
 
     def write(path: Path, header: CaptureHeader, attributes: dict | None = None, **options: object) -> np.ndarray:
         block = make_block(header)
-        with CaptureWriter(path, header, attributes=attributes or {}, **options) as writer:
-            writer.write(block, variance=block**2 if options.get("store_variance") else None)
+        variance = block**2 if options.pop("store_variance", False) else None
+        support.partial_captures.write_capture(path, header, block, variance, attributes, **options)
         return block
 
     return write

@@ -14,13 +14,13 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
+from support.partial_captures import write_capture
 
 from nlosrender.analysis.comparison.captures import Comparison, Tolerances, compare_captures
 from nlosrender.analysis.comparison.dataset import check_dataset
 from nlosrender.analysis.comparison.report import comparison_report
 from nlosrender.errors import FileError
 from nlosrender.files.capture_header import CaptureHeader
-from nlosrender.files.writer import CaptureWriter
 
 ROUNDING = 2e-7  # relative: two float32 roundings of 6e-8 in samples, squares summed in float64
 Header = Callable[..., CaptureHeader]
@@ -34,8 +34,7 @@ def compare(tmp_path: Path, header_of: Header) -> Callable[..., Comparison]:
         header_a = options.get("header") or header_of("exhaustive")
         header_b = options.get("reference") or header_a
         for name, block, header in (("a", a, header_a), ("b", b, header_b)):
-            with CaptureWriter(tmp_path / f"{name}.hdf5", header) as writer:
-                writer.write(block)
+            write_capture(tmp_path / f"{name}.hdf5", header, block)
         return compare_captures(tmp_path / "a.hdf5", tmp_path / "b.hdf5", tolerances or Tolerances())
 
     return run
@@ -295,8 +294,7 @@ def test_a_dataset_against_its_reference(tmp_path: Path, header_of: Header, bloc
     for name in (*(f"ref/{name}" for name in names), "new/equal.hdf5", "new/sub/different.h5", "new/extra.hdf5"):
         path = tmp_path / name
         path.parent.mkdir(parents=True, exist_ok=True)
-        with CaptureWriter(path, header_of()) as writer:
-            writer.write(block * np.float32(1.1) if name == "new/sub/different.h5" else block)
+        write_capture(path, header_of(), block * np.float32(1.1) if name == "new/sub/different.h5" else block)
     (tmp_path / "new/broken.hdf5").write_text("no capture")
     (tmp_path / "ref/notes.txt").write_text("no capture either")
     (tmp_path / "ref/.hidden.hdf5").write_text("nor this")

@@ -17,13 +17,9 @@ from nlosrender.files.partial.partial_capture import PartialCapture
 from nlosrender.files.partial.work_item_log import JournalState
 from nlosrender.files.validation import validate_file
 
+SMALL_CHUNKS = 7 * 2 * 3  # tiles of 2 x 3 of the 4 x 5 sensors, so that there are units
+
 UNITS = 3  # finished before the damage
-
-
-@pytest.fixture(autouse=True)
-def small_chunks(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Tiles of 2 x 3 of the 4 x 5 sensors, so that there are units."""
-    monkeypatch.setattr("nlosrender.files.chunks.CHUNK_SAMPLES", 7 * 2 * 3)
 
 
 @pytest.fixture
@@ -109,7 +105,7 @@ def test_a_flipped_bit_in_a_chunk_costs_its_unit(
         samples.write(bytes([byte ^ 4]))
     with claimed(path) as partial:
         partial.open(header_of("single"), {}, "none", store_variance=True)
-        assert partial.tally.items == state.tally.items[1:]
+        assert partial.finished.items == state.finished.items[1:]
         (message,) = partial.damage
         assert "1 of 3 finished units are damaged on the disk and are rendered again" in message
     header = header_of("single")
@@ -138,7 +134,7 @@ def test_a_flipped_bit_outside_the_chunks_costs_nothing(stopped: Callable, heade
     samples.write_bytes(content)
     with claimed(path) as partial:
         partial.open(header_of("single"), {}, "gzip", store_variance=True)
-        assert len(partial.tally.items) == UNITS
+        assert len(partial.finished.items) == UNITS
         assert any("is damaged; it is built anew" in text for text in partial.damage)
 
 
@@ -149,10 +145,10 @@ def test_a_damaged_journal_is_said(stopped: Callable) -> None:
     lines = journal.read_bytes().splitlines(keepends=True)
     journal.write_bytes(lines[0] + lines[1] + lines[2][:-5])
     with claimed(path) as partial:
-        assert (len(partial.tally.items), partial.damage) == (1, [])
+        assert (len(partial.finished.items), partial.damage) == (1, [])
     journal.write_bytes(lines[0] + lines[1] + lines[2].replace(b"data", b"dada") + lines[3])
     with claimed(path) as partial:
-        assert len(partial.tally.items) == 1
+        assert len(partial.finished.items) == 1
         (message,) = partial.damage
         assert "the units it told of from there on are rendered again" in message
 
@@ -165,5 +161,5 @@ def test_records_of_something_else_are_no_traceback(stopped: Callable, record: o
     journal.append(record)  # type: ignore[arg-type]
     journal.close()
     with claimed(path) as partial:
-        assert partial.tally.items == []
+        assert partial.finished.items == []
         assert any("is damaged; everything is rendered again" in text for text in partial.damage)

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from math import prod
-
 import numpy as np
 import pytest
 
 from nlosrender.files import layout
-from nlosrender.files.chunks import CHUNK_SAMPLES, chunk_shape, cuts, sensor_tile
+from nlosrender.files.chunk_shape import CHUNK_SAMPLES, chunk_shape, cuts, sensor_tile
 from nlosrender.scene.pose import Pose
 
 POSE = Pose.from_normal_up([4.0, -2.0, 0.5], [0.3, 0.2, 1.0], [0.0, 1.0, 0.1])
@@ -36,20 +34,6 @@ def test_unknown_frame_is_refused() -> None:
     """Only the two frames of the layout exist."""
     with pytest.raises(ValueError, match="frame: got 'wall', need one of znlos, scene"):
         layout.file_frame("wall", POSE)
-
-
-@pytest.mark.parametrize("confocal", [True, False])
-def test_file_order_and_back(confocal: bool) -> None:
-    """Every sample keeps its indices by name when a block goes to the file's order and back."""
-    axes = layout.file_axes(confocal)
-    memory = tuple(axis for axis in layout.MEMORY_AXES if axis in axes)
-    sizes = {axis: length for length, axis in enumerate(layout.MEMORY_AXES, start=2)}
-    array = np.arange(prod(sizes[axis] for axis in memory), dtype=np.float32).reshape([sizes[a] for a in memory])
-    stored = layout.to_file_order(array, memory, confocal)
-    assert stored.shape == tuple(sizes[axis] for axis in axes)
-    index = {axis: position % sizes[axis] for position, axis in enumerate(layout.MEMORY_AXES, start=1)}
-    assert stored[layout.in_file_order(index, confocal)] == array[tuple(index[axis] for axis in memory)]
-    np.testing.assert_array_equal(layout.from_file_order(stored, memory, confocal), array)
 
 
 @pytest.mark.parametrize(

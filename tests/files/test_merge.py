@@ -18,11 +18,7 @@ from nlosrender.files.partial.work_item_log import CHECKSUM_RANGE, placed_checks
 from nlosrender.files.parts.merge import merge_captures
 from nlosrender.files.validation import validate_file
 
-
-@pytest.fixture(autouse=True)
-def small_chunks(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Tiles of 2 x 3 of the 4 x 5 sensors, cut once along time."""
-    monkeypatch.setattr("nlosrender.files.chunks.CHUNK_SAMPLES", 7 * 2 * 3)
+SMALL_CHUNKS = 7 * 2 * 3  # tiles of 2 x 3 of the 4 x 5 sensors, so that there are units
 
 
 def write_shards(folder: Path, header, block, count: int, **options) -> list[Path]:

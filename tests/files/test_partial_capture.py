@@ -22,11 +22,7 @@ from nlosrender.files.partial.partial_capture import PartialCapture
 from nlosrender.files.partial.work_item_log import JournalState
 from nlosrender.files.validation import validate_file
 
-
-@pytest.fixture(autouse=True)
-def small_chunks(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Tiles of 2 x 3 of the 4 x 5 sensors, so that there are units."""
-    monkeypatch.setattr("nlosrender.files.chunks.CHUNK_SAMPLES", 7 * 2 * 3)
+SMALL_CHUNKS = 7 * 2 * 3  # tiles of 2 x 3 of the 4 x 5 sensors, so that there are units
 
 
 def contents(path: Path) -> dict[str, np.ndarray]:
@@ -257,7 +253,6 @@ def test_power_failures_after_going_on(
     with pytest.raises(Stopped):
         write_part(path, header, block, stop_after=2)
     monkeypatch.undo()
-    monkeypatch.setattr("nlosrender.files.chunks.CHUNK_SAMPLES", 7 * 2 * 3)
     assert len(copies) > 20
     every = 7 if built_anew else 1
     for copy in copies[::every]:

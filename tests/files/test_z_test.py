@@ -10,12 +10,12 @@ import h5py
 import numpy as np
 import pytest
 from scipy import stats
+from support.partial_captures import write_capture
 
 from nlosrender.analysis.comparison.captures import Comparison, Tolerances, compare_captures
 from nlosrender.analysis.comparison.report import comparison_report
 from nlosrender.analysis.comparison.z_test import MIN_FREEDOM, normal_deviate
 from nlosrender.errors import FileError
-from nlosrender.files.writer import CaptureWriter
 
 Header = Callable
 N_BINS, SIGNIFICANCE = 64, 0.01
@@ -45,9 +45,7 @@ class Tracer:
             replicas.append(weights * self.replicas / self.paths)
         mean = np.mean(replicas, axis=0)
         variance = np.var(replicas, axis=0, ddof=1) / self.replicas
-        with CaptureWriter(path, self.header, attributes=attributes, store_variance=True) as writer:
-            writer.write(mean, variance=variance)
-        return path
+        return write_capture(path, self.header, mean, variance, attributes)
 
 
 def judge(a: Path, b: Path) -> Comparison:

@@ -14,8 +14,6 @@ from nlosrender.capture.part import WHOLE, Part, Selection, Tiling
 from nlosrender.capture.tile import Tile, runs
 from nlosrender.files import layout
 from nlosrender.files.capture_header import CaptureHeader
-from nlosrender.files.chunking import packed_chunks
-from nlosrender.files.chunks import chunk_shape
 from nlosrender.files.identity import identity_attributes
 from nlosrender.files.partial.partial_capture import PartialCapture
 from nlosrender.files.parts.part_attributes import part_attributes, summed_attributes
@@ -33,7 +31,7 @@ class Stopped(Exception):
 
 def tiling_of(header: CaptureHeader) -> Tiling:
     """The sensor grid of a capture cut into storage tiles."""
-    chunks = dict(zip(layout.file_axes(header.confocal), chunk_shape(header.sizes, header.confocal), strict=True))
+    chunks = dict(zip(layout.file_axes(header.confocal), header.chunks, strict=True))
     rows, columns = header.sensor_positions.shape[:2]
     return Tiling(rows, columns, chunks["sensor_y"], chunks["sensor_x"])
 
@@ -79,7 +77,7 @@ def write_part(
     with PartialCapture.claim(path, identity, resume) as partial:
         provenance = provenance_attributes(config, "hash") | identity_attributes(identity)
         partial.open(header, provenance, compression, store_variance=True)
-        earlier = list(partial.tally.items)
+        earlier = list(partial.finished.items)
         left = [item for item in items_of(header, part) if item not in earlier]
         for number, (sensors, lasers) in enumerate(left):
             if number == stop_after:
@@ -92,11 +90,35 @@ def write_part(
             chunks = (
                 chunk
                 for name, values in ((layout.DATA, block), (layout.VARIANCE, variance))
-                for chunk in packed_chunks(partial.chunker, name, values[inside], *corner)
+                for chunk in partial.chunker.chunks(name, values[inside], *corner)
             )
             partial.store((sensors, lasers), chunks, sums_of_unit(block[inside], variance[inside]))
-        results = summed_attributes(partial.tally.sums, BOUNCES, {"render": 0.5})
+        results = summed_attributes(partial.finished.sums, BOUNCES, {"render": 0.5})
         if selection != WHOLE:
-            results |= part_attributes(part, tiling, partial.tally)
+            results |= part_attributes(part, tiling, partial.finished)
         partial.publish(results)
     return len(earlier)
+
+
+def write_capture(
+    path: Path,
+    header: CaptureHeader,
+    block: Array | None = None,
+    variance: Array | None = None,
+    attributes: Mapping[str, object] | None = None,
+    compression: str = "gzip",
+) -> Path:
+    """Write samples (channel, bounce, laser_y, laser_x, sensor_y, sensor_x, bin), or none, over an earlier capture."""
+    samples = {
+        name: values for name, values in ((layout.DATA, block), (layout.VARIANCE, variance)) if values is not None
+    }
+    rows, columns = header.sensor_positions.shape[:2]
+    everything = Tile(0, rows, 0, columns), Tile(0, header.sizes["laser_y"], 0, header.sizes["laser_x"])
+    with PartialCapture.claim(path, {}, resume=False) as partial:
+        partial.open(header, attributes or {}, compression, store_variance=variance is not None)
+        chunks = (
+            chunk for name, values in samples.items() for chunk in partial.chunker.chunks(name, values, (0, 0), (0, 0))
+        )
+        partial.store(everything, chunks, Sums())
+        partial.publish({})
+    return path

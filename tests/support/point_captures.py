@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nlosrender.files.capture_header import CaptureHeader
-from nlosrender.files.writer import CaptureWriter
 from nlosrender.scene.pose import Pose
+from support.partial_captures import write_capture
 
 Array = NDArray[np.float64]
 Point = Sequence[float]
@@ -103,6 +103,4 @@ def write_light(path: Path, header: CaptureHeader, light: Array, **attributes: o
     block = np.stack([np.full_like(third, third.max()), third])[None]
     if len(header.bounce_indices) == 1:
         block = block[:, 1:]
-    with CaptureWriter(path, header, attributes=attributes) as writer:
-        writer.write(block)
-    return path
+    return write_capture(path, header, block, attributes=attributes)

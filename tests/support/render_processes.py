@@ -94,7 +94,7 @@ def saved_units(folder: Path) -> int:
     partial = folder / PARTIAL
     with suppress(FileNotFoundError):  # not yet, or no longer
         if any(partial.glob("samples.*")):
-            return len(JournalState.from_records(read_records(partial / "journal")).tally.items)
+            return len(JournalState.from_records(read_records(partial / "journal")).finished.items)
     return 0
 
 

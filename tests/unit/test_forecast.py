@@ -8,6 +8,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from support.partial_captures import write_capture
 from support.rendering import configured, flat_wall
 
 from nlosrender.analysis.render_plan import plan_render
@@ -44,8 +45,6 @@ def test_an_unpacked_file_has_exactly_the_size_forecast(scan_type, variance, tmp
     The grid takes several chunks per laser, the last ones of which are partly padding.
     """
     h5py = pytest.importorskip("h5py")
-    from nlosrender.files.writer import CaptureWriter
-
     config = configured(flat_wall(PLATE, scan=scan_type, sensors=(101, 97), lasers=(2, 3), bins=(0.0, 0.5, 29)))
     wall, _ = stages.place_scene(config)
     built = SimpleNamespace(wall=wall, hidden_bounds=BOX)
@@ -56,8 +55,7 @@ def test_an_unpacked_file_has_exactly_the_size_forecast(scan_type, variance, tmp
         [header.sizes[a] for a in ("channel", "bounce", "laser_y", "laser_x", "sensor_y", "sensor_x", "bin")]
     )
     block[:, 0] = 0  # the second bounce: dark, so not written
-    with CaptureWriter(tmp_path / "x.hdf5", header, compression="none", store_variance=variance) as writer:
-        writer.write(block, variance=block if variance else None)
+    write_capture(tmp_path / "x.hdf5", header, block, block if variance else None, compression="none")
     with h5py.File(tmp_path / "x.hdf5") as file:
         datasets = [file[name] for name in file]
         assert size.logical_bytes == sum(d.size * d.dtype.itemsize for d in datasets)

@@ -10,7 +10,7 @@ from nlosrender.analysis.reconstruction.reconstruct import Reconstruction
 from nlosrender.files.atomic_write import replacing
 from nlosrender.files.attributes import set_attributes
 from nlosrender.files.file_kinds import VOLUME
-from nlosrender.files.hdf5_writer import hdf5_writer
+from nlosrender.files.hdf5_writer import HDF5Writer
 from nlosrender.files.provenance import package_versions
 from nlosrender.interruption import uninterrupted
 
@@ -57,7 +57,7 @@ def write_volume(
     with (
         replacing(path, VOLUME, [reconstruction.source]) as partial,
         uninterrupted(),
-        hdf5_writer(partial) as hdf5,
+        HDF5Writer(partial) as hdf5,
     ):
         file = hdf5.file
         for name in AXES:

@@ -14,10 +14,9 @@ import h5py
 import numpy as np
 from numpy.typing import ArrayLike
 
-from nlosrender.files.chunks import CHUNK_SAMPLES
-from nlosrender.files.hdf5_writer import HDF5Writer, hdf5_writer
+from nlosrender.files.chunk_shape import CHUNK_SAMPLES
+from nlosrender.files.hdf5_writer import HDF5Writer
 from nlosrender.files.reading.scan import Float32
-from nlosrender.files.sink import CHUNK_CACHE_BYTES, LIBRARY_VERSIONS
 
 USER_BLOCK = 512  # bytes before HDF5's own
 # text, no subsystem data, version 2.0, and "MI" as a little-endian machine writes it
@@ -84,8 +83,7 @@ def new_mat73(path: Path) -> Iterator[Mat73]:
     OSError
         The disk refuses.
     """
-    options = {"userblock_size": USER_BLOCK, "libver": LIBRARY_VERSIONS, "rdcc_nbytes": CHUNK_CACHE_BYTES}
-    with hdf5_writer(path, **options) as hdf5:
+    with HDF5Writer(path, userblock_size=USER_BLOCK) as hdf5:
         yield Mat73(hdf5)
     with path.open("r+b") as stream:
         stream.write(HEADER)

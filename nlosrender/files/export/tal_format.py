@@ -11,7 +11,7 @@ import numpy as np
 
 from nlosrender.files.export.rectification import Rectification, rectification
 from nlosrender.files.export.wall_order import OrderedCapture
-from nlosrender.files.hdf5_writer import hdf5_writer
+from nlosrender.files.hdf5_writer import HDF5Writer
 from nlosrender.files.layout import Float64
 from nlosrender.files.reading.reader import StoredCapture
 from nlosrender.files.reading.scan import Scan
@@ -67,7 +67,7 @@ def write_tal(path: Path, ordered: OrderedCapture, keep_legs: bool) -> list[str]
     pairs = lasers != (1, 1)
     n_bins = scan.n_bins if move is None else move.n_bins
     columns, rows = scan.sensors.shape[1], scan.sensors.shape[0]
-    with hdf5_writer(path) as hdf5:
+    with HDF5Writer(path) as hdf5:
         file = hdf5.file
         shape = (n_bins, *(lasers[::-1] if pairs else ()), columns, rows)
         chunk = (n_bins, *((1, 1) if pairs else ()), 1, rows)

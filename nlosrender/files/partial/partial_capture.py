@@ -3,37 +3,46 @@
 A folder ``.NAME.partial`` beside the output holds the samples, an HDF5 file, and a journal. HDF5 does not survive a
 kill, its tables being in memory until it is closed, so nothing is read from them. The journal says for each finished
 work item where the bytes of its chunks lie and what their checksums are; those bytes are written once, before the
-journal's record, and never moved. From them a new HDF5 file is built when the earlier one was not closed properly.
-Work items are not fsynced: after a power failure a record may be there and its bytes not, or torn. So a resumed render
-reads the file first: a work item whose bytes fail their checksums is rendered again, and a closed file is opened again
-only when its other bytes have not changed either.
+journal's record, and never moved. From them a new HDF5 file, of the next generation, is built when the earlier one was
+not closed properly. Work items are not fsynced: after a power failure a record may be there and its bytes not, or torn.
+So a resumed render reads the file first: a work item whose bytes fail their checksums is rendered again, and a closed
+file is opened again only when its other bytes have not changed either.
+
+A file per work item, renamed into the folder, would need no generations and no offsets. But HDF5 cannot take chunks
+from another file: all samples would be written, and lie on the disk, twice by the time the output is complete.
 """
 
 from __future__ import annotations
 
+import functools
 import os
 import shutil
 import socket
 import time
+import zlib
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
 from typing import Any
 
+import h5py
+
 from nlosrender.config.canonical import tree_hash
 from nlosrender.engine.launch.passes import SavedStages
 from nlosrender.errors import FileError
+from nlosrender.files import layout
 from nlosrender.files.atomic_write import check_writable, explained_write, publish, synchronise
 from nlosrender.files.capture_header import CaptureHeader
 from nlosrender.files.chunking import Chunker, PackedChunk
 from nlosrender.files.file_kinds import CAPTURE, FileKind, same_capture
-from nlosrender.files.header_writer import root_attributes
+from nlosrender.files.hdf5_writer import HDF5Writer
+from nlosrender.files.header_writer import add_attributes, create_capture
 from nlosrender.files.identity import differences
-from nlosrender.files.partial.journal import Journal
-from nlosrender.files.partial.partial_folder import claimed_journal
+from nlosrender.files.partial.journal import Journal, claimed_journal
 from nlosrender.files.partial.stored_chunks import StoredChunks, stored_chunks
 from nlosrender.files.partial.work_item_log import (
+    Closing,
     JournalState,
     RenderState,
     StoredChunk,
@@ -43,7 +52,6 @@ from nlosrender.files.partial.work_item_log import (
     items_of,
 )
 from nlosrender.files.partial.work_item_state import PREFIX, has_states, read_state, state_path, write_state
-from nlosrender.files.sink import CaptureSink, new_capture, sample_names
 from nlosrender.files.sums import Sums
 from nlosrender.interruption import uninterrupted
 
@@ -55,48 +63,30 @@ class PartialCapture:
 
     Leaving the block releases the output. What was finished but not published is kept, so that the same render can go
     on, and so is the state of a work item in flight, in a file of its own; where there is neither, nothing is left.
+
+    Attributes
+    ----------
+    damage
+        What of the earlier render was damaged and is rendered again, in sentences.
+    chunker
+        Makes chunks of the file, once it is open.
     """
+
+    chunker: Chunker
 
     def __init__(self, path: Path, target: Path, journal: Journal):
         self.path, self.target, self.folder = path, target, journal.path.parent
-        self.damage: list[str] = []  # what of the earlier render was damaged and is rendered again, in sentences
+        self.damage: list[str] = []
         self._journal = journal
         self._state = self._read_journal()
         self._identity: dict[str, Any] = {}
-        self._replaces_others = False
-        self._sink: CaptureSink | None = None
-        self._chunker: Chunker | None = None
+        self._overwrites = False  # whether another capture may be replaced
+        self._writer: HDF5Writer | None = None
 
     @property
-    def tally(self) -> RenderState:
+    def finished(self) -> RenderState:
         """What is finished so far, by earlier runs and this one."""
-        return self._state.tally
-
-    @property
-    def sink(self) -> CaptureSink:
-        """The open file.
-
-        Raises
-        ------
-        ValueError
-            It is not open.
-        """
-        if self._sink is None:
-            raise ValueError(f"{self.path}: is not open")
-        return self._sink
-
-    @property
-    def chunker(self) -> Chunker:
-        """What makes chunks of the open file.
-
-        Raises
-        ------
-        ValueError
-            It is not open.
-        """
-        if self._chunker is None:
-            raise ValueError(f"{self.path}: is not open")
-        return self._chunker
+        return self._state.finished
 
     @classmethod
     def claim(cls, path: str | Path, identity: Mapping[str, Any], resume: bool | None = None) -> PartialCapture:
@@ -136,44 +126,33 @@ class PartialCapture:
         Parameters
         ----------
         header, attributes, compression, store_variance
-            As for ``CaptureWriter``.
+            As for ``create_capture``.
 
         Raises
         ------
         FileError
             The disk refuses.
         """
-        self._chunker = Chunker(header, compression)
-
-        def create() -> CaptureSink:
-            sink = new_capture(self._samples(), self.path, header, compression, store_variance)
-            try:
-                sink.set_attributes(attributes)
-            except BaseException:
-                sink.abandon()
-                raise
-            return sink
-
-        if self.tally.items and self._state.closed and self._is_whole():
+        self.chunker, self._header = Chunker(header, compression), header
+        create = functools.partial(
+            create_capture,
+            header=header,
+            attributes=attributes,
+            compression=compression,
+            store_variance=store_variance,
+        )
+        if self.finished.items and self._state.closed and self._is_whole():
             # on the disk before HDF5 changes its tables: a closed file's are believed
             self._note({"opened": True}, durable=True)
-            names = sample_names(store_variance)
-            self._sink = CaptureSink(self._samples(), self.path, names, reserved=root_attributes(header))
-            return
-        if not self.tally.items:
-            self._note(
-                {
-                    "identity": self._identity,
-                    "overwrite": self._replaces_others,
-                    "process": os.getpid(),
-                    "machine": socket.gethostname(),
-                }
-            )
+            self._open_samples()
+        elif self.finished.items:
+            self._rebuild(create)
+        else:
+            begun_by = {"process": os.getpid(), "machine": socket.gethostname()}
+            self._note({"identity": self._identity, "overwrite": self._overwrites, **begun_by})
             with explained_write(self.path):  # without a finished work item it means nothing
                 self._samples().unlink(missing_ok=True)
-            self._sink = create()
-            return
-        self._rebuild(create)
+            self._open_samples(create)
 
     def store(self, item: WorkItemKey, chunks: Iterable[PackedChunk], sums: Sums) -> tuple[float, float]:
         """Write a work item and note that it is finished.
@@ -204,10 +183,13 @@ class PartialCapture:
         writing = 0.0
         for chunk in chunks:
             packed = time.perf_counter()
-            stored.append(self.sink.put(chunk))
+            with explained_write(self.path):
+                offset = self._open_writer.put_chunk(self._datasets[chunk.dataset], chunk.at, chunk.content)
+            length, checksum = len(chunk.content), zlib.crc32(chunk.content)
+            stored.append(StoredChunk(chunk.dataset, chunk.at, offset, length, checksum))
             writing += time.perf_counter() - packed
         self._note(item_record(self._state.generation, item, stored, sums))
-        self.tally.add(item, stored, sums)
+        self.finished.add(item, stored, sums)
         with suppress(OSError):
             state_path(self.folder, item).unlink(missing_ok=True)
         return time.perf_counter() - begun - writing, writing
@@ -220,7 +202,7 @@ class PartialCapture:
     @property
     def is_resumable(self) -> bool:
         """Whether a later render can go on with something: finished work items, or a state of one in flight."""
-        return bool(self.tally.items) or self.has_states
+        return bool(self.finished.items) or self.has_states
 
     def keep_state(self, item: WorkItemKey, budget: Mapping[str, Any], kept: SavedStages) -> None:
         """Write what there is of a work item in flight, instead of what was written of it before.
@@ -257,18 +239,18 @@ class PartialCapture:
             The disk refuses.
         """
         self._kind.refuse_others(self.path, self.target)  # while there is still something to go on with
-        self.sink.set_attributes(attributes)
-        self.sink.close()
-        with uninterrupted(), explained_write(self.path):
-            publish(self.path, self._samples(), self.target, self._kind)
+        with explained_write(self.path):
+            with self._open_writer.writing():
+                add_attributes(self._open_writer.file, self._header, attributes)
+            self._open_writer.close()
+            with uninterrupted():
+                publish(self.path, self._samples(), self.target, self._kind)
         self.discard()
 
     def discard(self) -> None:
         """Remove everything; nothing is raised."""
         with uninterrupted():
-            if self._sink is not None:
-                self._sink.abandon()
-                self._sink = None
+            self._abandon()
             self._state = JournalState()
             for leftover in self.folder.glob("samples.*"):  # first: without them the journal means nothing
                 with suppress(OSError):
@@ -296,16 +278,17 @@ class PartialCapture:
             return JournalState()
 
     def _begin(self, identity: dict[str, Any], resume: bool | None) -> None:
+        """Refuse what is not this render's; where there is nothing to go on with, clear the folder."""
         is_begun = self.has_states and bool(self._state.first)
-        exists = self._samples().exists() if self.tally.items else is_begun
+        exists = self._samples().exists() if self.finished.items else is_begun
         if resume is True and not exists:
             hint = " It is complete: leave out --resume to render it again." if self.target.exists() else ""
             hint = f" {self._journal.path} is damaged: leave out --resume to begin anew." if self.damage else hint
             raise FileError(f"{self.path}: there is no unfinished render to resume.{hint}")
         if exists and resume is not False:
             self._refuse_other(identity)
-            self._replaces_others = bool(self._state.first.get("overwrite"))  # as the first run was allowed to
-        self._identity, self._replaces_others = identity, self._replaces_others or resume is False
+            self._overwrites = bool(self._state.first.get("overwrite"))  # as the first run was allowed to
+        self._identity, self._overwrites = identity, self._overwrites or resume is False
         self._kind.refuse_others(self.path, self.target)
         if not exists or resume is False:
             with explained_write(self.path):
@@ -319,7 +302,7 @@ class PartialCapture:
     @property
     def _kind(self) -> FileKind:
         """What the output may replace."""
-        if self._replaces_others or not self._identity:
+        if self._overwrites or not self._identity:
             return CAPTURE
         config = self._identity["config"]
         return same_capture(tree_hash(config), str(self._identity["part"]), config)
@@ -336,42 +319,62 @@ class PartialCapture:
 
     def _is_whole(self) -> bool:
         """Return whether the closed file is, to the last byte, what was written."""
-        chunks = (chunk for _, chunks, _ in self._stored_units() for chunk in chunks)
         with explained_write(self.path), stored_chunks(self._samples()) as stored:
-            if stored.closing(chunks) != self._state.closed:
+            if self._closing(stored) != self._state.closed:
                 self.damage.append(f"{self._samples()}: is damaged; it is built anew from the units that are whole.")
                 return False
-            return all(stored.has(chunks) for _, chunks, _ in self._stored_units())
+            return all(stored.has(chunks) for _, chunks, _ in self._stored_items())
 
-    def _stored_units(self) -> Iterator[tuple[WorkItemKey, list[StoredChunk], Sums]]:
+    def _closing(self, stored: StoredChunks) -> Closing:
+        return stored.closing(chunk for _, chunks, _ in self._stored_items() for chunk in chunks)
+
+    def _stored_items(self) -> Iterator[tuple[WorkItemKey, list[StoredChunk], Sums]]:
         return items_of(self._journal.records(), self._state.generation)
 
-    def _rebuild(self, create: Callable[[], CaptureSink]) -> None:
+    def _open_samples(self, create: Callable[[h5py.File], None] | None = None) -> None:
+        """Open the samples' file as it was closed, or a new one that ``create`` fills with everything but light."""
+        with explained_write(self.path):
+            self._writer = HDF5Writer(self._samples(), reopen=create is None)
+            file = self._writer.file
+            with self._writer.writing():
+                if create is not None:
+                    create(file)
+                self._datasets = {name: file[name] for name in layout.sample_names(layout.VARIANCE in file)}
+
+    @property
+    def _open_writer(self) -> HDF5Writer:
+        if self._writer is None:
+            raise ValueError(f"{self.path}: is not open")
+        return self._writer
+
+    def _abandon(self) -> None:
+        if self._writer is not None:
+            self._writer.abandon()
+            self._writer = None
+
+    def _rebuild(self, create: Callable[[h5py.File], None]) -> None:
         """Copy the work items whose bytes are whole into a new file."""
         old, earlier = self._samples(), self._state
-        state = JournalState(earlier.first, generation=earlier.newest + 1, newest=earlier.newest + 1)
         for leftover in self.folder.glob("samples.*"):  # of an attempt that failed
             if leftover != old:
                 leftover.unlink()
-        self._state = state
+        self._state = JournalState(earlier.first, generation=earlier.newest + 1, newest=earlier.newest + 1)
         try:
-            self._sink = create()
+            self._open_samples(create)
             with explained_write(self.path), stored_chunks(old) as stored:
                 for item, chunks, sums in items_of(self._journal.records(), earlier.generation):
                     if stored.has(chunks):
                         self.store(item, _copies(stored, chunks), sums)
-            lost = len(earlier.tally.items) - len(self.tally.items)
+            lost = len(earlier.finished.items) - len(self.finished.items)
             if lost:
-                of_all = f"{lost} of {len(earlier.tally.items)} finished units"
+                of_all = f"{lost} of {len(earlier.finished.items)} finished units"
                 self.damage.append(f"{old}: {of_all} are damaged on the disk and are rendered again.")
             with explained_write(self.path):
                 synchronise(self._samples())  # before the old file goes: its work items would have to be done again
-            self._note({"switched_to": state.generation}, durable=True)
+            self._note({"switched_to": self._state.generation}, durable=True)
         except BaseException:
             # the old file still counts
-            if self._sink is not None:
-                self._sink.abandon()
-                self._sink = None
+            self._abandon()
             self._state = earlier
             raise
         with suppress(OSError):
@@ -383,24 +386,15 @@ class PartialCapture:
             if not self.is_resumable:
                 self.discard()
                 return
-            if self._sink is not None and not self.tally.items:
-                self._sink.abandon()  # it is begun anew
-                self._sink = None
-            if self._sink is not None:
-                try:
-                    self._sink.close()
-                    with explained_write(self.path):
-                        synchronise(self._samples())
-                        self._note(self._closing(), durable=True)
-                except FileError:  # the journal knows enough to build the file anew
-                    self._sink.abandon()
-                self._sink = None
+            if self._writer is not None and self.finished.items:
+                # where the disk refuses, the journal knows enough to build the file anew
+                with suppress(FileError), explained_write(self.path):
+                    self._writer.close()
+                    synchronise(self._samples())
+                    with stored_chunks(self._samples()) as stored:
+                        self._note(closing_record(self._closing(stored)), durable=True)
+            self._abandon()
             self._journal.close()
-
-    def _closing(self) -> dict[str, Any]:
-        chunks = (chunk for _, chunks, _ in self._stored_units() for chunk in chunks)
-        with stored_chunks(self._samples()) as stored:
-            return closing_record(stored.closing(chunks))
 
     def _tag(self, budget: Mapping[str, Any]) -> str:
         return tree_hash({"identity": self._identity, "budget": dict(budget)})

@@ -20,43 +20,25 @@ READ_BYTES = 2**20  # of what is no chunk, at a time
 
 
 class StoredChunks:
-    """A file of samples open for reading; made by ``stored_chunks``."""
+    """A file of samples open for reading; made by ``stored_chunks``. Its methods raise OSError from the disk."""
 
     def __init__(self, descriptor: int):
         self._descriptor = descriptor
         self.size = os.fstat(descriptor).st_size
 
     def content(self, chunk: StoredChunk) -> bytes | None:
-        """Return the bytes of a chunk as they were written; None where the file has other ones.
-
-        Raises
-        ------
-        OSError
-            The disk cannot be read.
-        """
+        """Return the bytes of a chunk as they were written; None where the file has other ones."""
         if chunk.offset < 0 or not 0 <= chunk.length <= self.size - chunk.offset:
             return None
         content = os.pread(self._descriptor, chunk.length, chunk.offset)
         return content if isal_zlib.crc32(content) == chunk.checksum else None
 
     def has(self, chunks: Iterable[StoredChunk]) -> bool:
-        """Return whether all of these chunks are as they were written.
-
-        Raises
-        ------
-        OSError
-            The disk cannot be read.
-        """
+        """Return whether all of these chunks are as they were written."""
         return all(self.content(chunk) is not None for chunk in chunks)
 
     def closing(self, chunks: Iterable[StoredChunk]) -> Closing:
-        """Return what tells whether anything but ``chunks`` has changed since: size, and checksum of the rest.
-
-        Raises
-        ------
-        OSError
-            The disk cannot be read.
-        """
+        """Return what tells whether anything but ``chunks`` has changed since: size, and checksum of the rest."""
         checksum = 0
         for start, stop in self._gaps(chunks):
             for position in range(start, stop, READ_BYTES):
@@ -79,13 +61,7 @@ class StoredChunks:
 
 @contextmanager
 def stored_chunks(path: Path) -> Iterator[StoredChunks]:
-    """Open a file of samples for reading.
-
-    Raises
-    ------
-    OSError
-        There is none, or it is a symbolic link.
-    """
+    """Open a file of samples for reading; OSError where there is none, or a symbolic link."""
     descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW)
     try:
         yield StoredChunks(descriptor)

@@ -35,7 +35,7 @@ class Closing:
 
 @dataclass
 class RenderState:
-    """What is finished."""
+    """The finished work items of a render, and sums over them."""
 
     items: list[WorkItemKey] = field(default_factory=list)
     sums: Sums = field(default_factory=Sums)
@@ -60,7 +60,7 @@ class JournalState:
     generation: int = 0  # of the file that holds the samples
     newest: int = 0  # generation that was ever begun
     closed: Closing | None = None  # that file as HDF5 has closed it; None: it has not
-    tally: RenderState = field(default_factory=RenderState)
+    finished: RenderState = field(default_factory=RenderState)
 
     @classmethod
     def from_records(cls, records: Iterable[Record]) -> JournalState:
@@ -72,7 +72,7 @@ class JournalState:
             They are not those of a render.
         """
         state = cls()
-        tallies: dict[int, RenderState] = {}
+        generations: dict[int, RenderState] = {}
         try:
             for record in records:
                 closed = record.get("closed")
@@ -83,11 +83,11 @@ class JournalState:
                     state.generation = record["switched_to"]
                 if "unit" in record:
                     state.newest = max(state.newest, record["generation"])
-                    tallies.setdefault(record["generation"], RenderState()).add(*item_of(record))
+                    generations.setdefault(record["generation"], RenderState()).add(*item_of(record))
             state.newest = max(state.newest, state.generation)
         except (KeyError, TypeError, AttributeError, RecursionError) as error:
             raise ValueError(f"no record of a render: {error!r}") from error
-        state.tally = tallies.get(state.generation, RenderState())
+        state.finished = generations.get(state.generation, RenderState())
         return state
 
 

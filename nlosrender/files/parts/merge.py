@@ -6,7 +6,6 @@ import json
 import shutil
 import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
@@ -20,9 +19,10 @@ from nlosrender.capture.tile import Tile
 from nlosrender.config.canonical import tree_hash
 from nlosrender.errors import FileError
 from nlosrender.files import layout
-from nlosrender.files.atomic_write import check_writable, explained_write, new_partial, publish
-from nlosrender.files.chunking import PackedChunk
+from nlosrender.files.atomic_write import check_writable, explained_write, replacing
+from nlosrender.files.attributes import set_attributes
 from nlosrender.files.file_kinds import CAPTURE, FileKind, same_capture
+from nlosrender.files.hdf5_writer import HDF5Writer
 from nlosrender.files.identity import SELECTION
 from nlosrender.files.partial.work_item_log import CHECKSUM_RANGE, placed_checksum
 from nlosrender.files.parts.part_attributes import (
@@ -40,7 +40,6 @@ from nlosrender.files.parts.part_attributes import (
 )
 from nlosrender.files.parts.shards import Shard, read_shards
 from nlosrender.files.reading.reader import explained_read, open_hdf5
-from nlosrender.files.sink import CaptureSink, sample_names
 from nlosrender.files.sums import Sums
 from nlosrender.interruption import uninterrupted
 
@@ -91,30 +90,18 @@ def merge_captures(
     output = Path(output)
     check_writable(output, CAPTURE, paths)
     shards = read_shards([Path(path) for path in paths])
-    kind = CAPTURE if overwrite else _whole(shards[0])
-    target = check_writable(output, kind, paths)
-    with explained_write(output):
-        partial = new_partial(target)
-    sink: CaptureSink | None = None
-    try:
-        with uninterrupted(), explained_write(output):
-            shutil.copyfile(shards[0].path, partial)  # its samples included
-        sink = CaptureSink(partial, output, sample_names(shards[0].header.has_variance))
-        for number, shard in enumerate(shards):
-            _copy(shard, None if number == 0 else sink)
-            progress((number + 1) / len(shards))
-        sums, bounces = sum((shard.stored.sums for shard in shards), Sums()), _bounces(shards[0])
-        sink.remove_attributes((PART, SUMS, CHECKSUMS, NOTE, ZERO, SELECTION))
-        sink.set_attributes(_attributes(shards, sums, output))
-        sink.close()
-        with uninterrupted(), explained_write(output):
-            publish(output, partial, target, kind)
-    finally:
+    sums, bounces = sum((shard.stored.sums for shard in shards), Sums()), _bounces(shards[0])
+    with replacing(output, CAPTURE if overwrite else _whole(shards[0]), paths) as partial:
         with uninterrupted():
-            if sink is not None:
-                sink.abandon()
-            with suppress(OSError):
-                partial.unlink(missing_ok=True)
+            shutil.copyfile(shards[0].path, partial)  # its samples included
+        with HDF5Writer(partial, reopen=True) as writer:
+            for number, shard in enumerate(shards):
+                _copy(shard, None if number == 0 else writer, output)
+                progress((number + 1) / len(shards))
+            with writer.writing():
+                for name in (PART, SUMS, CHECKSUMS, NOTE, ZERO, SELECTION):
+                    writer.file.attrs.pop(name, None)
+                set_attributes(writer.file, _attributes(shards, sums, output))
     return MergeReport(
         output=output,
         parts=len(shards),
@@ -135,8 +122,8 @@ def _whole(shard: Shard) -> FileKind:
     return same_capture(str(attributes.get("capture_hash")), str(WHOLE), json_object(attributes.get("config")))
 
 
-def _copy(shard: Shard, sink: CaptureSink | None) -> None:
-    """Copy a shard's chunks, or only check that they are what was rendered.
+def _copy(shard: Shard, writer: HDF5Writer | None, output: Path) -> None:
+    """Copy a shard's chunks into ``output``, or without a writer only check that they are what was rendered.
 
     Raises
     ------
@@ -145,7 +132,7 @@ def _copy(shard: Shard, sink: CaptureSink | None) -> None:
     """
     whole = set(shard.tiling.tiles())
     with open_hdf5(shard.path) as file, explained_read(shard.path):
-        for name in sample_names(shard.header.has_variance):
+        for name in layout.sample_names(shard.header.has_variance):
             samples: h5py.Dataset = file[name]
             existing: set[tuple[int, ...]] = set()
             # not one by one: HDF5 goes through all chunks for each
@@ -157,11 +144,17 @@ def _copy(shard: Shard, sink: CaptureSink | None) -> None:
                 _, content = samples.id.read_direct_chunk(chunk)
                 checksum += placed_checksum(chunk, zlib.crc32(content))
                 found += 1
-                if sink is not None and cell in whole:
-                    sink.put(PackedChunk(name, chunk, content))
-                elif sink is not None:  # the rest of this chunk is another shard's
+                if writer is None:
+                    continue
+                target: h5py.Dataset = writer.file[name]
+                if cell in whole:
+                    with explained_write(output):
+                        writer.put_chunk(target, chunk, content)
+                else:  # the rest of this chunk is another shard's
                     where = _selection(shard, cell, chunk)
-                    sink.fill(name, where, np.asarray(samples[where], dtype=np.float32))
+                    light = np.asarray(samples[where], dtype=np.float32)
+                    with explained_write(output):
+                        writer.fill(target, where, light)
             damaged = checksum % CHECKSUM_RANGE != shard.stored.checksum.get(name, 0)
             if damaged or found != len(existing):
                 message = f"{shard}: is damaged: its {name} is not what was rendered."

@@ -4,12 +4,30 @@ from __future__ import annotations
 
 import errno
 import fcntl
+from contextlib import suppress
 from pathlib import Path
 
 import h5py
 
 # What locking a file answers there. Two renders into one file are then the user's to avoid.
 NO_LOCKS = (errno.ENOSYS, errno.EOPNOTSUPP, errno.ENOLCK, errno.EINVAL)
+
+
+def locked(descriptor: int, kind: int) -> bool:
+    """Lock an open file with ``LOCK_SH`` or ``LOCK_EX``, without waiting; False: its file system has no locks.
+
+    Raises
+    ------
+    OSError
+        It cannot be locked; BlockingIOError where another process has the lock.
+    """
+    try:
+        fcntl.flock(descriptor, kind | fcntl.LOCK_NB)
+    except OSError as error:
+        if error.errno not in NO_LOCKS:
+            raise
+        return False
+    return True
 
 
 def open_for_reading(path: Path) -> h5py.File:
@@ -20,14 +38,8 @@ def open_for_reading(path: Path) -> h5py.File:
     OSError
         It cannot be read.
     """
+    has_locks = True
+    with path.open("rb") as stream, suppress(OSError):  # HDF5 says itself who has the lock
+        has_locks = locked(stream.fileno(), fcntl.LOCK_SH)
     # found out here, not by trying: HDF5 opens a file a second time only with the same setting
-    return h5py.File(path, "r", locking=_has_locks(path))
-
-
-def _has_locks(path: Path) -> bool:
-    with path.open("rb") as stream:
-        try:
-            fcntl.flock(stream, fcntl.LOCK_SH | fcntl.LOCK_NB)
-        except OSError as error:
-            return error.errno not in NO_LOCKS
-    return True
+    return h5py.File(path, "r", locking=has_locks)

@@ -25,11 +25,10 @@ from nlosrender.errors import EXIT_FAILURE, DiskError, FileError
 from nlosrender.files.atomic_write import partial_folder, replacing
 from nlosrender.files.dataset_index import write_index
 from nlosrender.files.export.export import export_capture
-from nlosrender.files.file_kinds import PLY
+from nlosrender.files.file_kinds import CAPTURE, PLY
 from nlosrender.files.partial.partial_capture import PartialCapture
 from nlosrender.files.parts.merge import merge_captures
 from nlosrender.files.reading.reader import open_capture, read_header
-from nlosrender.files.writer import CaptureWriter
 
 THESIS = "\\documentclass{thesis} ten years of work"
 OTHER = {**CONFIG, "render": {"spp": 16}}
@@ -239,13 +238,13 @@ def test_a_folder_of_another_user_is_refused(
         write_part(path, header_of(), block_of(header_of()))
 
 
-def test_a_name_for_the_unfinished_file_is_not_guessed(tmp_path: Path, header_of: Callable) -> None:
+def test_a_name_for_the_unfinished_file_is_not_guessed(tmp_path: Path) -> None:
     """A link under the name that the file had by the number of the process leads nowhere."""
     victim = tmp_path / "victim"
     victim.write_text(THESIS)
     (tmp_path / f".a.hdf5.{os.getpid()}.partial").symlink_to(victim)
-    with CaptureWriter(tmp_path / "a.hdf5", header_of()):
-        pass
+    with replacing(tmp_path / "a.hdf5", CAPTURE) as partial:
+        partial.write_text("capture")
     assert victim.read_text() == THESIS
 
 

@@ -11,8 +11,10 @@ import h5py
 import numpy as np
 import pytest
 
+from nlosrender.files.atomic_write import replacing
 from nlosrender.files.deferred_error_file import DeferredErrorFile
-from nlosrender.files.writer import CaptureWriter
+from nlosrender.files.file_kinds import CAPTURE
+from nlosrender.files.hdf5_writer import HDF5Writer
 from nlosrender.interruption import uninterrupted
 
 
@@ -77,9 +79,7 @@ def test_interrupts_wait() -> None:
     assert signal.getsignal(signal.SIGINT) is before
 
 
-def test_an_interrupted_write_leaves_nothing(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, header_of: Callable
-) -> None:
+def test_an_interrupted_write_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Ctrl-C in the middle of HDF5's own writing ends the writer as Ctrl-C anywhere else does."""
     true_write = os.pwrite
     events: list[str] = []
@@ -90,14 +90,13 @@ def test_an_interrupted_write_leaves_nothing(
         events.append("end")
         return true_write(descriptor, content, offset)
 
-    # no cache: every chunk is written at once
-    monkeypatch.setattr("nlosrender.files.sink.CHUNK_CACHE_BYTES", 0)
-
     def render() -> None:
-        with CaptureWriter(tmp_path / "a.hdf5", header_of("single", n_bins=50_000), compression="none") as writer:
+        # no cache: every chunk is written at once
+        with replacing(tmp_path / "a.hdf5", CAPTURE) as partial, HDF5Writer(partial, cache_bytes=0) as writer:
+            samples = writer.file.create_dataset("data", (20, 50_000), "f4", chunks=(1, 50_000))
             monkeypatch.setattr(os, "pwrite", interrupted)
             for _ in range(3):
-                writer.write(np.ones((1, 2, 1, 1, 4, 5, 50_000)))
+                writer.fill(samples, np.s_[:], np.ones((20, 50_000)))
 
     with pytest.raises(KeyboardInterrupt):
         render()

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import re
 import resource
 import signal
 import sys
@@ -14,11 +13,14 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
+from support.partial_captures import write_capture as write_samples
 
 from nlosrender.errors import FileError, RenderError
+from nlosrender.files.atomic_write import check_writable
+from nlosrender.files.chunking import Chunker
 from nlosrender.files.file_kinds import CAPTURE
+from nlosrender.files.partial.partial_capture import PartialCapture
 from nlosrender.files.provenance import provenance_attributes
-from nlosrender.files.writer import CaptureWriter, check_writable
 from nlosrender.scene.pose import Pose
 
 FLOATS = [
@@ -49,8 +51,7 @@ def test_every_sample_lands_where_the_layout_says(
     """data[c, t, file index, sy, sx, ly, lx] is block[c, slot, ly, lx, sy, sx, t]; all other bounces are zero."""
     header = header_of("exhaustive", n_channels=channels, bounce_indices=(1, 3), max_bounces=5)
     block = block_of(header)
-    with CaptureWriter(tmp_path / "a.hdf5", header, attributes={}, compression=compression) as writer:
-        writer.write(block)
+    write_samples(tmp_path / "a.hdf5", header, block, compression=compression)
     with h5py.File(tmp_path / "a.hdf5") as file:
         stored = file["data"][()]
     assert stored.shape == (channels, 7, 6, 4, 5, 2, 3)
@@ -75,37 +76,11 @@ def test_rank_of_single_and_confocal(
     np.testing.assert_array_equal(stored.reshape(7, 6, 4, 5)[:, :2], np.moveaxis(block[0, :, 0, 0], -1, 0))
 
 
-def test_pieces_in_any_order_give_the_same_file(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, header_of: Callable, block_of: Callable
-) -> None:
-    """Blocks of one laser and parts of the sensor grid, shuffled and smaller than the chunks, add up to the whole."""
-    monkeypatch.setattr("nlosrender.files.chunks.CHUNK_SAMPLES", 7 * 2 * 3)  # tiles of 2 x 3 of the 4 x 5 sensors
-    header = header_of()
-    block = block_of(header)
-    pieces = [(ly, lx, sy, sx) for ly in range(2) for lx in range(3) for sy in (0, 1) for sx in (0, 2, 4)]
-    np.random.default_rng(3).shuffle(pieces)
-    with CaptureWriter(tmp_path / "a.hdf5", header, store_variance=True) as writer:
-        for ly, lx, sy, sx in pieces:
-            rows, columns = (slice(0, 1), slice(1, 4))[sy], slice(sx, min(sx + 2, 5))
-            piece = block[:, :, ly : ly + 1, lx : lx + 1, rows, columns].astype(np.float64)
-            writer.write(piece, laser_at=(ly, lx), sensor_at=(rows.start, sx), variance=2 * piece)
-    with h5py.File(tmp_path / "a.hdf5") as file:
-        assert file["data"].chunks == (1, 7, 1, 2, 3, 1, 1)
-        for name, factor in (("data", 1), ("variance", 2)):
-            stored = np.transpose(file[name][()], (0, 2, 5, 6, 3, 4, 1))
-            np.testing.assert_array_equal(stored[:, :2], np.float32(factor) * block)
-            assert not stored[:, 2:].any()
-
-
-def test_long_histograms_are_cut_along_time(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, header_of: Callable
-) -> None:
+def test_long_histograms_are_cut_along_time(tmp_path: Path, header_of: Callable) -> None:
     """Bins beyond a chunk's length go into further chunks."""
-    monkeypatch.setattr("nlosrender.files.chunks.CHUNK_SAMPLES", 3)
-    header = header_of("single")
+    header = header_of("single", chunk_samples=3)
     block = np.random.default_rng(5).random((1, 2, 1, 1, 4, 5, 7))
-    with CaptureWriter(tmp_path / "a.hdf5", header) as writer:
-        writer.write(block)
+    write_samples(tmp_path / "a.hdf5", header, block)
     with h5py.File(tmp_path / "a.hdf5") as file:
         assert file["data"].chunks == (1, 3, 1, 1, 1, 1, 1)
         np.testing.assert_array_equal(file["data"][0, :, 1, 2, 3, 0, 0], block[0, 1, 0, 0, 2, 3].astype(np.float32))
@@ -230,33 +205,13 @@ def test_unsplit_light_is_named(tmp_path: Path, header_of: Callable, write_captu
 
 def test_layout_attributes_cannot_be_replaced(tmp_path: Path, header_of: Callable) -> None:
     """A caller's attribute that the layout owns is refused, early and late."""
-    with (
-        pytest.raises(ValueError, match="attributes: engine, frame already set"),
-        CaptureWriter(tmp_path / "a.hdf5", header_of(), attributes={"frame": "x", "engine": "path"}),
-    ):
-        pass
-    with (
-        CaptureWriter(tmp_path / "a.hdf5", header_of()) as writer,
-        pytest.raises(ValueError, match="units already set"),
-    ):
-        writer.set_attributes({"units": "feet"})
-
-
-def test_dark_chunks_take_no_space(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, header_of: Callable) -> None:
-    """Only chunks that hold light exist; zeros written over light do replace it."""
-    monkeypatch.setattr("nlosrender.files.chunks.CHUNK_SAMPLES", 7 * 4)  # tiles of 2 x 2
-    block = np.zeros((1, 2, 2, 3, 4, 5, 7), dtype=np.float32)
-    block[0, 1, 1, 2, 3, 4, 6] = 1.0
-    with CaptureWriter(tmp_path / "a.hdf5", header_of()) as writer:
-        writer.write(block)
-    with h5py.File(tmp_path / "a.hdf5") as file:
-        assert file["data"].id.get_num_chunks() == 1
-        assert file["data"][()].sum() == 1
-    with CaptureWriter(tmp_path / "b.hdf5", header_of()) as writer:
-        writer.write(block)
-        writer.write(np.zeros_like(block))
-    with h5py.File(tmp_path / "b.hdf5") as file:
-        assert file["data"][()].sum() == 0
+    with pytest.raises(ValueError, match="attributes: engine, frame already set"):
+        write_samples(tmp_path / "a.hdf5", header_of(), attributes={"frame": "x", "engine": "path"})
+    with PartialCapture.claim(tmp_path / "a.hdf5", {}) as partial:
+        partial.open(header_of(), {}, "gzip", store_variance=False)
+        with pytest.raises(ValueError, match="units already set"):
+            partial.publish({"units": "feet"})
+    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize(("value", "word"), [(np.nan, "nan"), (np.inf, "inf"), (-np.inf, "-inf"), (1e39, "inf")])
@@ -267,8 +222,11 @@ def test_non_finite_samples_are_named_and_leave_no_file(
     block = block_of(header_of()).astype(np.float64)[:, :, 1:, 1:, 1:, 2:]
     block[0, 1, 0, 1, 2, 1, 6] = value
     message = rf"data is {word} at laser \(1, 2\), sensor \(3, 3\), bin 6, bounce 3, channel 0"
-    with pytest.raises(RenderError, match=message), CaptureWriter(tmp_path / "a.hdf5", header_of()) as writer:
-        writer.write(block, laser_at=(1, 1), sensor_at=(1, 2))
+    with pytest.raises(RenderError, match=message):
+        list(Chunker(header_of(), "gzip").chunks("data", block, laser_at=(1, 1), sensor_at=(1, 2)))
+    whole = np.full((1, 2, 2, 3, 4, 5, 7), value)
+    with pytest.raises(RenderError, match=f"data is {word} at laser"):
+        write_samples(tmp_path / "a.hdf5", header_of(), whole)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -276,11 +234,8 @@ def test_non_finite_variance_is_refused(tmp_path: Path, header_of: Callable, blo
     """The variance is held to the same rule, also where its chunk is dark in data."""
     block = block_of(header_of())
     variance = block * np.float32(np.nan)
-    with (
-        pytest.raises(RenderError, match="variance is nan at laser"),
-        CaptureWriter(tmp_path / "a.hdf5", header_of(), store_variance=True) as writer,
-    ):
-        writer.write(block, variance=variance)
+    with pytest.raises(RenderError, match="variance is nan at laser"):
+        write_samples(tmp_path / "a.hdf5", header_of(), 0 * block, variance)
 
 
 @pytest.mark.parametrize("failure", [RuntimeError("engine"), KeyboardInterrupt()])
@@ -293,8 +248,8 @@ def test_failure_keeps_the_earlier_file(
     before = path.read_bytes()
 
     def render() -> None:
-        with CaptureWriter(path, header_of("confocal")) as writer:
-            writer.write(np.ones((1, 2, 1, 1, 4, 5, 7)))
+        with PartialCapture.claim(path, {}, resume=False) as partial:
+            partial.open(header_of("confocal"), {}, "gzip", store_variance=False)
             raise failure
 
     with pytest.raises(type(failure)):
@@ -306,8 +261,10 @@ def test_failure_keeps_the_earlier_file(
 def test_file_appears_only_when_complete(tmp_path: Path, header_of: Callable) -> None:
     """While it is written the file has another name, in the same folder."""
     path = tmp_path / "a.hdf5"
-    with CaptureWriter(path, header_of()):
-        assert all(re.fullmatch(r"\.a\.hdf5\.\w+\.partial", entry.name) for entry in tmp_path.iterdir())
+    with PartialCapture.claim(path, {}) as partial:
+        partial.open(header_of(), {}, "gzip", store_variance=False)
+        assert [entry.name for entry in tmp_path.iterdir()] == [".a.hdf5.partial"]
+        partial.publish({})
     assert [entry.name for entry in tmp_path.iterdir()] == ["a.hdf5"]
 
 
@@ -321,43 +278,10 @@ def test_a_symbolic_link_stays_one(tmp_path: Path, header_of: Callable, write_ca
     assert h5py.is_hdf5(tmp_path / "disk" / "real.hdf5")
 
 
-@pytest.mark.parametrize(
-    ("shape", "laser_at", "sensor_at", "message"),
-    [
-        ((1, 2, 2, 3, 4, 5), (0, 0), (0, 0), "block: got float64"),
-        ((1, 2, 1, 1, 4, 5, 6), (0, 0), (0, 0), "block: 6 from 0 along bin does not fit, its length is 7"),
-        ((1, 1, 1, 1, 4, 5, 7), (0, 0), (0, 0), "along bounce"),
-        ((1, 2, 1, 1, 4, 5, 7), (2, 0), (0, 0), "block: 1 from 2 along laser_y does not fit, its length is 2"),
-        ((1, 2, 1, 2, 4, 5, 7), (0, 2), (0, 0), "block: 2 from 2 along laser_x"),
-        ((1, 2, 1, 1, 4, 5, 7), (0, 0), (1, 0), "block: 4 from 1 along sensor_y"),
-        ((1, 2, 1, 1, 1, 1, 7), (0, 0), (0, -1), "block: 1 from -1 along sensor_x"),
-    ],
-)
-def test_blocks_that_do_not_fit(
-    tmp_path: Path, header_of: Callable, shape: tuple, laser_at: tuple, sensor_at: tuple, message: str
-) -> None:
-    """A block outside the capture is refused, never clipped."""
-    with CaptureWriter(tmp_path / "a.hdf5", header_of()) as writer, pytest.raises(ValueError, match=message):
-        writer.write(np.ones(shape), laser_at=laser_at, sensor_at=sensor_at)
-
-
-def test_integer_samples_and_stray_variance_are_refused(
-    tmp_path: Path, header_of: Callable, block_of: Callable
-) -> None:
-    """Samples are floats; variance comes exactly when it is stored."""
-    block = block_of(header_of())
-    with CaptureWriter(tmp_path / "a.hdf5", header_of()) as writer:
-        with pytest.raises(ValueError, match="block: got int64"):
-            writer.write(np.ones(block.shape, dtype=np.int64))
-        with pytest.raises(ValueError, match="variance: needed exactly when"):
-            writer.write(block, variance=block)
-    with CaptureWriter(tmp_path / "a.hdf5", header_of(), store_variance=True) as writer:
-        with pytest.raises(ValueError, match="variance: needed exactly when"):
-            writer.write(block)
-        with pytest.raises(ValueError, match="variance: got shape"):
-            writer.write(block, variance=block[..., :-1])
+def test_an_unknown_compression_is_refused(header_of: Callable) -> None:
+    """Only what every HDF5 build reads."""
     with pytest.raises(ValueError, match="compression: got 'lzf', need one of gzip, none"):
-        CaptureWriter(tmp_path / "a.hdf5", header_of(), compression="lzf")
+        Chunker(header_of(), compression="lzf")
 
 
 def test_gzip_with_shuffle_only(tmp_path: Path, header_of: Callable, write_capture: Callable) -> None:
@@ -394,14 +318,14 @@ def test_long_configurations_fit(tmp_path: Path, header_of: Callable, write_capt
     ],
 )
 def test_outputs_that_cannot_be_written(tmp_path: Path, header_of: Callable, name: str, message: str) -> None:
-    """Each is found before anything long starts, with advice, and by the writer too."""
+    """Each is found before anything long starts, with advice, and by the writer of captures too."""
     (tmp_path / "folder").mkdir()
     (tmp_path / "file").write_text("text")
     os.mkfifo(tmp_path / "pipe")
     with pytest.raises(FileError, match=message):
         check_writable(tmp_path / name, CAPTURE)
-    with pytest.raises(FileError, match=message), CaptureWriter(tmp_path / name, header_of()):
-        pass
+    with pytest.raises(FileError, match=message):
+        write_samples(tmp_path / name, header_of())
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may write anywhere")
@@ -415,19 +339,6 @@ def test_folder_without_permission(tmp_path: Path) -> None:
         tmp_path.chmod(0o700)
 
 
-def test_existing_files_are_kept_on_request(tmp_path: Path, header_of: Callable, write_capture: Callable) -> None:
-    """overwrite=False refuses an existing file and leaves it alone."""
-    path = tmp_path / "a.hdf5"
-    write_capture(path, header_of())
-    precious = path.read_bytes()
-    with pytest.raises(FileError, match="exists already"):
-        write_capture(path, header_of(), overwrite=False)
-    assert path.read_bytes() == precious
-    assert check_writable(path, CAPTURE) == path.resolve()
-    assert path.read_bytes() == precious
-    assert len(list(tmp_path.iterdir())) == 1
-
-
 @pytest.mark.skipif(sys.platform == "win32", reason="needs POSIX limits")
 def test_full_disk(tmp_path: Path, header_of: Callable) -> None:
     """When the disk takes no more the writer says so, names the file, and leaves nothing behind."""
@@ -438,9 +349,8 @@ def test_full_disk(tmp_path: Path, header_of: Callable) -> None:
     try:
         # a limit on the size of files stands in for the full disk: the same error comes from the same call
         resource.setrlimit(resource.RLIMIT_FSIZE, (500_000, hard))
-        with pytest.raises(FileError, match=r"a\.hdf5: cannot be written: File too large\. Free some space"):  # noqa: SIM117
-            with CaptureWriter(tmp_path / "a.hdf5", header, compression="none") as writer:
-                writer.write(noise)
+        with pytest.raises(FileError, match=r"a\.hdf5: cannot be written: File too large\. Free some space"):
+            write_samples(tmp_path / "a.hdf5", header, noise, compression="none")
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
         signal.signal(signal.SIGXFSZ, handler)
