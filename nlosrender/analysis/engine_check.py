@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from nlosrender.analysis.comparison.blocks import Block
 from nlosrender.analysis.comparison.z_test import ErrorModel, ZTest
+from nlosrender.analysis.json_values import finite_or_none
 from nlosrender.capture.bounces import FILE_BOUNCES, BounceAxis
 from nlosrender.capture.plan import replicas_for
 from nlosrender.capture.relative_error import relative_l2_error
@@ -133,19 +134,13 @@ class EngineCheck:
         """Return the numbers; what is infinite or not known is null."""
         techniques = [
             {"technique": t.technique, "obstacle": t.obstacle, "seconds": t.seconds}
-            | ({} if t.obstacle else {"error_estimate": finite(t.error), "energy": float(t.mean.sum())})
+            | ({} if t.obstacle else {"error_estimate": t.error, "energy": float(t.mean.sum())})
             for t in self.trials
         ]
-        pairs = [asdict(pair) | {"z": finite(pair.z)} for pair in self.pairs]
+        pairs = [asdict(pair) for pair in self.pairs]
         counts = {"sensor_points": self.n_sensors, "laser_points": self.n_lasers}
-        return {"agrees": self.agrees, **counts, "techniques": techniques, "pairs": pairs} | {
-            "unsampled_paths": list(self.unsampled_paths)
-        }
-
-
-def finite(value: float) -> float | None:
-    """Return a number as JSON can hold it."""
-    return value if math.isfinite(value) else None
+        found = {"agrees": self.agrees, **counts, "techniques": techniques, "pairs": pairs}
+        return finite_or_none(found | {"unsampled_paths": list(self.unsampled_paths)})
 
 
 def check_engines(

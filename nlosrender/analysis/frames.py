@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -23,9 +22,8 @@ from nlosrender.readable import readable_size
 Float32 = NDArray[np.float32]
 
 FRAMES_AIM = 120  # without --every: about so many pictures for the part of the time axis that holds light
-BAND_BYTES = 64 * 2**20  # of samples read at a time
-MOST_FRAMES = 20_000
-MOST_BYTES = 4 * 2**30  # of all pictures together
+MAX_FRAMES = 20_000
+MAX_BYTES = 4 * 2**30  # of all pictures together
 BRIGHTEST = 99.0  # percentile of the lit pixels of all frames that becomes white ...
 BRIGHTEST_STEADY = 97.0  # ... and of the steady picture, whose emitters outshine all they light
 
@@ -166,7 +164,7 @@ def _frame_ranges(capture: StoredCapture, options: FrameOptions) -> list[slice]:
     every = options.every or max(1, round((last + 1 - first) / FRAMES_AIM))
     count = -(-(last + 1 - first) // every)
     n_bytes = count * 4 * header.sizes["channel"] * header.sizes["sensor_y"] * header.sizes["sensor_x"]
-    if count > MOST_FRAMES or n_bytes > MOST_BYTES:
+    if count > MAX_FRAMES or n_bytes > MAX_BYTES:
         raise OptionError(
             f"--every: {count} pictures of {readable_size(n_bytes)} together are too many; use more bins each"
         )
@@ -175,8 +173,8 @@ def _frame_ranges(capture: StoredCapture, options: FrameOptions) -> list[slice]:
 
 def _light_over_time(capture: StoredCapture) -> NDArray[np.float64]:
     total = np.zeros(capture.header.n_bins)
-    for _, band in _bands(capture):
-        total += band[0].sum(axis=(0, 1), dtype=np.float64)
+    for _, band in capture.bands((0, 0)):
+        total += band[0].sum(axis=0).sum(axis=(0, 1), dtype=np.float64)
     return total
 
 
@@ -185,31 +183,12 @@ def _pictures(capture: StoredCapture, ranges: list[slice]) -> tuple[Float32, Flo
     sizes = capture.header.sizes
     shape = (sizes["sensor_y"], sizes["sensor_x"], sizes["channel"])
     frames, steady = np.zeros((len(ranges), *shape), np.float32), np.zeros(shape, np.float32)
-    for rows, band in _bands(capture):
+    for rows, samples in capture.bands((0, 0)):
+        band = samples.sum(axis=1)  # over bounces
         steady[rows] = np.moveaxis(band.sum(axis=-1, dtype=np.float64), 0, -1)
         for frame, bins in zip(frames, ranges, strict=True):
             frame[rows] = np.moveaxis(band[..., bins].sum(axis=-1, dtype=np.float64), 0, -1)
     return frames[:, ::-1], steady[::-1]
-
-
-def _bands(capture: StoredCapture) -> Iterator[tuple[slice, Float32]]:
-    """Yield (channel, row, column, bin) for a few rows at a time, summed over bounces.
-
-    Raises
-    ------
-    FileError
-        A sample is not finite.
-    """
-    header = capture.header
-    sizes = header.sizes
-    row_bytes = 8 * sizes["channel"] * len(header.bounce_indices) * sizes["sensor_x"] * sizes["bin"]
-    step = max(1, BAND_BYTES // row_bytes)
-    for start in range(0, sizes["sensor_y"], step):
-        rows = slice(start, min(start + step, sizes["sensor_y"]))
-        band = capture.read_block(sensors=(rows, None)).sum(axis=1)[:, 0, 0]
-        if not np.isfinite(band).all():
-            raise FileError(f"{capture.path}: data holds numbers that are not finite; see `nlosrender info --check`")
-        yield rows, band
 
 
 def _shown(frames: Float32, stokes: bool, exposure: float, brightest: float = BRIGHTEST) -> NDArray[np.uint8]:

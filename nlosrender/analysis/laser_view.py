@@ -2,22 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from nlosrender.errors import FileError
-from nlosrender.files.reading.reader import StoredCapture
+from nlosrender.files.reading.reader import BAND_BYTES, StoredCapture
 from nlosrender.files.reading.stored_header import intensity
 
 Float64 = NDArray[np.float64]
 
 FRAME_SHARES = (0.02, 0.2, 0.45, 0.7, 0.95)  # of the light that has arrived at the moments shown
 WINDOW_SHARES = (0.0005, 0.9995)  # of it at the ends of the part of the time axis that is worth showing
-BAND_BYTES = 64 * 2**20  # of samples read at a time
-MAX_ROW_BYTES = 2**30
+MAX_ROW_BYTES = 2**30  # of one row of sensor points, which is read at once
 MAX_LASER_BYTES = 2**36  # minutes of reading; beyond it a file is more likely damaged than meant
 
 
@@ -37,7 +36,7 @@ class LaserView:
         return int(row), int(column)
 
 
-def laser_view(capture: StoredCapture, laser: tuple[int, int]) -> LaserView:
+def laser_view(capture: StoredCapture, laser: tuple[int, int], band_bytes: int = BAND_BYTES) -> LaserView:
     """Sum the light of one laser point over the wall, the bounces and time.
 
     Raises
@@ -45,20 +44,29 @@ def laser_view(capture: StoredCapture, laser: tuple[int, int]) -> LaserView:
     FileError
         The laser point does not exist, a sample is not finite, or the file is damaged or too large for a picture.
     """
-    _check_size(capture)
-    sizes = capture.header.sizes
-    wall = np.zeros(capture.header.sensor_grid)
-    bounces, time = np.zeros(len(capture.header.bounce_indices)), np.zeros(sizes["bin"])
+    header, sizes = capture.header, capture.header.sizes
+    # float32 as read and float64 as summed
+    row_bytes = 12 * sizes["channel"] * len(header.bounce_indices) * sizes["sensor_x"] * sizes["bin"]
+    if row_bytes > MAX_ROW_BYTES or row_bytes * sizes["sensor_y"] > MAX_LASER_BYTES:
+        raise FileError(
+            f"{capture.path}: too large for a picture: data has shape {header.data_shape}. "
+            "Check the file with `nlosrender info`."
+        )
+    wall = np.zeros(header.sensor_grid)
+    bounces, time = np.zeros(len(header.bounce_indices)), np.zeros(sizes["bin"])
     # emitters seen directly would outshine all they light: they count among the bounces only
-    first = 1 if capture.header.first_bounce == 0 and len(bounces) > 1 else 0
-    for rows, band in _bands(capture, laser):
+    first = 1 if header.first_bounce == 0 and len(bounces) > 1 else 0
+    for rows, samples in capture.bands(laser, band_bytes=band_bytes):
+        band = intensity(header, samples.astype(np.float64))
         wall[rows] = band[first:].sum(axis=(0, 3))
         bounces += band.sum(axis=(1, 2, 3))
         time += band[first:].sum(axis=(0, 1, 2))
     return LaserView(laser, wall, bounces, time)
 
 
-def wall_frames(capture: StoredCapture, laser: tuple[int, int], windows: Sequence[slice]) -> Float64:
+def wall_frames(
+    capture: StoredCapture, laser: tuple[int, int], windows: Sequence[slice], band_bytes: int = BAND_BYTES
+) -> Float64:
     """Return (window, Ny, Nx) light on the wall, summed over bounces and the bins of each window.
 
     Raises
@@ -67,15 +75,14 @@ def wall_frames(capture: StoredCapture, laser: tuple[int, int], windows: Sequenc
         The laser point does not exist, or the file is damaged.
     """
     frames = np.zeros((len(windows), *capture.header.sensor_grid))
-    for rows, band in _bands(capture, laser):
+    for rows, samples in capture.bands(laser, band_bytes=band_bytes):
+        band = intensity(capture.header, samples.astype(np.float64))
         for frame, window in zip(frames, windows, strict=True):
             frame[rows] = band[..., window].sum(axis=(0, 3))
     return frames
 
 
-def point_histograms(
-    capture: StoredCapture, laser: tuple[int, int], pixel: tuple[int, int], dataset: str = "data"
-) -> Float64:
+def point_histograms(capture: StoredCapture, laser: tuple[int, int], pixel: tuple[int, int]) -> Float64:
     """Return (bounce, bin) of one sensor point, colour averaged.
 
     Raises
@@ -83,7 +90,7 @@ def point_histograms(
     FileError
         One of the points does not exist, or the file is damaged.
     """
-    block = capture.read_block(lasers=laser, sensors=pixel, dataset=dataset)
+    block = capture.read_block(lasers=laser, sensors=pixel)
     return intensity(capture.header, block[:, :, 0, 0, 0, 0].astype(np.float64))
 
 
@@ -100,7 +107,7 @@ def row_over_time(capture: StoredCapture, laser: tuple[int, int], row: int) -> F
 
 
 def frame_bins(time: Float64) -> list[int]:
-    """Return the bins at which given shares of all light in ``time`` (bin,) have arrived; fewer when they coincide."""
+    """Return the bins at which ``FRAME_SHARES`` of the light in ``time`` (bin,) have arrived, each once."""
     return sorted({_bin_of_share(time, share) for share in FRAME_SHARES})
 
 
@@ -118,33 +125,3 @@ def _bin_of_share(time: Float64, share: float) -> int:
     if arrived[-1] == 0:
         return len(time) // 2
     return int(min(np.searchsorted(arrived, share * arrived[-1]), len(time) - 1))
-
-
-def _bands(capture: StoredCapture, laser: tuple[int, int]) -> Iterator[tuple[slice, Float64]]:
-    """Yield (bounce, rows, Nx, bin) for a few rows at a time, colour averaged."""
-    n_rows = capture.header.sensor_grid[0]
-    step = max(BAND_BYTES // _row_bytes(capture), 1)
-    chunks = dict(zip(capture.header.axes, capture.header.chunks or (), strict=False))
-    if chunks.get("sensor_y", step + 1) <= step:
-        step -= step % chunks["sensor_y"]  # whole chunks, or each would be unpacked twice
-    for start in range(0, n_rows, step):
-        rows = slice(start, min(start + step, n_rows))
-        block = capture.read_block(lasers=laser, sensors=(rows, None))
-        if not np.isfinite(block).all():
-            raise FileError(f"{capture.path}: data holds numbers that are not finite; see `nlosrender info --check`")
-        yield rows, intensity(capture.header, block[:, :, 0, 0].astype(np.float64))
-
-
-def _row_bytes(capture: StoredCapture) -> int:
-    sizes, header = capture.header.sizes, capture.header
-    # float32 as read and float64 as summed
-    return 12 * sizes["channel"] * len(header.bounce_indices) * sizes["sensor_x"] * sizes["bin"]
-
-
-def _check_size(capture: StoredCapture) -> None:
-    row = _row_bytes(capture)
-    if row > MAX_ROW_BYTES or row * capture.header.sensor_grid[0] > MAX_LASER_BYTES:
-        raise FileError(
-            f"{capture.path}: too large for a picture: data has shape {capture.header.data_shape}. "
-            "Check the file with `nlosrender info`."
-        )

@@ -3,16 +3,23 @@
 from __future__ import annotations
 
 import json
-import math
-from collections.abc import Mapping
 from math import prod
 from pathlib import Path
 
+from nlosrender.analysis.json_values import finite_or_none
 from nlosrender.constants import opl_to_seconds
 from nlosrender.errors import FileError
 from nlosrender.files.parts.part_attributes import UNSAMPLED, ZERO, text_list
 from nlosrender.files.reading.reader import read_header
-from nlosrender.files.reading.stored_header import StoredHeader
+
+# keys of the summary that are attributes of the file, as text, number or JSON
+_ATTRIBUTES = {"engine": "render_engine", "written_by": "engine"} | {
+    name: name
+    for name in (
+        *("samples", "seed", "error_estimate", "error_estimate_per_bounce", "energy", "energy_error_per_bounce"),
+        *("energy_error", "out_of_window_energy", "seconds", "created", "config_hash", "part", "meshes", "versions"),
+    )
+}
 
 
 def summarise(path: str | Path) -> dict[str, object]:
@@ -28,7 +35,12 @@ def summarise(path: str | Path) -> dict[str, object]:
     """
     header = read_header(path)
     attributes = header.attributes
-    summary: dict[str, object] = {
+    try:
+        size = header.path.stat().st_size
+    except OSError as error:  # removed since it was read
+        raise FileError(f"{path}: cannot be read: {error}") from error
+    apart = header.bounces_known and header.split_bounces
+    summary = {
         "file": str(path),
         "scan_type": header.scan_type,
         "sensor_grid": list(header.sensor_grid[::-1]),
@@ -37,85 +49,39 @@ def summarise(path: str | Path) -> dict[str, object]:
         "laser_grid_size": _listed(header.laser_grid_size),
         "sensor_position": _listed(header.sensor_position),
         "laser_position": _listed(header.laser_position),
-        **_time_axis(header),
-        **_bounces(header),
-        "channels": attributes.get("channels", "grey" if header.sizes["channel"] == 1 else None),
-        "frame": attributes.get("frame"),
-        "planar_wall": _flag(attributes.get("planar_wall")),
-        "hidden_volume_position": _listed(header.hidden_volume_position),
-        "hidden_volume_size": _listed(header.hidden_volume_edges),
-        **_storage(header),
-        **_provenance(attributes),
-    }
-    return {key: _finite(value) for key, value in summary.items()}
-
-
-def _time_axis(header: StoredHeader) -> dict[str, object]:
-    return {
         "n_bins": header.n_bins,
         "bin_width_opl": header.bin_width_opl,
         "bin_width_ps": opl_to_seconds(header.bin_width_opl) * 1e12,
         "start_opl": header.start_opl,
         "end_opl": header.end_opl,
-        "account_first_and_last_bounces": _flag(header.attributes.get("account_first_and_last_bounces")),
-    }
-
-
-def _bounces(header: StoredHeader) -> dict[str, object]:
-    known = header.bounces_known
-    split = header.split_bounces
-    return {
-        "bounces": [index + header.first_bounce for index in header.bounce_indices] if known and split else None,
-        "split_bounces": split,
-        "max_bounces": header.attributes.get("max_bounces"),
-    }
-
-
-def _storage(header: StoredHeader) -> dict[str, object]:
-    try:
-        size = header.path.stat().st_size
-    except OSError as error:  # removed since it was read
-        raise FileError(f"{header.path}: cannot be read: {error}") from error
-    return {
+        "account_first_and_last_bounces": _flag(attributes.get("account_first_and_last_bounces")),
+        "bounces": [index + header.first_bounce for index in header.bounce_indices] if apart else None,
+        "split_bounces": header.split_bounces,
+        "max_bounces": attributes.get("max_bounces"),
+        "channels": attributes.get("channels", "grey" if header.sizes["channel"] == 1 else None),
+        "frame": attributes.get("frame"),
+        "planar_wall": _flag(attributes.get("planar_wall")),
+        "hidden_volume_position": _listed(header.hidden_volume_position),
+        "hidden_volume_size": _listed(header.hidden_volume_edges),
         "data_shape": list(header.data_shape),
         "dtype": header.dtype,
         "compression": header.compression,
         "has_variance": header.has_variance,
         "size_on_disk": size,
         "size_of_samples": prod(header.data_shape) * header.itemsize,
-    }
-
-
-def _provenance(attributes: Mapping[str, object]) -> dict[str, object]:
-    return {
-        "engine": attributes.get("render_engine"),
-        "samples": attributes.get("samples"),
-        "seed": attributes.get("seed"),
-        "error_estimate": attributes.get("error_estimate"),
-        "error_estimate_per_bounce": _json(attributes.get("error_estimate_per_bounce")),
-        "energy": _json(attributes.get("energy")),
-        "energy_error_per_bounce": _json(attributes.get("energy_error_per_bounce")),
-        "energy_error": attributes.get("energy_error"),
         "unsampled_paths": list(text_list(attributes, UNSAMPLED)) if UNSAMPLED in attributes else None,
         "zero_because": list(text_list(attributes, ZERO)) if ZERO in attributes else None,
-        "out_of_window_energy": attributes.get("out_of_window_energy"),
-        "seconds": _json(attributes.get("seconds")),
-        "created": attributes.get("created"),
-        "config_hash": attributes.get("config_hash"),
-        "part": _json(attributes.get("part")),
-        "written_by": attributes.get("engine"),
-        "meshes": _json(attributes.get("meshes")),
-        "versions": _json(attributes.get("versions")),
+        **{key: _unpacked(attributes.get(name)) for key, name in _ATTRIBUTES.items()},
     }
+    return finite_or_none(summary)
 
 
-def _json(text: object) -> object:
-    if not isinstance(text, str):
-        return text
+def _unpacked(value: object) -> object:
+    """Return the content of JSON text; any other value as it is."""
     try:
-        return json.loads(text)
+        return json.loads(value) if isinstance(value, str) and value[:1] in ("{", "[") else value
     except (ValueError, RecursionError):
-        return text  # not ours: show it as it is
+        return value  # another writer's
 
 
 def _flag(value: object) -> bool | None:
@@ -124,14 +90,3 @@ def _flag(value: object) -> bool | None:
 
 def _listed(numbers: tuple[float, ...] | None) -> list[float] | None:
     return None if numbers is None else list(numbers)
-
-
-def _finite(value: object) -> object:
-    """Replace numbers that JSON cannot hold by None."""
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    if isinstance(value, list):
-        return [_finite(entry) for entry in value]
-    if isinstance(value, dict):
-        return {key: _finite(entry) for key, entry in value.items()}
-    return value

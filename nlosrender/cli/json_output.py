@@ -7,6 +7,7 @@ import sys
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
+from nlosrender.analysis.json_values import finite_or_none
 from nlosrender.errors import EXIT_OK, ValidationIssue
 
 if TYPE_CHECKING:
@@ -45,7 +46,7 @@ class JsonOutput:
 
         self.printed = True
         failed = {"exit_code": exit_code} if exit_code != EXIT_OK else {}
-        typer.echo(json.dumps(_finite({**content, **failed}), indent=indent, allow_nan=False))
+        typer.echo(json.dumps(finite_or_none({**content, **failed}), indent=indent, allow_nan=False))
 
     def print_failure(self, messages: Iterable[str], exit_code: int, issues: Iterable[ValidationIssue] = ()) -> None:
         """Print why a command failed, unless it has printed its object before; only where ``--json`` asks for one."""
@@ -65,14 +66,6 @@ def issue_as_json(issue: ValidationIssue) -> dict[str, Any]:
         file, line, column = match[1], int(match[2]), int(match[3])
     where = {"file": file, "line": line, "column": column}
     return {"place": issue.place, **where, "key": issue.key, "message": issue.message}
-
-
-def _finite(value: Any) -> Any:
-    if isinstance(value, float):
-        return value if value - value == 0 else None
-    if isinstance(value, Mapping):
-        return {key: _finite(item) for key, item in value.items()}
-    return [_finite(item) for item in value] if isinstance(value, (list, tuple)) else value
 
 
 OUTPUT = JsonOutput()

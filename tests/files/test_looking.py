@@ -93,19 +93,14 @@ def test_summary_reads_no_samples(
 
 @pytest.mark.parametrize("band_bytes", [1, 10**9])
 def test_views_are_sums_of_the_samples(
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    header_of: Callable,
-    write_capture: Callable,
-    band_bytes: int,
+    tmp_path: Path, header_of: Callable, write_capture: Callable, band_bytes: int
 ) -> None:
     """Whatever the memory allows at a time, the sums over the wall, bounces and time are those of the whole block."""
-    monkeypatch.setattr(views, "BAND_BYTES", band_bytes)
     block = write_capture(tmp_path / "a.hdf5", header_of(n_channels=3)).astype(np.float64).mean(axis=0)
     one = block[:, 1, 2]  # (bounce, sensor_y, sensor_x, bin)
     with open_capture(tmp_path / "a.hdf5") as capture:
-        view = views.laser_view(capture, (1, 2))
-        frames = views.wall_frames(capture, (1, 2), [slice(0, 1), slice(2, 5)])
+        view = views.laser_view(capture, (1, 2), band_bytes)
+        frames = views.wall_frames(capture, (1, 2), [slice(0, 1), slice(2, 5)], band_bytes)
         point = views.point_histograms(capture, (1, 2), (3, 4))
         row = views.row_over_time(capture, (1, 2), 2)
     # float64 sums of 280 numbers below 1 in another order

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import asdict
 from typing import Any
 
 from nlosrender.analysis.comparison.captures import Comparison
+from nlosrender.analysis.comparison.differences import LargestDifference, WorstPlaces
+from nlosrender.analysis.comparison.z_test import Deviation
+from nlosrender.analysis.json_values import finite_or_none
 
 
 def comparison_report(comparison: Comparison) -> dict[str, Any]:
@@ -44,44 +46,20 @@ def comparison_report(comparison: Comparison) -> dict[str, Any]:
         ],
         "shift_bins": shift.whole(),
         "worst_shift": None if worst_shift is None else {"bins": worst_shift[0], "laser": list(worst_shift[1])},
-        "worst": _worst(comparison),
-        "largest_difference": _largest(comparison),
+        "worst": _place(comparison, differences.worst),
+        "largest_difference": _place(comparison, differences.largest),
         "z_test": _z_test(comparison),
     }
-    return {key: _finite(value) for key, value in report.items()}
+    return finite_or_none(report)
 
 
-def _worst(comparison: Comparison) -> dict[str, object] | None:
-    worst = comparison.differences.worst
-    return None if worst is None else asdict(worst) | {"bounce": comparison.bounce_name(worst.bounce)}
-
-
-def _largest(comparison: Comparison) -> dict[str, object] | None:
-    largest = comparison.differences.largest
-    return None if largest is None else asdict(largest) | {"bounce": comparison.bounce_name(largest.bounce)}
+def _place(comparison: Comparison, found: LargestDifference | WorstPlaces | Deviation | None) -> dict[str, Any] | None:
+    return None if found is None else asdict(found) | {"bounce": comparison.bounce_name(found.bounce)}
 
 
 def _z_test(comparison: Comparison) -> dict[str, object] | None:
     test = comparison.test
     if test is None:
         return None
-    worst = test.worst
-    named = None if worst is None else asdict(worst) | {"bounce": comparison.bounce_name(worst.bounce)}
-    return {
-        "significance": test.significance,
-        "statements": test.n_statements,
-        "limit": test.limit,
-        "z": test.z,
-        "worst": named,
-    }
-
-
-def _finite(value: object) -> object:
-    """Replace numbers that JSON cannot hold by None."""
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    if isinstance(value, dict):
-        return {key: _finite(entry) for key, entry in value.items()}
-    if isinstance(value, list):
-        return [_finite(entry) for entry in value]
-    return value
+    numbers = {"significance": test.significance, "statements": test.n_statements, "limit": test.limit, "z": test.z}
+    return numbers | {"worst": _place(comparison, test.worst)}

@@ -22,7 +22,9 @@ class TimeShift:
 
     def __init__(self, header: StoredHeader):
         self.n_bins = header.n_bins
-        self._length = _fast_length(2 * header.n_bins)  # room for every shift: no light wraps around
+        least = 2 * header.n_bins  # room for every shift: no light wraps around
+        # of an even length with small prime factors, which FFTs like, at most a quarter longer than needed
+        self._length = min(odd << max((-(-least // odd) - 1).bit_length(), 1) for odd in (1, 3, 5))
         self._whole: Complex = np.zeros(self._length // 2 + 1, np.complex128)
         self._current: Complex = np.zeros_like(self._whole)  # of one laser: a spectrum for each could fill the memory
         self._laser: tuple[int, int] | None = None
@@ -74,16 +76,3 @@ class TimeShift:
         offset = 0.5 * (before - after) / curvature if curvature < 0 else 0.0
         whole = peak if peak < self.n_bins else peak - self._length
         return round(whole + offset, ROUND_DIGITS)
-
-
-def _fast_length(least: int) -> int:
-    """Return the smallest even number >= ``least`` without prime factors above 5: an FFT of it is quick."""
-    length = least + least % 2
-    while True:
-        rest = length
-        for prime in (2, 3, 5):
-            while rest % prime == 0:
-                rest //= prime
-        if rest == 1:
-            return length
-        length += 2

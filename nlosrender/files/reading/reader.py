@@ -22,6 +22,7 @@ from nlosrender.files.reading.stored_header import StoredHeader, header_of, samp
 from nlosrender.files.reading.stored_points import dataset_in, plane_normal, stored_points
 
 Part = int | slice | None  # of one axis; None: all of it
+BAND_BYTES = 64 * 2**20  # of samples read at a time; a reader holds a few arrays of that size
 TILE_AXES = ("channel", "sensor_y", "sensor_x", "bin")  # what one read of one laser and one bounce returns
 
 
@@ -114,6 +115,27 @@ class StoredCapture:
                 raise FileError(f"{self.path}: {dataset} has shape {samples.shape}, data {self.header.data_shape}")
             return self._gather(samples, where, chosen)
 
+    def bands(
+        self, laser: tuple[int, int], bounces: Sequence[int] | None = None, band_bytes: int = BAND_BYTES
+    ) -> Iterator[tuple[slice, NDArray[np.float32]]]:
+        """Yield rows of sensor points and their samples (channel, bounce, row, sensor_x, bin) of one laser point.
+
+        ``band_bytes`` bounds the samples of one band; a band has whole chunks where it has more than one.
+
+        Raises
+        ------
+        FileError
+            As ``read_block``; or a sample is not finite.
+        """
+        sizes = self.header.sizes
+        n_bounces = len(self.header.bounce_indices if bounces is None else bounces)
+        step = max(band_bytes // (4 * sizes["channel"] * n_bounces * sizes["sensor_x"] * sizes["bin"]), 1)
+        chunk = dict(zip(self.header.axes, self.header.chunks or (), strict=False)).get("sensor_y", 1)
+        step -= step % chunk if chunk <= step else 0  # or the chunks at its ends would be unpacked twice
+        for start in range(0, sizes["sensor_y"], step):
+            rows = slice(start, min(start + step, sizes["sensor_y"]))
+            yield rows, finite(self.path, self.read_block(laser, (rows, None), bounces)[:, :, 0, 0])
+
     def _gather(self, samples: h5py.Dataset, where: dict[str, slice], bounces: tuple[int, ...]) -> NDArray[np.float32]:
         sizes = self.header.sizes
         lengths = {axis: part.stop - part.start for axis, part in where.items()}
@@ -142,6 +164,19 @@ class StoredCapture:
         elif isinstance(part, (int, np.integer)) and 0 <= part < length:
             return slice(int(part), int(part) + 1)
         raise FileError(f"{self.path}: {axis} {part} is outside the capture, which has 0 to {length - 1}")
+
+
+def finite(path: Path, samples: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return samples as they are.
+
+    Raises
+    ------
+    FileError
+        One is not finite.
+    """
+    if not np.isfinite(samples).all():
+        raise FileError(f"{path}: data holds numbers that are not finite; see `nlosrender info --check`")
+    return samples
 
 
 def read_header(path: str | Path) -> StoredHeader:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from nlosrender.capture.bounces import LINE_OF_SIGHT
 from nlosrender.errors import FileError
 from nlosrender.files.layout import ZNLOS_FROM_LOCAL, Float64
-from nlosrender.files.reading.reader import StoredCapture
+from nlosrender.files.reading.reader import StoredCapture, finite
 from nlosrender.files.reading.stored_header import StoredHeader, intensity
 from nlosrender.files.reading.stored_points import FLATNESS, Numbers
 from nlosrender.scene.bounding_box import Bounds, box_corners
@@ -150,12 +150,8 @@ def light_bands(
     FileError
         The file is damaged, or holds a number that is not finite.
     """
-    sizes = capture.header.sizes
-    row_bytes = 4 * sizes["channel"] * len(bounces) * sizes["sensor_x"] * sizes["bin"]
-    step = int(max(BAND_BYTES // row_bytes, 1))
-    for start in range(0, sizes["sensor_y"], step):
-        rows = slice(start, min(start + step, sizes["sensor_y"]))
-        yield rows, read_light(capture, laser, rows, None, bounces)
+    for rows, band in capture.bands(laser, bounces, BAND_BYTES):
+        yield rows, finite(capture.path, intensity(capture.header, band).sum(axis=0))
 
 
 def read_light(
@@ -169,10 +165,7 @@ def read_light(
         The file is damaged, or holds a number that is not finite.
     """
     block = capture.read_block(lasers=laser, sensors=(rows, columns), bounces=bounces)
-    light = intensity(capture.header, block[:, :, 0, 0]).sum(axis=0)
-    if not np.isfinite(light).all():
-        raise FileError(f"{capture.path}: data holds numbers that are not finite; see `nlosrender info --check`")
-    return light
+    return finite(capture.path, intensity(capture.header, block[:, :, 0, 0]).sum(axis=0))
 
 
 def _device(position: Numbers | None, wall_from_file: Float64) -> Float64 | None:
