@@ -8,37 +8,23 @@ from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import Literal
 
+import numpy as np
+
 HowKnown = Literal["measured", "interpolated", "extrapolated", "not reached"]
 
 
 @dataclass(frozen=True)
 class Point:
-    """What one setting reached.
+    """What one setting reached."""
 
-    Parameters
-    ----------
-    seconds, cpu_seconds
-        Wall-clock time, and CPU time of all threads: medians over ``repeats``.
-    error
-        Relative L2 distance to the reference.
-    estimate
-        The engine's own estimate of it.
-    samples
-        Paths per sensor point; 0 for a deterministic engine.
-    systematic
-        The part of the error that independent runs share; None when their noise hides it.
-    energy
-        Sum of H, in the contender's own unit.
-    """
-
-    seconds: float
-    cpu_seconds: float
-    error: float
+    seconds: float  # median over ``repeats``
+    cpu_seconds: float  # of all threads, median
+    error: float  # relative L2 distance to the reference, median
     repeats: int = 1
-    estimate: float | None = None
-    samples: int = 0
-    systematic: float | None = None
-    energy: float = 0.0
+    estimate: float | None = None  # the engine's own estimate of the error
+    samples: int = 0  # paths per sensor point; 0 for a deterministic engine
+    systematic: float | None = None  # part of the error that independent runs share; None when noise hides it
+    energy: float = 0.0  # sum of H, in the contender's own unit
 
 
 @dataclass
@@ -51,10 +37,6 @@ class Curve:
     first_seconds: float = 0.0  # the first render of the process, with compilation or loading of cached kernels
     engine: str = ""
 
-    def add(self, point: Point) -> None:
-        """Append the point of the next level."""
-        self.points.append(point)
-
     def slope(self, floor: float = 0.0) -> float | None:
         """Return d log(error) / d log(seconds), least squares over the last four points above ``floor``.
 
@@ -65,22 +47,20 @@ class Curve:
 
     @property
     def bias(self) -> float | None:
-        """Return the systematic error, from the last point that shows one; None when none is known.
+        """Return the systematic error of the last point that shows one; None when none is known.
 
-        What two runs of the virtual lights share is their resolution's error, which the next level halves: no bias.
+        What two runs of the virtual lights share is the error of their resolution, which the next level halves.
         """
         if self.engine == "virtual_lights":
             return None
-        known = [point.systematic for point in self.points if point.systematic is not None]
-        return known[-1] if known else None
+        return next((point.systematic for point in reversed(self.points) if point.systematic is not None), None)
 
     def time_to(self, target: float, *, cpu: bool = False) -> tuple[float, HowKnown]:
         """Return the seconds (or CPU seconds) to a relative L2 error of ``target``, and how they are known.
 
         Interpolated along straight lines of the log-log plot. Beyond the last point, the error of a random contender
-        falls as 1 / sqrt(seconds), so the time is extrapolated, unless a bias above the target stands in the way;
-        for others the time is unknown. The time of a first point below the target is an upper bound and counts as
-        measured.
+        falls as 1 / sqrt(seconds), so the time is extrapolated, unless its bias exceeds the target; for others the
+        time is unknown. The time of a first point below the target is an upper bound and counts as measured.
         """
         steps = [(point.cpu_seconds if cpu else point.seconds, point.error) for point in self.points]
         if steps[0][1] <= target:
@@ -93,17 +73,9 @@ class Curve:
         seconds, error = steps[-1]
         return seconds * (error / target) ** 2, "extrapolated"
 
-    def paths_per_second(self, n_pairs: int) -> float | None:
-        """Return paths per second of the longest run; ``n_pairs`` sensor points each take ``samples`` paths."""
-        last = self.points[-1]
-        return last.samples * n_pairs / last.seconds if last.samples else None
-
 
 def power_law(sizes: Sequence[float], values: Sequence[float]) -> float | None:
     """Return the exponent p of the least-squares fit of values ~ sizes^p; None with fewer than two sizes."""
-    if len(sizes) < 2 or len(set(sizes)) < 2 or min(values) <= 0:
+    if len(set(sizes)) < 2 or min(values) <= 0:
         return None
-    x, y = [math.log(size) for size in sizes], [math.log(value) for value in values]
-    mean_x, mean_y = sum(x) / len(x), sum(y) / len(y)
-    covariance = sum((a - mean_x) * (b - mean_y) for a, b in zip(x, y, strict=True))
-    return covariance / sum((a - mean_x) ** 2 for a in x)
+    return float(np.polyfit(np.log(sizes), np.log(values), 1)[0])

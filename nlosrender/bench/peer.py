@@ -1,7 +1,6 @@
-"""Other renderers as contenders: a command that runs in an environment of its own and answers requests, line by line.
+"""Other renderers as contenders: a command in an environment of its own that answers requests, one JSON line each.
 
-The protocol is in the docstring of ``tests/peers/render_with_mitransient.py``. A request says what to render and
-where to write the histogram; the answer says how long it took.
+The protocol is in the docstring of ``tests/peers/render_with_mitransient.py``.
 """
 
 from __future__ import annotations
@@ -12,7 +11,6 @@ import subprocess
 import tempfile
 from dataclasses import dataclass, field
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Self
 
 import numpy as np
@@ -27,6 +25,7 @@ from nlosrender.scene.hidden_geometry import MeshFile
 from nlosrender.scene.meshes.triangle_mesh import TriangleMesh
 
 CALIBRATION_LEVEL = 2
+UNBIASED_NAME = "mitransient, BSDF sampling"
 # Royo et al. 2022's techniques by their names in mitransient. Hidden geometry sampling is biased under occlusion.
 UNBIASED: dict[str, Any] = {"nlos_laser_sampling": True}
 FASTEST: dict[str, Any] = {"nlos_laser_sampling": True, "nlos_hidden_geometry_sampling": True}
@@ -66,13 +65,9 @@ class Peer:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        if self._running.stdin is not None:
-            self._running.stdin.close()
+    def __exit__(self, *error: object) -> None:
         self._running.terminate()
-        self._running.wait()
+        self._running.communicate()
         self.folder.cleanup()
 
     def ask(self, request: dict[str, Any]) -> dict[str, Any]:
@@ -131,7 +126,7 @@ def peer_contenders(peer: Peer, loaded: LoadedScene) -> list[Contender]:
     if loaded.scene.max_bounces != 3:  # as its documentation asks for beyond the third bounce
         fastest["nlos_hidden_geometry_sampling_includes_relay_wall"] = True
     return [
-        PeerContender("mitransient, BSDF sampling", peer, description, UNBIASED),
+        PeerContender(UNBIASED_NAME, peer, description, UNBIASED),
         PeerContender("mitransient, hidden geometry sampling", peer, description, fastest),
     ]
 
@@ -151,22 +146,17 @@ def describe_scene(loaded: LoadedScene, folder: Path) -> dict[str, Any]:
             raise TypeError(f"{scene.name}: peers render triangle meshes, not {type(surface.shape).__name__}")
         reflectance = surface.bsdf["reflectance"]
         surfaces.append({"mesh": str(mesh), "to_world": to_world.tolist(), "reflectance": reflectance})
-    laser = [0.0, 0.0] if scene_is_confocal(loaded) else loaded.capture.laser_grid.wall_coordinates[0, 0].tolist()
+    confocal = loaded.capture.scan_type == "confocal"  # every sensor point has a laser point of its own
     return {
         "wall": [loaded.built.wall.width, loaded.built.wall.height],
         "wall_reflectance": scene.sections["scene"]["relay_wall"]["bsdf"]["reflectance"],
         "scan": loaded.capture.scan_type,
         "sensors": [grid.ny, grid.nx],
-        "laser_point": laser,
+        "laser_point": [0.0, 0.0] if confocal else loaded.capture.laser_grid.wall_coordinates[0, 0].tolist(),
         "bins": [axis.start_opl, axis.bin_width_opl, axis.n_bins],
         "max_bounces": scene.max_bounces,
         "surfaces": surfaces,
     }
-
-
-def scene_is_confocal(loaded: LoadedScene) -> bool:
-    """Return whether every sensor point has a laser point of its own."""
-    return loaded.capture.scan_type == "confocal"
 
 
 def matched(contender: Contender, run: Run, reference: Reference) -> np.ndarray:

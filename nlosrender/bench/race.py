@@ -23,21 +23,18 @@ FIXED_POINT = 1.5  # an error this close to the reference's own says nothing abo
 
 
 class Contender(Protocol):
-    """Something that renders a loaded scene at increasing cost."""
+    """Renders a loaded scene at increasing cost."""
 
     @property
     def name(self) -> str:
-        """What the table calls it."""
-        ...
+        """In the table."""
 
     @property
     def is_random(self) -> bool:
         """Whether its error is noise, which falls as 1 / sqrt of the time."""
-        ...
 
     def run(self, level: int, seed: int) -> Run:
         """Render once at ``level``, 0 being the cheapest."""
-        ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,14 +46,9 @@ class OwnContender:
     options: Mapping[str, Any]
 
     @property
-    def counts_paths(self) -> bool:
-        """Whether a level is a number of paths, otherwise a target error."""
-        return self.options["engine"] == "path"
-
-    @property
     def is_random(self) -> bool:
         """All but the third bounce of the virtual lights."""
-        return self.counts_paths or self.loaded.scene.max_bounces != 3
+        return self.options["engine"] == "path" or self.loaded.scene.max_bounces != 3
 
     def run(self, level: int, seed: int) -> Run:
         """Render once: ``FIRST_SAMPLES * 4^level`` paths per sensor point, or to ``FIRST_TARGET / 2^level``.
@@ -68,7 +60,7 @@ class OwnContender:
         """
         from nlosrender.engine.path.engine import Budget
 
-        if self.counts_paths:
+        if self.options["engine"] == "path":
             budget = Budget(spp=FIRST_SAMPLES * 4**level)
         else:
             budget = Budget(target_error=FIRST_TARGET / 2**level)
@@ -112,7 +104,7 @@ def race(
     seconds
         For all of them together. A contender goes on while its next level can be expected to fit into its share.
     target
-        A contender that has not come to this error yet may take twice its share.
+        A contender above this error may take twice its share.
     match
         Brings a result to the reference's scale, where a contender's unit is not ours.
 
@@ -140,7 +132,7 @@ def race(
                 lane.spent += timer.read()[0]
         for lane in active:
             matched = [match(lane.contender, run, reference) for run in lane.runs]
-            lane.curve.add(_point(lane.runs, matched, reference))
+            lane.curve.points.append(_point(lane.runs, matched, reference))
             lane.curve.engine = lane.runs[0].engine
             lane.runs = []
         done = sum(lane.spent for lane in lanes if lane not in active)
@@ -180,8 +172,8 @@ def _point(runs: list[Run], matched: list[np.ndarray], reference: Reference) -> 
 def _shared_error(one: np.ndarray, other: np.ndarray, reference: Reference) -> float | None:
     """Return the relative L2 error that two independent runs share, None when it is lost in their noise.
 
-    Independent noise cancels in the product of two runs' errors; what is left is the square of what they have in
-    common, the reference's own error included. That is taken off; a rest below it says nothing.
+    Independent noise cancels in the product of two runs' errors, which leaves the square of their common part. The
+    reference's own error, a part of it, is subtracted; what is below that error is not significant.
     """
     squares = float((reference.values**2).sum())
     # per sensor point: the bins of one are not independent where numbers are low-discrepancy

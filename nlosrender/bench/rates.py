@@ -7,7 +7,6 @@ import statistics
 import subprocess
 import sys
 import tempfile
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -22,41 +21,11 @@ REPEATS = 3
 GATHER_TARGET = 0.01
 
 
-@dataclass(frozen=True)
-class GatherRate:
-    """How the third bounce's gather compares with tracing its shadow rays and doing nothing else.
+def gather_rate(loaded: LoadedScene) -> dict[str, Any]:
+    """Compare the gather of a third-bounce scene with tracing its shadow rays and doing nothing else.
 
     A pair is a sensor point and a patch. The gather's time is all of it: patches, lighting, histogram. The any-hit
-    queries are the rays of all lit pairs that face each other, from the wall to the patch, in the gather's order:
-    neighbouring sensor points to one patch at a time. The gather itself asks for fewer.
-    """
-
-    scene: str
-    triangles: int
-    patches: int  # at the resolution of the target error
-    shadow_ray_targets: int  # of them, seen by a laser point: only these are gathered
-    pairs: int  # sensor points times all patches: the rays of a gather that leaves out none
-    rays: int  # lit pairs that face each other
-    asked_rays: int  # of ``rays``: the gather leaves out those that nothing can stop
-    gather_seconds: float
-    any_hit_seconds: float  # for ``rays``
-    asked_seconds: float  # for ``asked_rays``
-    traces_rays: bool  # the gather leaves out visibility where nothing can occlude
-
-    def report(self) -> dict[str, Any]:
-        """Return counts, rates in pairs and rays per second, and the share of rays left out."""
-        return {
-            **vars(self),
-            "gather_pairs_per_second": self.pairs / self.gather_seconds,
-            "gather_rays_per_second": self.rays / self.gather_seconds,
-            "any_hit_rays_per_second": self.rays / self.any_hit_seconds,
-            "gather_share_of_any_hit": self.any_hit_seconds / self.gather_seconds,
-            "rays_left_out": 1 - (self.asked_rays / self.pairs if self.traces_rays else 0.0),
-        }
-
-
-def gather_rate(loaded: LoadedScene) -> GatherRate:
-    """Measure one third-bounce scene.
+    queries are the rays of all lit pairs that face each other, in the gather's order; the gather asks for fewer.
 
     Raises
     ------
@@ -74,23 +43,30 @@ def gather_rate(loaded: LoadedScene) -> GatherRate:
         for batch in plan.batches:
             engine.third.gather(batch, patch_scale)
         spent.append(timer.read()[0])
+    gather_seconds = statistics.median(spent[1:])
     lit = engine.third.shadow_ray_targets(plan.batches[0], patch_scale)
     rays, any_hit_seconds = trace_any_hit(loaded, lit)
     asked_rays, asked_seconds = trace_any_hit(loaded, lit, only_asked=True)
-    n_patches = len(engine.tessellator.patches(patch_scale))
-    return GatherRate(
-        loaded.scene.name,
-        loaded.built.n_triangles,
-        n_patches,
-        len(lit.positions),
-        n_patches * loaded.capture.n_sensors,
-        rays,
-        asked_rays,
-        statistics.median(spent[1:]),
-        any_hit_seconds,
-        asked_seconds,
-        engine.settings.needs_visibility,
-    )
+    n_patches, traces_rays = len(engine.tessellator.patches(patch_scale)), engine.settings.needs_visibility
+    pairs = n_patches * loaded.capture.n_sensors
+    return {
+        "scene": loaded.scene.name,
+        "triangles": loaded.built.n_triangles,
+        "patches": n_patches,  # at the resolution of the target error
+        "lit_patches": len(lit.positions),  # of them, lit by a laser point: only these are gathered
+        "pairs": pairs,  # sensor points times all patches
+        "rays": rays,  # lit pairs that face each other
+        "asked_rays": asked_rays,  # of ``rays``, those that something may stop: the gather traces them
+        "gather_seconds": gather_seconds,
+        "any_hit_seconds": any_hit_seconds,
+        "asked_seconds": asked_seconds,
+        "traces_rays": traces_rays,  # False: nothing can occlude
+        "gather_pairs_per_second": pairs / gather_seconds,
+        "gather_rays_per_second": rays / gather_seconds,
+        "any_hit_rays_per_second": rays / any_hit_seconds,
+        "gather_share_of_any_hit": any_hit_seconds / gather_seconds,
+        "rays_left_out": 1 - (asked_rays / pairs if traces_rays else 0.0),
+    }
 
 
 def whole_process(scene: BenchScene) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""The truth a benchmark's errors are measured against: quadrature where there is a formula, otherwise long runs."""
+"""References of a benchmark: float64 quadrature where there is a formula, long runs elsewhere."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ LONG_RUN_SEED = 9001  # no contender uses it
 
 @dataclass(frozen=True, eq=False)
 class Reference:
-    """A scene's truth, as good as it was affordable."""
+    """H of a scene, as exact as the time allowed."""
 
     values: Float64  # (laser, row, column, bin)
-    error: float  # its own relative L2 error, estimated; adds in quadrature to what is reported for a contender
+    error: float  # its own relative L2 error, estimated: in quadrature a part of what is reported for a contender
     origin: str
     seconds: float
 
 
 def find_reference(loaded: LoadedScene, seconds: float) -> Reference:
-    """Compute the truth of a scene in about ``seconds``; kept in memory only.
+    """Compute the reference of a scene in about ``seconds``; kept in memory only.
 
     Raises
     ------

@@ -5,7 +5,6 @@ from __future__ import annotations
 import statistics
 import tempfile
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -24,30 +23,14 @@ WAVES = 3  # across the sheet
 ALL_BOUNCES = 12  # stands for "no limit" on the axis of bounces
 
 
-@dataclass(frozen=True)
-class Scaling:
-    """Median seconds at a fixed target error for growing sizes, and the exponent of the last steps."""
+def measure_scaling(seconds: float) -> list[dict[str, Any]]:
+    """Measure every quantity in about ``seconds`` together; sizes that do not fit are left out.
 
-    quantity: str
-    setting: str
-    sizes: tuple[float, ...]
-    seconds: tuple[float, ...]
-    cpu_seconds: tuple[float, ...]  # of all threads
-    setup_seconds: tuple[float, ...]  # CPU seconds of these, see ``Run``
-    engines: tuple[str, ...]
-
-    @property
-    def exponent(self) -> float | None:
-        """Exponent p of seconds ~ size^p over the last three sizes; None with fewer than two."""
-        return power_law(self.sizes[-3:], self.seconds[-3:])
-
-    def report(self) -> dict[str, Any]:
-        """Return all as plain values."""
-        return {**vars(self), "exponent": self.exponent}
-
-
-def measure_scaling(seconds: float) -> list[Scaling]:
-    """Measure every quantity in about ``seconds`` together; what does not fit is left out.
+    Returns
+    -------
+    list of dict
+        Plain values: ``quantity``, ``setting``, ``sizes``; for each size medians of ``seconds``, ``cpu_seconds`` and
+        ``setup_seconds`` (see ``Run``), and ``engines``; ``exponent`` p of seconds ~ size^p over the last three.
 
     Raises
     ------
@@ -82,27 +65,27 @@ def _axes(folder: Path) -> list[tuple[str, str, Sequence[float], Callable[[int],
 
 def _measure(
     quantity: str, setting: str, sizes: Sequence[float], scene_of: Callable[[int], BenchScene], seconds: float
-) -> Scaling:
-    begun = Timer()
-    measured: list[tuple[float, float, float, float, str]] = []
+) -> dict[str, Any]:
+    from nlosrender.engine.path.engine import Budget
+
+    begun, budget, options = Timer(), Budget(target_error=TARGET), {"engine": "auto"}
+    found: dict[str, list[Any]] = {name: [] for name in ("seconds", "cpu_seconds", "setup_seconds", "engines")}
+    times = found["seconds"]
     for size in sizes:
-        if len(measured) >= 2:
-            growth = measured[-1][1] / measured[-2][1]
-            expected = 2 * measured[-1][1] * max(growth, 1.0)
-            if begun.read()[0] + expected > seconds or measured[-1][1] * growth > LONGEST:
+        if len(times) >= 2:
+            growth = times[-1] / times[-2]
+            if begun.read()[0] + 2 * times[-1] * max(growth, 1.0) > seconds or times[-1] * growth > LONGEST:
                 break
         loaded = load(scene_of(int(size)))
-        from nlosrender.engine.path.engine import Budget  # the backend has to be started before
-
-        runs = [render(loaded, Budget(target_error=TARGET), seed, {"engine": "auto"}) for seed in range(2)]
+        runs = [render(loaded, budget, seed, options) for seed in range(2)]
         if runs[1].seconds < SHORT:  # the first run compiles; long runs are not repeated
-            runs += [render(loaded, Budget(target_error=TARGET), 2 + k, {"engine": "auto"}) for k in range(REPEATS - 1)]
-        median = [
-            statistics.median(getattr(run, name) for run in runs[1:])
-            for name in ("seconds", "cpu_seconds", "setup_seconds")
-        ]
-        measured.append((size, *median, runs[0].engine))
-    return Scaling(quantity, setting, *(tuple(column) for column in zip(*measured, strict=True)))
+            runs += [render(loaded, budget, 2 + k, options) for k in range(REPEATS - 1)]
+        for name in ("seconds", "cpu_seconds", "setup_seconds"):
+            found[name].append(statistics.median(getattr(run, name) for run in runs[1:]))
+        found["engines"].append(runs[0].engine)
+    measured = list(sizes[: len(times)])
+    exponent = power_law(measured[-3:], times[-3:])
+    return {"quantity": quantity, "setting": setting, "sizes": measured, **found, "exponent": exponent}
 
 
 def write_wavy_sheet(path: Path, n_triangles: int) -> None:

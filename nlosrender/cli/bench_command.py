@@ -57,8 +57,7 @@ def bench(
     parts = [one_of(name, PARTS, "--part") for name in part or PARTS]
     json_path, png_path = _outputs(output)
     start_backend()
-    found = run_benchmark(scenes, seconds, parts, peer, lambda what: typer.echo(what, err=True))
-    report = found.report()
+    report = run_benchmark(scenes, seconds, parts, peer, lambda what: typer.echo(what, err=True))
     write_json(json_path, report)
     if report["scenes"]:
         write_plot(png_path, report)

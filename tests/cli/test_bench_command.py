@@ -84,7 +84,7 @@ def test_contenders_take_turns():
 def curve(*points, is_random=True, bias=None):
     found = Curve("some", is_random)
     for seconds, error in points:
-        found.add(Point(seconds, 2 * seconds, error, systematic=bias))
+        found.points.append(Point(seconds, 2 * seconds, error, systematic=bias))
     return found
 
 
@@ -143,7 +143,7 @@ def test_the_gather_and_the_rays_it_leaves_out_are_counted_alike(tmp_path):
     """Rays are fewer than pairs, fewer still where nothing can stop them, and what is left out changes nothing."""
     write_wavy_sheet(tmp_path / "sheet.ply", 2000)
     loaded = load(wavy_sheet(tmp_path / "sheet.ply", 16))
-    rate = gather_rate(loaded).report()
+    rate = gather_rate(loaded)
     assert rate["traces_rays"]
     assert rate["lit_patches"] <= rate["patches"]
     assert rate["pairs"] == 256 * rate["patches"]

@@ -9,9 +9,10 @@ import numpy as np
 
 from nlosrender.bench.paper.drawing import BRIGHT, new_figure, save, show_row, show_wall
 from nlosrender.bench.paper.figure import Check, PaperFigure, Picture, Table
-from nlosrender.bench.paper.study import Rendered, Study, relative_error
+from nlosrender.bench.paper.study import Rendered, Study, relative_error, sensor_grid
 
 SPOT_RADIUS = 0.01  # m: a laser without extent is never found by chance
+SPOT = f"capture.laser_spot_radius={SPOT_RADIUS}"
 PAPER_SAMPLES = 200_000  # of the paper's Table 2
 LIT = 0.2  # of the bins that light reaches: what forward path tracing finds less of
 REFERENCE_TIMES = 16  # samples of the reference over those of the contenders
@@ -24,6 +25,11 @@ class Technique:
     name: str
     laser_sampling: bool
     hidden_geometry_sampling: bool
+
+    @property
+    def label(self) -> str:
+        """Its name as a part of a file's."""
+        return self.name.replace(" ", "-")
 
     @property
     def overrides(self) -> tuple[str, ...]:
@@ -48,7 +54,7 @@ FORWARD, BOTH = TECHNIQUES[0], TECHNIQUES[-1]
 def ablation(study: Study, name: str, figure: str, title: str) -> PaperFigure:
     """Figures 8 and 9: the same number of paths by every technique."""
     side, spp = study.pick((48, 2048), (128, 20_000))
-    common = (f"capture.sensor_grid={{nx: {side}, ny: {side}}}", f"capture.laser_spot_radius={SPOT_RADIUS}")
+    common = (sensor_grid(side), SPOT)
     reference = study.render(
         name, f"{name}-reference", *common, *BOTH.overrides,
         f"render.spp={REFERENCE_TIMES * spp}", f"render.seed={study.seed + 1}",
@@ -56,8 +62,7 @@ def ablation(study: Study, name: str, figure: str, title: str) -> PaperFigure:
     truth = reference.light()
     rows, runs, errors, lit = [], [], {}, {}
     for technique in TECHNIQUES:
-        label = f"{name}-{technique.name.replace(' ', '-')}"
-        run = study.render(name, label, *common, *technique.overrides, f"render.spp={spp}")
+        run = study.render(name, f"{name}-{technique.label}", *common, *technique.overrides, f"render.spp={spp}")
         light = run.light()
         error = relative_error(light, truth)
         errors[technique.name] = error

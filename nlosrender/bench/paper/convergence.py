@@ -9,10 +9,10 @@ import numpy as np
 
 from nlosrender.analysis.theme import MARK
 from nlosrender.bench.curve import power_law
-from nlosrender.bench.paper.ablation import BOTH, SPOT_RADIUS, TECHNIQUES, Technique
+from nlosrender.bench.paper.ablation import BOTH, SPOT, SPOT_RADIUS, TECHNIQUES, Technique
 from nlosrender.bench.paper.drawing import log_log, new_figure, save
 from nlosrender.bench.paper.figure import Check, PaperFigure, Picture, Table
-from nlosrender.bench.paper.study import Float64, Rendered, Study, relative_error
+from nlosrender.bench.paper.study import Float64, Rendered, Study, relative_error, sensor_grid
 
 SCENE = "letters-near"
 REFERENCE_TIMES = 16  # samples of the reference over the largest count: its own squared error is known and taken off
@@ -21,10 +21,9 @@ SLOPE_TOLERANCE = 0.2  # a fit through four or more points whose errors are know
 
 def convergence(study: Study) -> PaperFigure:
     """Render with more and more paths, and with the virtual lights for smaller and smaller target errors."""
-    side = study.pick(24, 64)
-    grid = f"capture.sensor_grid={{nx: {side}, ny: {side}}}"
+    grid = sensor_grid(study.pick(24, 64))
     counts = [4**k for k in study.pick(range(3, 7), range(3, 8))]
-    reference = _path_reference(study, grid, REFERENCE_TIMES * counts[-1], f"capture.laser_spot_radius={SPOT_RADIUS}")
+    reference = _path_reference(study, grid, REFERENCE_TIMES * counts[-1], SPOT)
     truth, floor = reference.light(), float(reference.variance().mean())
     curves = {technique: _curve(study, technique, grid, counts, truth, floor) for technique in TECHNIQUES}
     slopes = {}
@@ -75,9 +74,8 @@ def _curve(
 ) -> tuple[list[float], list[float]]:
     """Return mean squared errors, the reference's own taken off, and seconds."""
     mses, seconds = [], []
-    spot = f"capture.laser_spot_radius={SPOT_RADIUS}"
     for count in counts:
-        run = study.render(SCENE, "convergence", grid, spot, *technique.overrides, f"render.spp={count}")
+        run = study.render(SCENE, "convergence", grid, SPOT, *technique.overrides, f"render.spp={count}")
         mses.append(max(float(np.square(run.light() - truth).mean()) - floor, 1e-300))
         seconds.append(run.seconds)
     return mses, seconds

@@ -60,8 +60,26 @@ def show_wall(axes: Axes, wall: Float64, half_width: float, title: str, top: flo
     extent = (-half_width, half_width, -half_width, half_width)
     axes.imshow(np.clip(wall / max(top, 1e-300), 0, 1), origin="lower", extent=extent, cmap=COLORMAP)
     style(axes, title)
-    axes.set_xticks([])
-    axes.set_yticks([])
+    axes.set(xticks=[], yticks=[])
+
+
+def frames_at(light: Float64, shares: Float64, energy: Float64, bins_per_frame: float) -> list[tuple[int, Float64]]:
+    """Return moments of a capture as bins, and the light summed over a few bins around each.
+
+    Parameters
+    ----------
+    light
+        (..., bin).
+    shares
+        Of the energy that has arrived by then.
+    energy
+        (bin,) that they are shares of.
+    bins_per_frame
+        Half a frame's length, in shares of all bins.
+    """
+    reach, arrived = max(1, int(light.shape[-1] * bins_per_frame)), energy.cumsum()
+    moments = [int(np.searchsorted(arrived, share * arrived[-1])) for share in shares]
+    return [(moment, light[..., max(0, moment - reach) : moment + reach + 1].sum(axis=-1)) for moment in moments]
 
 
 def log_log(axes: Axes, title: str, xlabel: str, ylabel: str) -> None:

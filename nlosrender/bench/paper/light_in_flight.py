@@ -8,11 +8,11 @@ import numpy as np
 
 from nlosrender.analysis.frames import FrameOptions, write_frames
 from nlosrender.analysis.theme import INK
-from nlosrender.bench.paper.drawing import new_figure, save
+from nlosrender.bench.paper.drawing import frames_at, new_figure, save
 from nlosrender.bench.paper.figure import Check, PaperFigure, Picture, Table
 from nlosrender.bench.paper.steady import steady_picture, worst_deviation
 from nlosrender.bench.paper.study import Float64, Rendered, Study
-from nlosrender.files.reading.reader import open_capture
+from nlosrender.files.layout import VARIANCE
 
 SHOWN = 6  # frames side by side
 SCENES = {
@@ -70,28 +70,18 @@ def light_in_flight(study: Study, name: str) -> PaperFigure:
 
 def steady_sum(run: Rendered) -> tuple[Float64, Float64]:
     """Return the sum over bounces and time and its variance, (channel, row, column) each, rows upwards."""
-    with open_capture(run.path) as capture:
-        light, variance = (
-            capture.read_block(dataset=dataset).sum(axis=(1, 6), dtype=np.float64)[:, 0, 0]
-            for dataset in ("data", "variance")
-        )
-    return light, variance
+    return run.summed((1, 6))[:, 0, 0], run.summed((1, 6), VARIANCE)[:, 0, 0]
 
 
 def _montage(study: Study, run: Rendered, label: str) -> Path:
-    with open_capture(run.path) as capture:
-        light = capture.read_block().sum(axis=1, dtype=np.float64)[:, 0, 0]  # (channel, row, column, bin)
-    edges = run.bin_edges()
-    energy = light.sum(axis=(0, 1, 2)).cumsum()
+    light, edges = run.summed(1)[:, 0, 0], run.bin_edges()  # (channel, row, column, bin)
     figure, axes = new_figure(1, SHOWN, 15, 3)
-    reach = max(1, light.shape[-1] // 200)
-    for part, share in zip(axes[0], np.linspace(0.05, 0.9, SHOWN), strict=True):
-        moment = int(np.searchsorted(energy, share * energy[-1]))
-        frame = np.moveaxis(light[..., max(0, moment - reach) : moment + reach + 1].sum(axis=-1), 0, -1)
+    frames = frames_at(light, np.linspace(0.05, 0.9, SHOWN), light.sum(axis=(0, 1, 2)), 0.005)
+    for part, (moment, channels) in zip(axes[0], frames, strict=True):
+        frame = np.moveaxis(channels, 0, -1)
         top = np.percentile(frame[frame > 0], 98) if (frame > 0).any() else 1.0
         shown = np.clip(frame / top, 0, 1) ** (1 / 2.2)
         part.imshow(np.repeat(shown, 3, axis=-1) if shown.shape[-1] == 1 else shown, origin="lower")
         part.set_title(f"{edges[moment]:.2f} m", color=INK, size=10)
-        part.set_xticks([])
-        part.set_yticks([])
+        part.set(xticks=[], yticks=[])
     return save(figure, study.picture(f"light-in-flight-{label}"))

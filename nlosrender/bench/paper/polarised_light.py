@@ -9,12 +9,11 @@ import numpy as np
 from nlosrender.analysis.frames import FrameOptions, write_frames
 from nlosrender.analysis.pictures import degree_of_polarization, signed_colors
 from nlosrender.analysis.theme import INK
-from nlosrender.bench.paper.drawing import new_figure, save
+from nlosrender.bench.paper.drawing import frames_at, new_figure, save
 from nlosrender.bench.paper.figure import Check, PaperFigure, Picture, Table
 from nlosrender.bench.paper.light_in_flight import steady_sum
 from nlosrender.bench.paper.steady import steady_picture, worst_deviation
 from nlosrender.bench.paper.study import Float64, Rendered, Study
-from nlosrender.files.reading.reader import open_capture
 
 SCENE = "polarised-cornell-box"
 COMPONENTS = ("I", "Q", "U", "V")
@@ -61,21 +60,16 @@ def polarised_light(study: Study) -> PaperFigure:
 
 
 def _montage(study: Study, run: Rendered) -> Path:
-    with open_capture(run.path) as capture:
-        light = capture.read_block().sum(axis=1, dtype=np.float64)[:, 0, 0]  # (component, row, column, bin)
-    edges = run.bin_edges()
-    energy = light[0].sum(axis=(0, 1)).cumsum()
-    reach = max(1, light.shape[-1] // 200)
-    moments = [int(np.searchsorted(energy, share * energy[-1])) for share in np.linspace(0.3, 0.85, MOMENTS)]
-    shown = [(f"{edges[m]:.2f} m", light[..., max(0, m - reach) : m + reach + 1].sum(axis=-1)) for m in moments]
+    light, edges = run.summed(1)[:, 0, 0], run.bin_edges()  # (component, row, column, bin)
+    frames = frames_at(light, np.linspace(0.3, 0.85, MOMENTS), light[0].sum(axis=(0, 1)), 0.005)
+    shown = [(f"{edges[moment]:.2f} m", frame) for moment, frame in frames]
     shown.append(("steady", light.sum(axis=-1)))
     figure, axes = new_figure(len(shown), 5, 12, 2.4 * len(shown))
     for line, (title, stokes) in zip(axes, shown, strict=True):
         for part, name, picture in zip(line, (*COMPONENTS, "degree"), _colored(stokes), strict=True):
             part.imshow(picture, origin="lower", cmap="gray", vmin=0, vmax=1)
             part.set_title(f"{name}, {title}", color=INK, size=9)
-            part.set_xticks([])
-            part.set_yticks([])
+            part.set(xticks=[], yticks=[])
     return save(figure, study.picture("figure-13-stokes"))
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,7 +11,7 @@ import numpy as np
 from nlosrender.bench.paper.drawing import new_figure, save, show_row, show_wall
 from nlosrender.bench.paper.figure import Check, PaperFigure, Picture, Table
 from nlosrender.bench.paper.room_meshes import write_furniture, write_statue
-from nlosrender.bench.paper.study import Rendered, Study
+from nlosrender.bench.paper.study import Rendered, Study, sensor_grid
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ def closed_rooms(study: Study) -> PaperFigure:
             room.config,
             room.config,
             f"scene.hidden_geometry.1.filename={mesh}",
-            f"capture.sensor_grid={{nx: {side}, ny: {side}}}",
+            sensor_grid(side),
             f"render.target_error={target}",
         )
         runs.append((room.config, run))
@@ -83,8 +83,8 @@ def closed_rooms(study: Study) -> PaperFigure:
     )
 
 
-def write_meshes(study: Study) -> list[Path]:
-    """Write the meshes that the rooms' configurations name, where they are not there yet, and return where.
+def write_meshes(study: Study, rooms: Iterable[Room] = ROOMS) -> list[Path]:
+    """Write the meshes that the rooms' configurations name, where they are not there yet, and return their paths.
 
     Raises
     ------
@@ -92,11 +92,11 @@ def write_meshes(study: Study) -> list[Path]:
         A folder or file cannot be written.
     """
     study.make_folders()
-    return [write_mesh(study, room) for room in ROOMS]
+    return [write_mesh(study, room) for room in rooms]
 
 
 def write_mesh(study: Study, room: Room) -> Path:
-    """Write a room's mesh where it is not there yet, and return where: whole or not at all.
+    """Write a room's mesh, whole or not at all, unless it is there; return its path.
 
     Raises
     ------

@@ -8,10 +8,10 @@ from nlosrender.analysis.reconstruction.picture import draw_reconstruction
 from nlosrender.analysis.reconstruction.reconstruct import ReconstructionSettings, reconstruct_capture
 from nlosrender.analysis.reconstruction.score import Score, score_front_view
 from nlosrender.analysis.reconstruction.silhouette import true_silhouette
-from nlosrender.bench.paper.ablation import SPOT_RADIUS, TECHNIQUES
+from nlosrender.bench.paper.ablation import SPOT, TECHNIQUES
 from nlosrender.bench.paper.drawing import new_figure, save, show_wall
 from nlosrender.bench.paper.figure import Check, PaperFigure, Picture, Table
-from nlosrender.bench.paper.study import Float64, Rendered, Study
+from nlosrender.bench.paper.study import Float64, Rendered, Study, sensor_grid
 
 SCENE = "letters-near"
 WAVELENGTH = 0.06  # m, of the virtual wave: the same for all, twice the spacing of 64 points on 2 m
@@ -23,7 +23,7 @@ def silhouettes(study: Study) -> PaperFigure:
     wavelength = max(WAVELENGTH, 2 * 2.0 / side)
     common = (
         "capture.scan_type=confocal",
-        f"capture.sensor_grid={{nx: {side}, ny: {side}}}",
+        sensor_grid(side),
         "time_axis={start_opl: 1.8, bin_width_opl: 0.005, n_bins: 400}",
     )
     rows: list[tuple[str, ...]] = []
@@ -31,9 +31,7 @@ def silhouettes(study: Study) -> PaperFigure:
     scores: dict[str, Score] = {}
     limit = f"render.time_limit_s={seconds}"
     for technique in TECHNIQUES:
-        spot = f"capture.laser_spot_radius={SPOT_RADIUS}"
-        label = f"confocal-{technique.name.replace(' ', '-')}"
-        run = study.render(SCENE, label, *common, spot, *technique.overrides, limit)
+        run = study.render(SCENE, f"confocal-{technique.label}", *common, SPOT, *technique.overrides, limit)
         scores[technique.name] = _reconstruct(study, run, technique.name, wavelength, voxels, rows, views)
     run = study.render(SCENE, "confocal-virtual-lights", *common, "render.target_error=0.01")
     scores["virtual lights"] = _reconstruct(study, run, "virtual lights", wavelength, voxels, rows, views)

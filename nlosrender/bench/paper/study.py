@@ -35,22 +35,24 @@ class Rendered:
         """Seconds of the render alone: no start of the program, no writing."""
         return self.report.seconds["render"]
 
+    def summed(self, axes: int | tuple[int, ...], dataset: str = "data") -> Float64:
+        """Return a dataset (channel, bounce, laser_y, laser_x, sensor_y, sensor_x, bin) summed over ``axes``."""
+        with open_capture(self.path) as capture:
+            return capture.read_block(dataset=dataset).sum(axis=axes, dtype=np.float64)
+
     def light(self) -> Float64:
         """Return H (laser_y, laser_x, sensor_y, sensor_x, bin), summed over channels and bounces."""
-        with open_capture(self.path) as capture:
-            return capture.read_block().sum(axis=(0, 1), dtype=np.float64)
+        return self.summed((0, 1))
 
     def variance(self) -> Float64:
         """Return the variance of ``light``; bounces and channels add up."""
-        with open_capture(self.path) as capture:
-            return capture.read_block(dataset=VARIANCE).sum(axis=(0, 1), dtype=np.float64)
+        return self.summed((0, 1), VARIANCE)
 
     def bin_edges(self) -> Float64:
         """Return the edges of the bins (n + 1,) [m of optical path]."""
         with open_capture(self.path) as capture:
             header = capture.header
-            edges: Float64 = header.start_opl + header.bin_width_opl * np.arange(header.sizes["bin"] + 1.0)
-            return edges
+            return np.asarray(header.start_opl + header.bin_width_opl * np.arange(header.sizes["bin"] + 1.0))
 
 
 @dataclass(frozen=True)
@@ -82,14 +84,7 @@ class Study:
         return quick if self.quick else full
 
     def config(self, name: str, *overrides: str) -> Config:
-        """Load ``name``.yaml.
-
-        Parameters
-        ----------
-        name
-            Of the configuration.
-        overrides
-            ``a.b.c=VALUE`` each.
+        """Load ``name``.yaml with overrides, ``a.b.c=VALUE`` each.
 
         Raises
         ------
@@ -134,6 +129,11 @@ class Study:
                 (self.folder / part).mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise FileError(f"{self.folder}: cannot be created ({error.strerror})") from error
+
+
+def sensor_grid(nx: int, ny: int | None = None) -> str:
+    """Return the override of a configuration's sensor grid; square without ``ny``."""
+    return f"capture.sensor_grid={{nx: {nx}, ny: {ny or nx}}}"
 
 
 def relative_error(light: Float64, reference: Float64) -> float:

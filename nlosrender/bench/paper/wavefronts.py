@@ -3,27 +3,25 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from nlosrender.analysis.theme import MARK
-from nlosrender.bench.paper.drawing import new_figure, save, show_row, show_wall
+from nlosrender.bench.paper.drawing import frames_at, new_figure, save, show_row, show_wall
 from nlosrender.bench.paper.figure import Check, PaperFigure, Picture
-from nlosrender.bench.paper.study import Rendered, Study
+from nlosrender.bench.paper.study import Float64, Rendered, Study, sensor_grid
 from nlosrender.capture.grids import build_capture
 from nlosrender.rendering import stages
 from nlosrender.scene.meshes.triangle_mesh import TriangleMesh
 
-Float64 = NDArray[np.float64]
 SPACING = 0.01  # m between the points that arrivals are looked for at: ways of 2 m are then right to 0.02 mm
 FRAMES = 4
 
 
 def z_letter(study: Study) -> PaperFigure:
     """Figure 4: the first light of every sensor point lands in the bin of the shortest way over the letter."""
-    grid = study.pick("{nx: 48, ny: 40}", "{nx: 128, ny: 128}")
-    rendered = study.render("z-letter", "z-letter", f"capture.sensor_grid={grid}")
+    grid = sensor_grid(*study.pick((48, 40), (128, 128)))
+    rendered = study.render("z-letter", "z-letter", grid)
     light, edges = rendered.light()[0, 0], rendered.bin_edges()
-    first, last = arrivals(study, "z-letter", f"capture.sensor_grid={grid}")
+    first, last = arrivals(study, "z-letter", grid)
     row = light.shape[0] // 2
     lit = light > 0
     found_first = lit.argmax(axis=-1)
@@ -50,7 +48,7 @@ def z_letter(study: Study) -> PaperFigure:
 
 def captured_letters(study: Study) -> PaperFigure:
     """Figure 1: what a capture of hidden letters looks like."""
-    grid = f"capture.sensor_grid={study.pick('{nx: 64, ny: 64}', '{nx: 256, ny: 256}')}"
+    grid = sensor_grid(study.pick(64, 256))
     rendered = study.render("letters-near", "letters-virtual-lights", grid)
     ny, nx = rendered.light().shape[2:4]
     middle = ny // 2
@@ -106,16 +104,15 @@ def _picture(study: Study, configuration: str, rendered: Rendered, name: str, fi
     figure, axes = new_figure(1, FRAMES + 1, 15, 3.6)
     half_width = study.half_width(configuration)
     row = light.shape[0] // 2
-    energy = light.sum(axis=(0, 1)).cumsum()
-    moments = [int(np.searchsorted(energy, share * energy[-1])) for share in np.linspace(0.08, 0.75, FRAMES)]
-    reach = max(1, light.shape[-1] // 100)
-    for part, moment in zip(axes[0], moments, strict=False):
-        frame = light[..., max(0, moment - reach) : moment + reach + 1].sum(axis=-1)
+    frames = frames_at(light, np.linspace(0.08, 0.75, FRAMES), light.sum(axis=(0, 1)), 0.01)
+    for part, (moment, frame) in zip(axes[0], frames, strict=False):
         show_wall(part, frame, half_width, f"wall at {edges[moment]:.2f} m")
     show_row(axes[0, -1], light[row], edges, half_width, "middle row over time")
     x = (np.arange(light.shape[1]) + 0.5) / light.shape[1] * 2 * half_width - half_width
     axes[0, -1].plot(first, x, color=MARK, lw=1, label="first")
     axes[0, -1].plot(last, x, color=MARK, lw=1, ls=":", label="last")
-    caption = "The wall at four moments, and its middle row over time; lines: the shortest (solid) and longest (dotted)\
- way over the hidden geometry."
+    caption = (
+        "The wall at four moments, and its middle row over time; lines: the shortest (solid) and longest (dotted) "
+        "way over the hidden geometry."
+    )
     return Picture(save(figure, study.picture(name)), caption)
