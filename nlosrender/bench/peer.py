@@ -21,8 +21,8 @@ from nlosrender.bench.references import Reference
 from nlosrender.bench.runs import LoadedScene, Run
 from nlosrender.engine.backend import llvm
 from nlosrender.errors import BackendError
-from nlosrender.scene.hidden_geometry import MeshFile
 from nlosrender.scene.meshes.triangle_mesh import TriangleMesh
+from nlosrender.scene.surfaces import MeshFile
 
 CALIBRATION_LEVEL = 2
 UNBIASED_NAME = "mitransient, BSDF sampling"

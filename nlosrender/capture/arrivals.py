@@ -13,7 +13,7 @@ from nlosrender.capture.grids import Capture, PointGrid
 from nlosrender.capture.time_axis import TimeAxis
 from nlosrender.scene.bounding_box import Bounds, box_corners, distance_to_box, joined_bounds
 from nlosrender.scene.pose import Float64
-from nlosrender.scene.relay_wall import RelayWall
+from nlosrender.scene.walls.wall import RelayWall
 
 SAMPLED_POINTS = 32  # per grid; the filled share of the window hardly differs between neighbours
 # Interactions that "n_bins: auto" makes room for: two bounces above the third, and four for a camera. Each adds at most

@@ -11,8 +11,7 @@ from numpy.typing import ArrayLike
 from nlosrender.capture.bounces import LINE_OF_SIGHT
 from nlosrender.errors import ConfigError
 from nlosrender.scene.pose import Float64
-from nlosrender.scene.relay_wall import RelayWall
-from nlosrender.scene.wall_coordinates import EDGE_TOLERANCE
+from nlosrender.scene.walls.wall import EDGE_TOLERANCE, RelayWall
 
 if TYPE_CHECKING:
     from nlosrender.config.capture import CaptureConfig, GridConfig

@@ -123,8 +123,8 @@ def _meshes_of(config: Config) -> tuple[Sequence[MeshReport], Sequence[str], Seq
     """
     if not config.scene.has_mesh_files:
         return (), (), ()
-    from nlosrender.scene.mesh_surfaces import describe_meshes
     from nlosrender.scene.meshes.mesh_report import mesh_lines
+    from nlosrender.scene.read_surfaces import describe_meshes
 
     read = describe_meshes(config.scene)
     return read.meshes, list(mesh_lines(read.meshes)), read.warnings

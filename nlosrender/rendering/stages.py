@@ -19,9 +19,9 @@ from nlosrender.engine.backend.start import Backend, batch_memory, physical_memo
 from nlosrender.files.capture_header import CaptureHeader
 from nlosrender.files.chunk_shape import sensor_tile
 from nlosrender.rendering.process_layout import ONE_PROCESS, ProcessLayout
-from nlosrender.scene.hidden_geometry import Surface, hidden_surfaces
-from nlosrender.scene.placing import placed
-from nlosrender.scene.relay_wall import RelayWall, relay_wall_from_config
+from nlosrender.scene.surfaces import Surface, hidden_surfaces
+from nlosrender.scene.walls.wall import RelayWall
+from nlosrender.scene.walls.wall_from_config import relay_wall_from_config
 
 if TYPE_CHECKING:
     from nlosrender.engine.path.engine import Budget
@@ -72,8 +72,7 @@ def load_view(config: Config) -> BuiltView:
     """
     from nlosrender.scene.view import build_view
 
-    with placed():
-        return build_view(config.scene, config.capture)
+    return build_view(config.scene, config.capture)
 
 
 def load_scene(config: Config) -> BuiltScene:
@@ -92,9 +91,8 @@ def place_scene(config: Config) -> tuple[RelayWall, tuple[Surface, ...]]:
     ConfigError
         A pose is degenerate.
     """
-    with placed():
-        wall = relay_wall_from_config(config.scene.wall)
-        return wall, hidden_surfaces(config.scene.hidden_geometry, wall)
+    wall = relay_wall_from_config(config.scene.wall)
+    return wall, hidden_surfaces(config.scene.hidden_geometry, wall.pose)
 
 
 def describe_capture(config: Config, wall: RelayWall, built: BuiltScene | BuiltView) -> tuple[Capture, TimeAxis]:

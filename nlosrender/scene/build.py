@@ -17,17 +17,17 @@ import numpy as np
 
 from nlosrender.scene.bounding_box import Bounds, box_corners, joined_bounds
 from nlosrender.scene.coincident import PASSES, Overlap, coincident_disks, moved_apart, overlaps
-from nlosrender.scene.hidden_geometry import ShapeDescription, Surface
 from nlosrender.scene.materials import area_emitter, check_surface, first_line, load_bsdf, medium_warnings, rejected
-from nlosrender.scene.mesh_surfaces import read_surfaces
 from nlosrender.scene.meshes.double_faces import without_double_faces
 from nlosrender.scene.meshes.mesh_attributes import VERTEX_COLOR, attribute_uses
 from nlosrender.scene.meshes.mesh_report import MeshReport
 from nlosrender.scene.meshes.triangle_mesh import TriangleMesh
-from nlosrender.scene.pictures import upright_bsdf
+from nlosrender.scene.picture_orientation import upright_bsdf
 from nlosrender.scene.pose import Float64
-from nlosrender.scene.relay_wall import RelayWall
+from nlosrender.scene.read_surfaces import read_surfaces
 from nlosrender.scene.round_surfaces import ROUND_PLUGINS, Nested, curvature, nested_surfaces
+from nlosrender.scene.surfaces import ShapeDescription, Surface
+from nlosrender.scene.walls.wall import RelayWall
 
 WALL_ID = "relay_wall"
 MOST_REACH = 1e5  # hidden geometry over the wall's size: float32 then tells points 1 % of the wall apart

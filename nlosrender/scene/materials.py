@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nlosrender.errors import ConfigError
-from nlosrender.scene.hidden_geometry import Radiance
 from nlosrender.scene.images import check_image, image_files
+from nlosrender.scene.surfaces import Radiance
 from nlosrender.scene.transforms import transform_matrix
 
 TEXEL_ROUNDING = 1e-3  # half-precision images and their filters may pass 1 a little

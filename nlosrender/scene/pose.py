@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 Float64 = NDArray[np.float64]
+MIN_LENGTH = 1e-12  # of a direction, whose numbers are near 1: below it is rounding of 0
 
 
 @dataclass(frozen=True)
@@ -38,9 +39,7 @@ class Pose:
         ValueError
             A direction is zero or not finite, or the two are parallel.
         """
-        z = _unit(np.asarray(normal, dtype=np.float64), "normal")
-        y = np.asarray(up, dtype=np.float64)
-        y = _unit(y, "up")
+        z, y = unit_direction(normal, "normal"), unit_direction(up, "up")
         y = y - np.dot(y, z) * z
         if np.linalg.norm(y) < 1e-9:
             raise ValueError(f"up {np.ravel(up).tolist()} is parallel to normal {np.ravel(normal).tolist()}")
@@ -68,6 +67,10 @@ class Pose:
         """Express directions (..., 3) of this frame in scene coordinates."""
         return np.asarray(directions, dtype=np.float64) @ self.rotation.T
 
+    def seen_from(self, frame: Pose) -> Pose:
+        """Return this pose in the coordinates of another frame; both are given in the scene's."""
+        return Pose(frame.rotation.T @ self.rotation, frame.to_local(self.origin))
+
     def matrix(self) -> Float64:
         """Return the (4, 4) homogeneous matrix from this frame to scene coordinates."""
         matrix = np.eye(4)
@@ -92,8 +95,28 @@ def euler_xyz(rotate_deg: ArrayLike) -> Float64:
     return rz @ ry @ rx
 
 
-def _unit(direction: Float64, name: str) -> Float64:
-    length = float(np.linalg.norm(direction))
-    if not np.isfinite(length) or length < 1e-12:
-        raise ValueError(f"{name} {direction.tolist()} has no direction: need a finite, non-zero vector")
-    return direction / length
+def cylinder_pose(center: ArrayLike, axis: ArrayLike) -> Pose:
+    """Return the local frame of a cylinder: origin at the middle of its axis, y along the axis.
+
+    Azimuth 0 (local z) is the scene's z axis made perpendicular to the axis; the scene's x axis when the cylinder's
+    axis is within 1 degree of z.
+
+    Parameters
+    ----------
+    center
+        (3,) middle of the axis in the scene [m].
+    axis
+        (3,) direction of the axis, any length; ValueError for zero or one that is not finite.
+    """
+    y = unit_direction(axis, "axis")
+    reference = np.array([0.0, 0.0, 1.0]) if abs(y[2]) < np.cos(np.radians(1.0)) else np.array([1.0, 0.0, 0.0])
+    return Pose.from_normal_up(center, reference - np.dot(reference, y) * y, y)
+
+
+def unit_direction(direction: ArrayLike, name: str) -> Float64:
+    """Return a direction (3,) at length 1; ValueError, with its name, where it has none."""
+    vector = np.asarray(direction, dtype=np.float64)
+    length = float(np.linalg.norm(vector))
+    if not np.isfinite(length) or length < MIN_LENGTH:
+        raise ValueError(f"{name} {vector.tolist()} has no direction: need a finite, non-zero vector")
+    return vector / length

@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from nlosrender.scene.pose import Float64
+from nlosrender.scene.pose import Float64, euler_xyz
+
+if TYPE_CHECKING:
+    from nlosrender.config.hidden_geometry import MeshConfig
+    from nlosrender.config.relay_wall import MeshWallConfig
 
 
 def transform_matrix(to_world: object) -> Float64:
@@ -36,6 +41,14 @@ def transform_matrix(to_world: object) -> Float64:
         if not isinstance(step, Mapping) or len(step) != 1:
             raise ValueError(f"to_world.{number}: got {step!r}, need one of translate, rotate, scale")
         matrix = _step_matrix(*next(iter(step.items())), number) @ matrix
+    return matrix
+
+
+def mesh_matrix(item: MeshConfig | MeshWallConfig) -> Float64:
+    """Return scale, then rotations about x, y and z, then translation, as one (4, 4) matrix."""
+    matrix = np.eye(4)
+    matrix[:3, :3] = euler_xyz(item.rotate_deg) * np.asarray(item.scale)  # of columns: before the rotation
+    matrix[:3, 3] = item.translate
     return matrix
 
 

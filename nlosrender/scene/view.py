@@ -14,15 +14,15 @@ from numpy.typing import ArrayLike
 from nlosrender.config.emitters import PointLamp, SpotLamp
 from nlosrender.scene.bounding_box import Bounds, box_corners, joined_bounds
 from nlosrender.scene.build import load_surface, shape_bounds
-from nlosrender.scene.camera import ImagePlane, image_plane
-from nlosrender.scene.hidden_geometry import ShapeDescription, Surface, hidden_surfaces
 from nlosrender.scene.materials import check_surface, medium_warnings, mitsuba_spectrum, rejected
-from nlosrender.scene.mesh_surfaces import read_surfaces
 from nlosrender.scene.meshes.mesh_report import MeshReport
 from nlosrender.scene.meshes.triangle_mesh import TriangleMesh
-from nlosrender.scene.pictures import upright_bsdf
+from nlosrender.scene.picture_orientation import upright_bsdf
 from nlosrender.scene.pose import Float64, Pose
-from nlosrender.scene.relay_wall import relay_wall_from_config
+from nlosrender.scene.read_surfaces import read_surfaces
+from nlosrender.scene.surfaces import ShapeDescription, Surface, all_surfaces
+from nlosrender.scene.walls.image_plane import ImagePlane, image_plane
+from nlosrender.scene.walls.wall_from_config import relay_wall_from_config
 from nlosrender.scene.xml_loading import WHERE, load_xml_scene
 
 if TYPE_CHECKING:
@@ -109,7 +109,6 @@ def build_view(scene_config: SceneConfig, capture_config: CaptureConfig) -> Buil
 
 def _surfaces(scene_config: SceneConfig, frame: Pose) -> Iterator[Surface]:
     """Yield relay wall, hidden geometry and shining surfaces in the engine's frame [m]."""
-    at = _Frame(frame)
     if scene_config.relay_wall is not None:
         wall = relay_wall_from_config(scene_config.relay_wall)
         description = wall.shape_description()
@@ -122,14 +121,7 @@ def _surfaces(scene_config: SceneConfig, frame: Pose) -> Iterator[Surface]:
             shape = ShapeDescription({**description, "to_world": to_world})
         bsdf = upright_bsdf(description, scene_config.relay_wall.bsdf)
         yield Surface("relay_wall", "scene.relay_wall", shape, bsdf)
-    yield from hidden_surfaces(scene_config.hidden_geometry, at)
-    for index, item in scene_config.shining_surfaces:
-        yield from hidden_surfaces([item], at, [f"scene.emitters.{index}"])
-
-
-@dataclass(frozen=True)
-class _Frame:
-    pose: Pose
+    yield from all_surfaces(scene_config, frame)
 
 
 def _engine_frame(scene_config: SceneConfig, plane: ImagePlane) -> Pose:

@@ -17,7 +17,6 @@ from nlosrender.config.xml_shapes import named, placement, shape_parameters
 from nlosrender.config.xml_tree import numbered_text, place_of
 from nlosrender.scene.bounding_box import box_corners
 from nlosrender.scene.build import load_flat_serialized, shape_bounds
-from nlosrender.scene.hidden_geometry import MESH_PLUGINS, ShapeDescription
 from nlosrender.scene.images import check_image
 from nlosrender.scene.materials import first_line, rejected
 from nlosrender.scene.meshes.file_mesh import FileMesh
@@ -27,6 +26,7 @@ from nlosrender.scene.meshes.mesh_report import MeshReport, mesh_report
 from nlosrender.scene.meshes.primitives import box_mesh, rectangle_mesh
 from nlosrender.scene.meshes.triangle_mesh import TriangleMesh
 from nlosrender.scene.pose import Float64
+from nlosrender.scene.surfaces import MESH_PLUGINS, ShapeDescription
 from nlosrender.scene.transforms import transform_matrix
 from nlosrender.scene.xml_textures import check_attributes, has_two_sides, picture_warnings
 

@@ -10,8 +10,8 @@ from nlosrender.capture.bounces import BounceAxis
 from nlosrender.capture.grids import Capture, point_grid, single_point
 from nlosrender.capture.time_axis import TimeAxis
 from nlosrender.scene.pose import Pose
-from nlosrender.scene.relay_wall import RectangleWall
-from nlosrender.scene.round_walls import SphereWall
+from nlosrender.scene.walls.round_walls import SphereWall
+from nlosrender.scene.walls.wall import RectangleWall
 
 WALL = RectangleWall(Pose.identity(), 2.0, 1.5)
 BOX = (np.array([-0.4, -0.7, 0.5]), np.array([0.9, 0.2, 1.6]))

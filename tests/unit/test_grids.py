@@ -8,8 +8,8 @@ import pytest
 
 from nlosrender.capture.grids import build_capture, point_grid, single_point
 from nlosrender.scene.pose import Pose
-from nlosrender.scene.relay_wall import RectangleWall
-from nlosrender.scene.round_walls import SphereWall
+from nlosrender.scene.walls.round_walls import SphereWall
+from nlosrender.scene.walls.wall import RectangleWall
 
 WALL = RectangleWall(Pose.from_normal_up([5.0, -2.0, 1.0], [1, 0.5, 0.2], [0, 0.3, 1]), 2.0, 1.5)
 SPHERE = SphereWall(np.array([1.0, 2.0, 3.0]), 0.8)

@@ -5,12 +5,13 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from nlosrender.errors import ConfigError
 from nlosrender.scene.bounding_box import joined_bounds
-from nlosrender.scene.hidden_geometry import MeshFile, ShapeDescription, Surface, hidden_surfaces
 from nlosrender.scene.meshes.triangle_mesh import TriangleMesh
 from nlosrender.scene.pose import Pose, euler_xyz
-from nlosrender.scene.relay_wall import RectangleWall
+from nlosrender.scene.surfaces import MeshFile, ShapeDescription, Surface, hidden_surfaces
 from nlosrender.scene.transforms import transform_matrix
+from nlosrender.scene.walls.wall import RectangleWall
 
 WALL = RectangleWall(Pose.from_normal_up([5.0, -2.0, 1.0], [1, 0.5, 0.2], [0, 0.3, 1]), 2.0, 1.5)
 BSDF = {"type": "diffuse", "reflectance": 0.4}
@@ -21,7 +22,7 @@ def item(type, **keys):
 
 
 def one(config) -> Surface:
-    (surface,) = hidden_surfaces([config], WALL)
+    (surface,) = hidden_surfaces([config], WALL.pose)
     return surface
 
 
@@ -162,16 +163,16 @@ def test_errors_name_the_item():
     """A mistake in the third item is reported under its key."""
     good = item("room", size=[1, 2, 3])
     bad = item("cylinder", center=[0, 0, 1], axis=[0, 0, 0], radius=0.1, height=0.5, inside=False)
-    with pytest.raises(ValueError, match=r"scene\.hidden_geometry\.2: axis .* no direction"):
-        hidden_surfaces([good, good, bad], WALL)
-    with pytest.raises(ValueError, match=r"scene\.hidden_geometry\.0: type 'torus'"):
-        hidden_surfaces([item("torus")], WALL)
+    with pytest.raises(ConfigError, match=r"scene\.hidden_geometry\.2: axis .* no direction"):
+        hidden_surfaces([good, good, bad], WALL.pose)
+    with pytest.raises(ConfigError, match=r"scene\.hidden_geometry\.0: type 'torus'"):
+        hidden_surfaces([item("torus")], WALL.pose)
 
 
 def test_names_and_keys_count_the_items():
     """An item without a name is called by its type and place."""
     room = {"size": [1, 2, 3]}
-    surfaces = hidden_surfaces([item("room", **room), item("room", name="hall", **room)], WALL)
+    surfaces = hidden_surfaces([item("room", **room), item("room", name="hall", **room)], WALL.pose)
     assert [surface.name for surface in surfaces] == ["room-0", "hall"]
     assert [surface.key for surface in surfaces] == ["scene.hidden_geometry.0", "scene.hidden_geometry.1"]
 

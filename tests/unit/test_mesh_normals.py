@@ -9,10 +9,10 @@ import pytest
 from support.rendering import configured, flat_wall
 
 from nlosrender.errors import ConfigError
-from nlosrender.scene.mesh_surfaces import ReadSurfaces, describe_meshes
 from nlosrender.scene.meshes.mesh_file import read_mesh
 from nlosrender.scene.meshes.mesh_report import edge_counts
 from nlosrender.scene.meshes.triangle_mesh import TriangleMesh
+from nlosrender.scene.read_surfaces import ReadSurfaces, describe_meshes
 
 CUBE = np.array([[x, y, z] for z in (-1, 1) for y in (-1, 1) for x in (-1, 1)], dtype=float)
 # two triangles a side, counter-clockwise from outside

@@ -15,9 +15,9 @@ from support.wall_meshes import flat, globe, sheet, wavy, write_obj, write_uv_pl
 from nlosrender.capture.grids import build_capture
 from nlosrender.errors import ConfigError
 from nlosrender.rendering.stages import place_scene
-from nlosrender.scene.mesh_wall import MeshWall, mesh_wall_from_config
 from nlosrender.scene.meshes.triangle_mesh import TriangleMesh
 from nlosrender.scene.pose import Pose
+from nlosrender.scene.walls.mesh_wall import MeshWall, mesh_wall_from_config
 
 WIDTH, HEIGHT = 2.0, 1.6
 

@@ -19,7 +19,7 @@ from nlosrender.capture.plan import (
 from nlosrender.capture.tile import Tile, joined, runs
 from nlosrender.errors import ConfigError
 from nlosrender.scene.pose import Pose
-from nlosrender.scene.relay_wall import RectangleWall
+from nlosrender.scene.walls.wall import RectangleWall
 
 WALL = RectangleWall(Pose.identity(), 2.0, 1.0)
 

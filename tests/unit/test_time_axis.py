@@ -10,8 +10,8 @@ from nlosrender.capture.grids import build_capture
 from nlosrender.capture.time_axis import TimeAxis, resolve_time_axis
 from nlosrender.errors import ConfigError
 from nlosrender.scene.pose import Pose
-from nlosrender.scene.relay_wall import RectangleWall
-from nlosrender.scene.round_walls import CylinderWall, SphereWall
+from nlosrender.scene.walls.round_walls import CylinderWall, SphereWall
+from nlosrender.scene.walls.wall import RectangleWall
 
 WALL = RectangleWall(Pose.identity(), 2.0, 1.5)
 SPHERE = SphereWall(np.zeros(3), 0.8)

@@ -12,10 +12,10 @@ from nlosrender.analysis.reconstruction.voxel_grid import VoxelGrid
 from nlosrender.config.load import parse_config
 from nlosrender.errors import ConfigError, FileError
 from nlosrender.files.layout import Float64
-from nlosrender.scene.hidden_geometry import MeshFile, Surface, hidden_surfaces
 from nlosrender.scene.meshes.mesh_file import read_mesh
 from nlosrender.scene.meshes.triangle_mesh import TriangleMesh
-from nlosrender.scene.relay_wall import relay_wall_from_config
+from nlosrender.scene.surfaces import MeshFile, Surface, hidden_surfaces
+from nlosrender.scene.walls.wall_from_config import relay_wall_from_config
 
 if TYPE_CHECKING:
     from shapely.geometry.base import BaseGeometry
@@ -98,7 +98,7 @@ def _surfaces(source: Path, attributes: Mapping[str, object]) -> tuple[Surface, 
     try:
         config = parse_config(text, str(source), source.absolute().parent)
         wall = relay_wall_from_config(config.scene.wall)
-        return hidden_surfaces(config.scene.hidden_geometry, wall)
+        return hidden_surfaces(config.scene.hidden_geometry, wall.pose)
     except (ConfigError, ValueError) as error:
         raise FileError(f"{source}: the configuration it carries cannot be used: {error}") from error
 

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from nlosrender.capture.grids import Capture
 from nlosrender.capture.time_axis import TimeAxis
 from nlosrender.scene.build import WALL_ID, BuiltScene
-from nlosrender.scene.mesh_wall import SAME_FACE, too_fine
 from nlosrender.scene.pose import Float64
+from nlosrender.scene.walls.mesh_wall import MIN_SAME_COSINE, too_fine
 
 KINDS = {
     "Float": np.float32,
@@ -125,7 +125,7 @@ def _on_mesh(built: BuiltScene, point: mi.Point3f, normal: mi.Vector3f) -> mi.Su
     for along, across in ((0, 0), (1, 0), (-1, 0), (0, 1), (0, -1)):
         beside = point + MESH_NUDGE * (along * frame.s + across * frame.t)
         hit = alone.ray_intersect(mi.Ray3f(beside + MESH_LIFT * normal, -normal))
-        is_own = hit.is_valid() & (dr.dot(hit.n, normal) > SAME_FACE)
+        is_own = hit.is_valid() & (dr.dot(hit.n, normal) > MIN_SAME_COSINE)
         interaction = dr.select(is_own & ~found, hit, interaction)
         found = found | is_own
     if not dr.all(found):

@@ -20,8 +20,8 @@ from nlosrender.engine.virtual_lights.elements.tessellator import MAX_PATCHES
 from nlosrender.engine.virtual_lights.engine import VirtualLightEngine
 from nlosrender.engine.virtual_lights.third_bounce import COARSEST_SCALE, REFINEMENT
 from nlosrender.scene.build import BuiltScene, wall_box
-from nlosrender.scene.hidden_geometry import Surface
 from nlosrender.scene.pose import Float64
+from nlosrender.scene.surfaces import Surface
 from nlosrender.scene.view import BuiltView
 
 POINTS_PER_SURFACE = 64

@@ -11,40 +11,30 @@ from numpy.typing import ArrayLike, NDArray
 
 from nlosrender.config.fields import LONGEST, SHORTEST
 from nlosrender.errors import ConfigError
-from nlosrender.scene.hidden_geometry import mesh_matrix
+from nlosrender.scene.bounding_box import Bounds
 from nlosrender.scene.meshes.file_mesh import FileMesh
 from nlosrender.scene.meshes.mesh_file import read_mesh_file
 from nlosrender.scene.meshes.mesh_normals import with_normals
 from nlosrender.scene.meshes.triangle_mesh import TriangleMesh
 from nlosrender.scene.pose import Float64, Pose
-from nlosrender.scene.uv_map import NOWHERE, Indices, UvMap
-from nlosrender.scene.wall_coordinates import on_wall, require_positive
+from nlosrender.scene.transforms import mesh_matrix
+from nlosrender.scene.walls.uv_map import NOWHERE, UvMap
+from nlosrender.scene.walls.wall import RelayWall, require_positive
 
 if TYPE_CHECKING:
     from nlosrender.config.relay_wall import MeshWallConfig
 
-SAME_FACE = 1 - 1e-5  # least cosine between the normals of a face in float32 and float64
+MIN_SAME_COSINE = 1 - 1e-5  # between the normals of a face in float32 and float64: 0.26 degrees
 FLATNESS = 1e-7  # of the wall's size: what float32 coordinates of a file leave of a plane
-LEAST_MEAN_NORMAL = 0.1  # of the length it has on a plane: below it the wall closes round, and no side is its front
-UV_ROUNDING = 1e-6  # texture coordinates may pass 0 and 1 by so much
+MIN_MEAN_NORMAL = 0.1  # of the length it has on a plane: below it the wall closes round, and no side is its front
+UV_ROUNDING = 1e-6  # texture coordinates of a few decimals or in float32 may pass 0 and 1 by this
 
 
 @dataclass(frozen=True, eq=False)
-class MeshWall:
+class MeshWall(RelayWall):
     """A mesh as relay wall, lit on the side of its faces' normals; wall coordinates are its texture coordinates.
 
-    Parameters
-    ----------
-    pose
-        Pose of the local frame in the scene.
-    mesh
-        The wall in its local frame [m], flat faces; texture coordinates within [0, 1].
-    width, height
-        What u and v from 0 to 1 are in wall coordinates [m], > 0.
-    coordinates
-        (n, 2) texture coordinates of the vertices that wall coordinates are made of; None: those of ``mesh``.
-    read, file
-        What its file holds, and the file's name; None, if it has none.
+    What other walls raise as ValueError off the wall is a ConfigError here, that names the hole.
 
     Raises
     ------
@@ -53,38 +43,32 @@ class MeshWall:
     """
 
     pose: Pose
-    mesh: TriangleMesh
-    width: float
-    height: float
-    coordinates: Float64 | None = None
-    read: FileMesh | None = None
-    file: str = ""
+    mesh: TriangleMesh  # in the local frame [m], flat faces; texture coordinates within [0, 1]
+    width: float  # what u from 0 to 1 is in wall coordinates [m], > 0
+    height: float  # what v from 0 to 1 is
+    coordinates: Float64 | None = None  # (n, 2) texture coordinates that wall coordinates are made of; None: the mesh's
+    read: FileMesh | None = None  # what its file holds; None, if it has none
+    file: str = ""  # the file's name
+    is_planar: bool = field(init=False)  # all of the mesh lies in z = 0
     _map: UvMap = field(init=False, repr=False)
     _face_normals: Float64 = field(init=False, repr=False)
-    _is_planar: bool = field(init=False, repr=False)
     _is_lost: NDArray[np.bool_] = field(init=False, repr=False)  # (n,) faces that float32 turns or flattens
 
     def __post_init__(self) -> None:
-        require_positive("relay wall", width=self.width, height=self.height)
+        require_positive(width=self.width, height=self.height)
         if self.mesh.uvs is None:
             raise ValueError("the mesh has no texture coordinates")
         coordinates = self.mesh.uvs if self.coordinates is None else self.coordinates
         object.__setattr__(self, "_map", UvMap(np.clip(coordinates, 0, 1)[self.mesh.faces]))
         object.__setattr__(self, "_face_normals", self.mesh.face_normals())
         flat = not self.mesh.vertices[:, 2].any() and bool((self._face_normals[:, 2] > 0).all())
-        object.__setattr__(self, "_is_planar", flat)
+        object.__setattr__(self, "is_planar", flat)
         rounded = TriangleMesh(self.mesh.vertices.astype(np.float32), self.mesh.faces).face_normals()
         cosines = np.einsum("nk,nk->n", rounded, self._face_normals)
-        object.__setattr__(self, "_is_lost", ~flat & (cosines <= SAME_FACE))
-
-    @property
-    def is_planar(self) -> bool:
-        """Whether all of the mesh lies in z = 0."""
-        return self._is_planar
+        object.__setattr__(self, "_is_lost", ~flat & (cosines <= MIN_SAME_COSINE))
 
     @property
     def area(self) -> float:
-        """Area of the lit side [m^2]."""
         return self.mesh.area
 
     @property
@@ -93,59 +77,54 @@ class MeshWall:
         faces, weights = self._map.locate(np.array([[0.5, 0.5]]))
         if faces[0] == NOWHERE:
             return np.array([0.0, 0.0, 1.0])
-        return self._interpolated(self.mesh.vertices, faces, weights)[0] + self._face_normals[faces[0]]
+        corners = self.mesh.vertices[self.mesh.faces[faces]]
+        return np.einsum("nk,nkx->nx", weights, corners)[0] + self._face_normals[faces[0]]
 
-    def positions(self, xy: ArrayLike) -> Float64:
-        """Return the points (..., 3) [m, local frame] at wall coordinates (..., 2) [m]; ConfigError off the wall."""
-        return self._at(xy, self.mesh.vertices)
-
-    def normals(self, xy: ArrayLike) -> Float64:
-        """Return unit normals (..., 3) of the faces at wall coordinates (..., 2) [m]; ConfigError off the wall."""
-        faces, _ = self._locate(xy)
-        return self._face_normals[faces].reshape(*np.shape(xy)[:-1], 3)
-
-    def uv(self, xy: ArrayLike) -> Float64:
-        """Return texture coordinates (..., 2) as Mitsuba has them; ConfigError off the wall."""
-        return self._at(xy, self.mesh.uvs)
-
-    def on_edges(self, xy: ArrayLike, share: float = 1e-3) -> NDArray[np.bool_]:
-        """Return which points (...,) lie within ``share`` of a triangle's height of one of its edges."""
-        _, weights = self._locate(xy)
-        return (weights.min(axis=1) < share).reshape(np.shape(xy)[:-1])
-
-    def bounds(self) -> tuple[Float64, Float64]:
-        """Return the smallest and largest coordinates of the wall, (3,) and (3,) [m, local frame]."""
+    def bounds(self) -> Bounds:
         return self.mesh.bounds()
 
     def shape_description(self) -> TriangleMesh:
-        """Return the mesh in the local frame."""
         return self.mesh
 
-    def _at(self, xy: ArrayLike, per_vertex: Float64 | None) -> Float64:
-        faces, weights = self._locate(xy)
-        values = self._interpolated(np.asarray(per_vertex), faces, weights)
-        return values.reshape(*np.shape(xy)[:-1], values.shape[-1])
-
-    def _interpolated(self, per_vertex: Float64, faces: Indices, weights: Float64) -> Float64:
-        return np.einsum("nk,nkx->nx", weights, per_vertex[self.mesh.faces[faces]])
-
-    def _locate(self, xy: ArrayLike) -> tuple[Indices, Float64]:
+    def on_wall(self, xy: ArrayLike) -> Float64:
         try:
-            flat = on_wall(self, xy).reshape(-1, 2)
+            return super().on_wall(xy)
         except ValueError as error:
-            raise _refused(str(error)) from error
-        uv = np.clip(flat / [self.width, self.height] + 0.5, 0, 1)
+            raise ConfigError.at("capture", str(error)) from error
+
+    def on_edges(self, xy: ArrayLike, share: float = 1e-3) -> NDArray[np.bool_]:
+        """Return which points (...,) lie within ``share`` of a triangle's height of one of its edges."""
+        xy = self.on_wall(xy)
+        return (self._locate(xy)[1].min(axis=1) < share).reshape(xy.shape[:-1])
+
+    def _positions(self, xy: Float64) -> Float64:
+        return self._interpolated(xy, self.mesh.vertices)
+
+    def _normals(self, xy: Float64) -> Float64:
+        return self._face_normals[self._locate(xy)[0]].reshape(*xy.shape[:-1], 3)
+
+    def _uv(self, xy: Float64) -> Float64:
+        return self._interpolated(xy, np.asarray(self.mesh.uvs))
+
+    def _interpolated(self, xy: Float64, per_vertex: Float64) -> Float64:
+        faces, weights = self._locate(xy)
+        values = np.einsum("nk,nkx->nx", weights, per_vertex[self.mesh.faces[faces]])
+        return values.reshape(*xy.shape[:-1], values.shape[-1])
+
+    def _locate(self, xy: Float64) -> tuple[NDArray[np.int64], Float64]:
+        """Return face (n,) and barycentric coordinates (n, 3) of points; ConfigError in a hole or on a sliver."""
+        flat = xy.reshape(-1, 2)
+        uv = np.clip(flat / self._extent + 0.5, 0, 1)
         faces, weights = self._map.locate(uv)
-        holes = np.flatnonzero(faces == NOWHERE)
-        if len(holes):
-            (x, y), (u, v) = flat[holes[0]], uv[holes[0]]
-            raise _refused(
+        for hole in np.flatnonzero(faces == NOWHERE)[:1]:
+            (x, y), (u, v) = flat[hole], uv[hole]
+            raise ConfigError.at(
+                "capture",
                 f"the relay wall's mesh has no triangle at wall coordinates ({x:.6g}, {y:.6g}) m, (u, v) = "
-                f"({u:.6g}, {v:.6g}); need laser and sensor points on it. Use a smaller grid, or close the hole."
+                f"({u:.6g}, {v:.6g}); need laser and sensor points on it. Use a smaller grid, or close the hole.",
             )
-        lost = np.flatnonzero(self._is_lost[faces])
-        if len(lost):
-            (x, y), corners = flat[lost[0]], self.mesh.vertices[self.mesh.faces[faces[lost[0]]]]
+        for lost in np.flatnonzero(self._is_lost[faces])[:1]:
+            (x, y), corners = flat[lost], self.mesh.vertices[self.mesh.faces[faces[lost]]]
             raise too_fine(
                 f"wall coordinates ({x:.6g}, {y:.6g}) m: the triangle there, of {np.ptp(corners, axis=0).max():.3g} m, "
                 "is a sliver whose normal float32 does not keep"
@@ -161,8 +140,8 @@ def mesh_wall_from_config(config: MeshWallConfig) -> MeshWall:
 
     Raises
     ------
-    ValueError
-        The file cannot be used as a wall; the message begins with the key.
+    ConfigError
+        The file cannot be used as a wall.
     """
     kind = Path(config.filename).suffix.lower().lstrip(".")
     try:
@@ -186,7 +165,7 @@ def mesh_wall_from_config(config: MeshWallConfig) -> MeshWall:
         return MeshWall(pose, mesh, width, height, coordinates, read, Path(config.filename).name)
     except ValueError as error:
         message = f"{config.filename} cannot be the relay wall: {str(error).rstrip('.')}."
-        raise ValueError(f"scene.relay_wall.filename: {message}") from error
+        raise ConfigError.at("scene.relay_wall.filename", message) from error
 
 
 def _checked_uvs(mesh: TriangleMesh, no_uvs: str) -> Float64:
@@ -202,10 +181,7 @@ def _checked_uvs(mesh: TriangleMesh, no_uvs: str) -> Float64:
 
 
 def _mean_tangents(mesh: TriangleMesh, coordinates: Float64) -> tuple[Float64, Float64, float]:
-    """Return dp/du and dp/dv at points spread evenly over (u, v), each (k, 3), and the area covered there.
-
-    Faces count by their share of (u, v): the tangents are those of the faces, repeated.
-    """
+    """Return dp/du and dp/dv of the faces, each (k, 3), weighted by the faces' share of (u, v), and the area of all."""
     corners, uv = mesh.vertices[mesh.faces], coordinates[mesh.faces]
     edges, steps = corners[:, 1:] - corners[:, :1], uv[:, 1:] - uv[:, :1]
     determinant = steps[:, 0, 0] * steps[:, 1, 1] - steps[:, 0, 1] * steps[:, 1, 0]
@@ -216,12 +192,8 @@ def _mean_tangents(mesh: TriangleMesh, coordinates: Float64) -> tuple[Float64, F
     inverse = np.linalg.inv(steps[real])  # rows of edges = steps @ [dp/du, dp/dv]
     tangents = np.einsum("nij,njx->nix", inverse, edges[real])
     shares = np.abs(determinant[real])
-    return tangents[:, 0] * _weights(shares), tangents[:, 1] * _weights(shares), covered
-
-
-def _weights(shares: Float64) -> Float64:
-    """Return factors (n, 1) that make a plain mean one weighted by ``shares``."""
-    return (shares / shares.mean())[:, None]
+    weights = (shares / shares.mean())[:, None]  # make a plain mean one over (u, v)
+    return tangents[:, 0] * weights, tangents[:, 1] * weights, covered
 
 
 def _pose(mesh: TriangleMesh, along_v: Float64) -> Pose:
@@ -230,8 +202,8 @@ def _pose(mesh: TriangleMesh, along_v: Float64) -> Pose:
     normal = np.average(mesh.face_normals(), axis=0, weights=areas)
     up = along_v.mean(axis=0)
     across = np.cross(up, normal)
-    is_open = np.linalg.norm(normal) > LEAST_MEAN_NORMAL
-    if not is_open or np.linalg.norm(across) < LEAST_MEAN_NORMAL * np.linalg.norm(up) * np.linalg.norm(normal):
+    is_open = np.linalg.norm(normal) > MIN_MEAN_NORMAL
+    if not is_open or np.linalg.norm(across) < MIN_MEAN_NORMAL * np.linalg.norm(up) * np.linalg.norm(normal):
         return Pose(np.eye(3), centroid)
     return Pose.from_normal_up(centroid, normal, up)
 
@@ -246,9 +218,5 @@ def _flattened(mesh: TriangleMesh) -> TriangleMesh:
 
 def too_fine(where: str) -> ConfigError:
     """Return the error about a laser or sensor point on a triangle that the renderer cannot find."""
-    message = f"the relay wall's mesh is too fine at {where}. Remove slivers or use larger triangles there, or move the"
-    return ConfigError.at("scene.relay_wall.filename", f"{message} laser and sensor points off it.")
-
-
-def _refused(message: str) -> ConfigError:
-    return ConfigError.at("capture", message)
+    advice = "Remove slivers or use larger triangles there, or move the laser and sensor points off it."
+    return ConfigError.at("scene.relay_wall.filename", f"the relay wall's mesh is too fine at {where}. {advice}")

@@ -1,4 +1,4 @@
-"""The camera of a line-of-sight capture: its image plane stands where other captures have their relay wall."""
+"""The image plane of a line-of-sight capture: it stands where other captures have their relay wall."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from nlosrender.scene.pose import Float64, Pose
-from nlosrender.scene.relay_wall import RectangleWall
+from nlosrender.scene.walls.wall import RectangleWall
 
 
 @dataclass(frozen=True, eq=False)
@@ -16,16 +16,9 @@ class ImagePlane(RectangleWall):
     """The part of a plane that a camera sees; nothing is there, light passes through.
 
     Its axes point right and up in the picture, its normal at the camera, so that pixels are a grid like any other.
-
-    Parameters
-    ----------
-    pose, width, height
-        As for a wall: pose in the scene, extent [m].
-    distance
-        From the camera [m], > 0.
     """
 
-    distance: float = 1.0
+    distance: float = 1.0  # from the camera [m], > 0
 
     @property
     def default_device_position(self) -> Float64:
@@ -41,19 +34,15 @@ def image_plane(
     Parameters
     ----------
     position, look_at, up
-        (3,) where the camera stands, what it looks at [m] and which direction is up in the picture.
+        (3,) where the camera stands, what it looks at [m] and which direction is up in the picture; ValueError if
+        these span no picture.
     fov_deg
         Horizontal field of view [degrees].
     pixels
         Columns and rows; they are square.
-
-    Raises
-    ------
-    ValueError
-        The directions span no picture.
     """
     towards = np.asarray(position, dtype=np.float64) - np.asarray(look_at, dtype=np.float64)
     distance = float(np.linalg.norm(towards))
-    pose = Pose.from_normal_up(look_at, towards, up)
     width = 2 * distance * float(np.tan(np.radians(fov_deg) / 2))
+    pose = Pose.from_normal_up(look_at, towards, up)
     return ImagePlane(pose, width, width * pixels[1] / pixels[0], distance)

@@ -1,0 +1,1 @@
+"""Relay walls: wall coordinates, positions, normals and texture coordinates of every type."""
