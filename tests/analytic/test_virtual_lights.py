@@ -241,7 +241,6 @@ def test_patches_cover_every_surface_once(patch_scale: float) -> None:
 
 # whole blocks of bins, a part of one, more than one; windows that begin after the light or end before it
 WINDOWS = [(8, 0), (11, 2), (40, 9), (13, -3), (5, -2), (7, -40), (6, 50)]
-STEPS = 2000  # midpoints of n^2 equal parts: strips along an edge misplace at most 1 / n of the area
 
 
 def spread_shares(delays: tuple[float, ...], is_cluster: bool | None, n_bins: int, whole: int) -> NDArray[np.float64]:
@@ -266,6 +265,32 @@ def spread_shares(delays: tuple[float, ...], is_cluster: bool | None, n_bins: in
     return histogram.on_host().ravel()
 
 
+def triangle_share_before(time: np.ndarray, delays: tuple[float, ...]) -> np.ndarray:
+    """Return the part of a triangle whose delay, linear between its corners', is less than ``time``."""
+    a, b, c = sorted(delays)
+    if a == c:
+        return (time > a).astype(float)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        rising, falling = (time - a) ** 2 / ((b - a) * (c - a)), 1 - (c - time) ** 2 / ((c - b) * (c - a))
+    return np.select([time <= a, time < b, time < c], [0.0, rising, falling], 1.0)
+
+
+def parallelogram_share_before(time: np.ndarray, delays: tuple[float, ...]) -> np.ndarray:
+    """Return the part of a parallelogram whose delay is less than ``time``: the linear one nearest to its corners'.
+
+    The delay is a sum of two uniform numbers, one along each side.
+    """
+    sides = np.array([[1, 0, 0], [1, 1, 0], [1, 1, 1], [1, 0, 1]])
+    base, along, across = np.linalg.lstsq(sides, np.array(delays), rcond=None)[0].round(9)
+    time = time - base - min(along, 0) - min(across, 0)
+    p, q = abs(along), abs(across)
+    if p * q > 0:
+        return sum(sign * np.maximum(time - x, 0) ** 2 for sign, x in ((1, 0), (-1, p), (-1, q), (1, p + q))) / (
+            2 * p * q
+        )
+    return np.clip(time / (p + q), 0, 1) if p + q > 0 else (time > 0).astype(float)
+
+
 @pytest.mark.parametrize("among_clusters", [False, True])
 @pytest.mark.parametrize(
     "delays",
@@ -281,12 +306,8 @@ def test_a_triangle_is_spread_over_its_bins_by_area(
         shares = spread_shares((*corners, 99.0), False, n_bins, whole)
     else:
         shares = spread_shares(corners, None, n_bins, whole)
-    i, j = np.meshgrid(np.arange(STEPS), np.arange(STEPS))
-    keep = i + j < STEPS
-    u, v = (i[keep] + 1 / 3) / STEPS, (j[keep] + 1 / 3) / STEPS
-    delay = delays[0] + u * (delays[1] - delays[0]) + v * (delays[2] - delays[0])
-    expected = np.histogram(delay + whole, bins=np.arange(n_bins + 1.0))[0] / keep.sum()
-    assert shares[:-1] == pytest.approx(2 * expected, abs=4 / STEPS)
+    expected = np.diff(triangle_share_before(np.arange(n_bins + 1.0) - whole, delays))
+    assert shares[:-1] == pytest.approx(2 * expected, abs=1e-5)  # float32
     assert shares.sum() == pytest.approx(2.0, rel=1e-6)
 
 
@@ -307,13 +328,8 @@ def test_a_parallelogram_is_spread_over_its_bins_by_area(
 ) -> None:
     """The share of each bin is the part whose delay falls into it: the linear one nearest to the corners' delays."""
     shares = spread_shares(delays, True, n_bins, whole)
-    at = np.array([[1, 0, 0], [1, 1, 0], [1, 1, 1], [1, 0, 1]])
-    base, along, across = np.linalg.lstsq(at, np.array(delays), rcond=None)[0]
-    u, v = np.meshgrid(*[(np.arange(STEPS) + 0.5) / STEPS] * 2)
-    delay = (base + along * u + across * v).ravel()
-    # rounded: equal delays of many points on a bin's edge are on one side of it
-    expected = np.histogram(np.round(delay, 9) + whole, bins=np.arange(n_bins + 1.0))[0] / STEPS**2
-    assert shares[:-1] == pytest.approx(2 * expected, abs=4 / STEPS)
+    expected = np.diff(parallelogram_share_before(np.arange(n_bins + 1.0) - whole, delays))
+    assert shares[:-1] == pytest.approx(2 * expected, abs=1e-5)  # float32
     assert shares.sum() == pytest.approx(2.0, rel=1e-6)
 
 

@@ -1,11 +1,10 @@
 """``nlosrender render`` as its users meet it: files, reports, exit codes."""
 
 import json
-import subprocess
-import sys
 
 import h5py
 import pytest
+from support.commands import run
 
 from nlosrender.files.validation import validate_file
 
@@ -31,16 +30,11 @@ def write_config(folder, scan="single", engine="path", bsdf="{type: diffuse, ref
     return path
 
 
-def run(*arguments, cwd):
-    command = [sys.executable, "-m", "nlosrender", *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, check=False, cwd=cwd)
-
-
 @pytest.mark.parametrize("scan", ["single", "confocal", "exhaustive"])
 def test_a_render_leaves_a_valid_file_and_an_honest_report(scan, tmp_path):
     """One command, one file of the fixed layout, and a JSON report that agrees with it."""
     config = write_config(tmp_path, scan)
-    done = run("render", config, "-o", "capture.hdf5", "--json", cwd=tmp_path)
+    done = run(tmp_path, "render", config, "-o", "capture.hdf5", "--json")
     assert done.returncode == 0, done.stderr
     report = json.loads(done.stdout)
     assert set(report["seconds"]) == {"scene", "compile", "render", "compress", "write", "total"}
@@ -59,14 +53,14 @@ def test_a_render_leaves_a_valid_file_and_an_honest_report(scan, tmp_path):
 def test_a_part_that_the_capture_does_not_have(part, tmp_path):
     """A mistake in the arguments, exit code 2, though only the configuration tells; nothing is left."""
     config = write_config(tmp_path, "exhaustive")
-    done = run("render", config, "-o", "a.hdf5", *part, cwd=tmp_path)
+    done = run(tmp_path, "render", config, "-o", "a.hdf5", *part)
     assert (done.returncode, f"error: {' '.join(part)}: " in done.stderr) == (2, True), done.stderr
     assert list(tmp_path.iterdir()) == [config]
 
 
 def test_the_output_defaults_to_the_name_of_the_configuration(tmp_path):
     """scene.yaml gives scene.hdf5 in the current folder, and the report says so."""
-    done = run("render", write_config(tmp_path), cwd=tmp_path)
+    done = run(tmp_path, "render", write_config(tmp_path))
     assert done.returncode == 0, done.stderr
     assert "wrote scene.hdf5" in done.stdout
     assert (tmp_path / "scene.hdf5").exists()
@@ -74,7 +68,7 @@ def test_the_output_defaults_to_the_name_of_the_configuration(tmp_path):
 
 def test_set_overrides_a_key(tmp_path):
     """Shell loops sweep with --set."""
-    done = run("render", write_config(tmp_path), "--set", "capture.sensor_grid.nx=7", "--json", cwd=tmp_path)
+    done = run(tmp_path, "render", write_config(tmp_path), "--set", "capture.sensor_grid.nx=7", "--json")
     assert done.returncode == 0, done.stderr
     with h5py.File(tmp_path / "scene.hdf5") as file:
         assert file["data"].shape[4] == 7
@@ -82,18 +76,17 @@ def test_set_overrides_a_key(tmp_path):
 
 def test_quiet_prints_nothing(tmp_path):
     """--quiet is for loops whose output is looked at only when something fails."""
-    done = run("render", write_config(tmp_path), "--quiet", cwd=tmp_path)
+    done = run(tmp_path, "render", write_config(tmp_path), "--quiet")
     assert (done.returncode, done.stdout) == (0, "")
 
 
 def test_what_only_mitsuba_rejects_is_reported_with_its_place(tmp_path):
     """A parameter that Mitsuba does not accept ends in exit 3 with file:line:column, and no file is written."""
     config = write_config(tmp_path, bsdf="{type: hair, no_such_parameter: 3}")
-    done = run("render", config, cwd=tmp_path)
+    done = run(tmp_path, "render", config)
     assert done.returncode == 3, done.stderr
     assert "scene.yaml:5:" in done.stderr
     assert "scene.hidden_geometry.0.bsdf" in done.stderr
-    assert "Traceback" not in done.stderr
     assert sorted(path.name for path in tmp_path.iterdir()) == ["scene.yaml"]
 
 
@@ -104,27 +97,23 @@ def test_a_mesh_that_is_no_mesh_is_reported_with_its_place(tmp_path):
     start = text.index("    - {type: rectangle")
     text = text[:start] + "    - {type: mesh, filename: broken.ply}\n" + text[text.index("capture:") :]
     (tmp_path / "scene.yaml").write_text(text)
-    done = run("render", "scene.yaml", cwd=tmp_path)
+    done = run(tmp_path, "render", "scene.yaml")
     assert done.returncode == 3, done.stderr
     assert "broken.ply" in done.stderr
     assert "scene.yaml:5:" in done.stderr
-    assert "Traceback" not in done.stderr
 
 
 def test_an_output_folder_that_is_missing_is_found_before_rendering(tmp_path):
     """Nothing long starts when its result could not be written."""
-    done = run("render", write_config(tmp_path), "-o", "missing/capture.hdf5", cwd=tmp_path)
+    done = run(tmp_path, "render", write_config(tmp_path), "-o", "missing/capture.hdf5")
     assert done.returncode == 3
     assert "missing" in done.stderr
-    assert "Traceback" not in done.stderr
 
 
 def test_a_capture_that_cannot_fit_is_refused(tmp_path):
     """The memory limit is checked before anything is allocated."""
-    done = run(
-        "render", write_config(tmp_path), "--set", "time_axis.n_bins=1000000000", "--set", "render.memory_limit=1GB",
-        cwd=tmp_path,
-    )  # fmt: skip
+    settings = ("--set", "time_axis.n_bins=1000000000", "--set", "render.memory_limit=1GB")
+    done = run(tmp_path, "render", write_config(tmp_path), *settings)
     assert done.returncode == 3, done.stderr
     assert "memory_limit" in done.stderr
 
@@ -132,7 +121,7 @@ def test_a_capture_that_cannot_fit_is_refused(tmp_path):
 @pytest.mark.parametrize("command", ["render", "merge", "doctor", "new", "validate", "schema", "info", "plot"])
 def test_help_ends_with_an_example(command, tmp_path):
     """Each command's --help shows one real call and what it creates."""
-    done = run(command, "--help", cwd=tmp_path)
+    done = run(tmp_path, command, "--help")
     assert done.returncode == 0
     assert f"nlosrender {command}" in done.stdout
     assert "Example" in done.stdout
