@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from nlosrender.cli.options import one_of
+from nlosrender.cli.tables import print_table
 
 if TYPE_CHECKING:
     from nlosrender.bench.paper.figure import PaperFigure
@@ -56,10 +57,8 @@ def paper(
 
 
 def _print_figure(figure: PaperFigure) -> None:
-    from nlosrender.bench.paper.figure import text_table
-
     typer.echo(f"\n{figure.name}: {figure.title} ({figure.seconds:.1f} s)\n  {figure.measured}")
     for check in figure.checks:
         typer.echo(f"  {'holds' if check.holds else 'FAILS'}: {check.statement}")
     for table in figure.tables:
-        typer.echo("  " + text_table(table).replace("\n", "\n  "))
+        print_table([table.columns, *table.rows], indent=2)

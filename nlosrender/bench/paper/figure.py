@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -66,14 +65,3 @@ class PaperFigure:
 def relative_name(path: Path, folder: Path) -> str:
     """Return a file's name as seen from ``folder``."""
     return path.resolve().relative_to(folder.resolve()).as_posix()
-
-
-def text_table(table: Table) -> str:
-    """Return a table as aligned text."""
-    rows = [table.columns, *table.rows]
-    widths = [max(len(row[column]) for row in rows) for column in range(len(table.columns))]
-    return "\n".join("  ".join(_aligned(row, widths)).rstrip() for row in rows)
-
-
-def _aligned(row: Sequence[str], widths: Sequence[int]) -> list[str]:
-    return [cell.ljust(width) for cell, width in zip(row, widths, strict=True)]

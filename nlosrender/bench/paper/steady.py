@@ -1,4 +1,4 @@
-"""Mitsuba's own steady pictures of a line-of-sight capture's scene, to hold its sum over time against."""
+"""Mitsuba's own steady pictures of a line-of-sight capture's scene, to compare its sum over time with."""
 
 from __future__ import annotations
 
