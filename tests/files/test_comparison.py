@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 from support.partial_captures import write_capture
 
+from nlosrender.analysis.comparison.blocks import BLOCK_SAMPLES
 from nlosrender.analysis.comparison.captures import Comparison, Tolerances, compare_captures
 from nlosrender.analysis.comparison.dataset import check_dataset
 from nlosrender.analysis.comparison.report import comparison_report
@@ -35,7 +36,8 @@ def compare(tmp_path: Path, header_of: Header) -> Callable[..., Comparison]:
         header_b = options.get("reference") or header_a
         for name, block, header in (("a", a, header_a), ("b", b, header_b)):
             write_capture(tmp_path / f"{name}.hdf5", header, block)
-        return compare_captures(tmp_path / "a.hdf5", tmp_path / "b.hdf5", tolerances or Tolerances())
+        paths = tmp_path / "a.hdf5", tmp_path / "b.hdf5"
+        return compare_captures(*paths, tolerances or Tolerances(), options.get("block_samples", BLOCK_SAMPLES))
 
     return run
 
@@ -266,14 +268,11 @@ def test_what_neither_file_stores_is_not_read(tmp_path: Path) -> None:
     assert float(done.stdout.split()[-1]) < 10
 
 
-def test_blocks_cover_everything(
-    monkeypatch: pytest.MonkeyPatch, compare: Callable, header_of: Header, block_of: Callable
-) -> None:
+def test_blocks_cover_everything(compare: Callable, header_of: Header, block_of: Callable) -> None:
     """However small the blocks are, the numbers are the same."""
     a, b = block_of(header_of(), 1), block_of(header_of(), 2)
     whole = comparison_report(compare(a, b))
-    monkeypatch.setattr("nlosrender.analysis.comparison.blocks.BLOCK_SAMPLES", 30)  # two sensor points of 2 x 7
-    cut = comparison_report(compare(a, b))
+    cut = comparison_report(compare(a, b, block_samples=30))  # two sensor points of 2 x 7
     assert cut["largest_difference"] == whole["largest_difference"]
     assert cut["worst"] == whole["worst"]
     assert cut["relative_l2"] == pytest.approx(whole["relative_l2"], rel=1e-12)

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nlosrender.errors import FileError
-from nlosrender.files.reading.reader import StoredCapture, StoredPositions
+from nlosrender.files.reading.reader import StoredCapture
 from nlosrender.files.reading.stored_header import StoredHeader
 
 T = TypeVar("T", np.float32, np.float64)
@@ -81,28 +81,28 @@ def align(capture: StoredCapture, reference: StoredCapture) -> Alignment:
         A file is damaged.
     """
     a, b = capture.header, reference.header
-    sensors, lasers = GridTurn(a.sensor_grid), GridTurn(a.laser_grid)
-    notes: list[str] = []
     try:
-        grids = (capture.positions, reference.positions)
+        points, others = capture.positions, reference.positions
+        sensors = _turn(points.sensor_positions, others.sensor_positions)
+        lasers = _turn(points.laser_positions, others.laser_positions)
     except FileError:  # samples mean something without positions too: other writers leave them out
-        grids = None
-    if grids is not None:
-        sensors, lasers = _turns(*grids)
-        for name, turn in (("sensor", sensors), ("laser", lasers)):
-            if turn != GridTurn(turn.shape) and (name == "sensor" or not a.confocal):
-                notes.append(f"{name} points are in another order than the reference's")
+        sensors, lasers = GridTurn(a.sensor_grid), GridTurn(a.laser_grid)
+    turns = {"sensor": sensors} | ({} if a.confocal else {"laser": lasers})
+    notes = [
+        f"{name} points are in another order than the reference's"
+        for name, turn in turns.items()
+        if turn != GridTurn(turn.shape)
+    ]
     lead, reference_lead = _leads(a, b)
-    header = b
     if lead or reference_lead:
         n_bins = max(lead + a.n_bins, reference_lead + b.n_bins)
         start = b.start_opl - reference_lead * b.bin_width_opl
-        header = replace(b, sizes={**b.sizes, "bin": n_bins}, start_opl=start)
         notes.append(
             f"bins begin at {a.start_opl:.6g} m, the reference's at {b.start_opl:.6g} m: bin 0 below is at "
             f"{start:.6g} m, and bins that one of them lacks count as dark there"
         )
-    return Alignment(sensors, lasers, lead, reference_lead, header, tuple(notes))
+        b = replace(b, sizes={**b.sizes, "bin": n_bins}, start_opl=start)
+    return Alignment(sensors, lasers, lead, reference_lead, b, tuple(notes))
 
 
 def apart(a: Grid, b: Grid) -> bool:
@@ -111,11 +111,6 @@ def apart(a: Grid, b: Grid) -> bool:
         return True
     largest = max(float(np.abs(b).max()), np.finfo(np.float64).tiny)
     return not bool((np.abs(a - b) <= POSITION_TOLERANCE * largest).all())  # a NaN is apart from everything
-
-
-def _turns(a: StoredPositions, b: StoredPositions) -> tuple[GridTurn, GridTurn]:
-    sensors = _turn(a.sensor_positions, b.sensor_positions)
-    return sensors, _turn(a.laser_positions, b.laser_positions)
 
 
 def _turn(points: Grid, reference: Grid) -> GridTurn:

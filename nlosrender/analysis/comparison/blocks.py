@@ -21,7 +21,7 @@ from nlosrender.files.reading.stored_header import samples_of
 Float32 = NDArray[np.float32]
 Samples = NDArray[np.float32] | NDArray[np.float64]  # as stored, or as rendered
 BLOCK_SAMPLES = 2**21  # of one dataset at a time: 8 MiB as read, and about 20 times that in intermediate results
-LARGEST_CHUNK = 8  # blocks; larger ones, by other writers, are unpacked more than once
+MAX_CHUNK = 8  # blocks; larger ones, by other writers, are unpacked more than once
 MAX_POINTS = 2**24  # of one grid; 4096 x 4096 is beyond any scan
 MAX_PER_POINT = 2**26  # samples of one sensor point and laser: 11 million bins of six bounces
 STORED = ("bounce", "sensor_y", "sensor_x", "laser_y", "laser_x")  # axes along which parts may never be written
@@ -64,9 +64,10 @@ class OpenCapture:
                 "Check the file with `nlosrender info`."
             )
         samples = samples_of(file, path)
-        # of one chunk, along every axis; none for a file without chunks, all of which counts as written
-        self._steps = dict(zip(self.header.axes, samples.chunks or (), strict=False))
-        self._written = self._written_chunks(samples) if self._steps else set()
+        # of one chunk along every axis; a file without chunks is one chunk, which counts as written
+        chunk = zip(self.header.axes, samples.chunks or samples.shape, strict=False)
+        self._steps = dict.fromkeys(STORED, 1) | dict(chunk)
+        self._written = self._written_chunks(samples) if samples.chunks else {(0,) * len(STORED)}
         self._lasers = {chunk[-2:] for chunk in self._written}
         self.sensors, self.lasers = GridTurn(self.header.sensor_grid), GridTurn(self._laser_grid())
         self._lead, self._n_bins = 0, self.header.n_bins
@@ -82,45 +83,36 @@ class OpenCapture:
 
     @property
     def tile(self) -> tuple[int, int]:
-        """Rows and columns of sensor points in one chunk; the whole grid for a file without chunks."""
-        if not self._steps:
-            return self.sensors.turned_shape
+        """Rows and columns of sensor points in one chunk."""
         height, width = self._steps["sensor_y"], self._steps["sensor_x"]
         return (width, height) if self.sensors.transposed else (height, width)
 
     def stores_laser(self, laser: tuple[int, int]) -> bool:
         """Return whether any sample of a laser may differ from zero, without reading it."""
-        return not self._steps or self._laser_chunk(self._stored_laser(laser)) in self._lasers
+        return self._laser_chunk(laser) in self._lasers
 
     def stores(self, bounce: int, laser: tuple[int, int], rows: slice, columns: slice) -> bool:
         """Return whether any sample of the part may differ from zero, without reading it."""
-        if not self._steps:
-            return True
-        rows, columns = self.sensors.stored(rows, columns)
-        height, width = self._steps["sensor_y"], self._steps["sensor_x"]
-        at = self._laser_chunk(self._stored_laser(laser))
-        return any(
-            (bounce // self._steps["bounce"], y, x, *at) in self._written
-            for y in range(rows.start // height, -(-rows.stop // height))
-            for x in range(columns.start // width, -(-columns.stop // width))
-        )
+        parts = zip(self.sensors.stored(rows, columns), ("sensor_y", "sensor_x"), strict=True)
+        ys, xs = (range(part.start // self._steps[axis], -(-part.stop // self._steps[axis])) for part, axis in parts)
+        first, last = bounce // self._steps["bounce"], self._laser_chunk(laser)
+        return any((first, y, x, *last) in self._written for y in ys for x in xs)
 
     def _stored_laser(self, laser: tuple[int, int]) -> tuple[int, int]:
         row, column = self.lasers.stored(*(slice(index, index + 1) for index in laser))
         return row.start, column.start
 
     def _laser_chunk(self, laser: tuple[int, int]) -> tuple[int, int]:
-        row, column = laser
-        return row // self._steps.get("laser_y", 1), column // self._steps.get("laser_x", 1)
+        row, column = self._stored_laser(laser)
+        return row // self._steps["laser_y"], column // self._steps["laser_x"]
 
     def _written_chunks(self, samples: h5py.Dataset) -> set[tuple[int, ...]]:
         """Return where, along ``STORED``, a chunk was written: numbers of chunks, not of samples."""
         written: set[tuple[int, ...]] = set()
-        places = [self.header.axes.index(axis) if axis in self.header.axes else None for axis in STORED]
 
         def note(chunk: h5py.h5d.StoreInfo) -> None:
-            at = chunk.chunk_offset
-            written.add(tuple(0 if place is None else at[place] // samples.chunks[place] for place in places))
+            starts = dict(zip(self.header.axes, chunk.chunk_offset, strict=False))
+            written.add(tuple(starts.get(axis, 0) // self._steps[axis] for axis in STORED))
 
         samples.id.chunk_iter(note)
         return written
@@ -173,7 +165,7 @@ def open_for_comparison(path: Path) -> Iterator[OpenCapture]:
         yield capture
 
 
-def blocks(a: OpenCapture, b: OpenCapture, with_variance: bool) -> Iterator[Block]:
+def blocks(a: OpenCapture, b: OpenCapture, with_variance: bool, block_samples: int = BLOCK_SAMPLES) -> Iterator[Block]:
     """Yield all parts of two captures of the same structure that either of them stores, laser after laser.
 
     Raises
@@ -187,7 +179,7 @@ def blocks(a: OpenCapture, b: OpenCapture, with_variance: bool) -> Iterator[Bloc
         laser = (row, column)
         if not (a.stores_laser(laser) or b.stores_laser(laser)):
             continue
-        for rows, columns in _tiles(a):
+        for rows, columns in _tiles(a, block_samples):
             stored = tuple(
                 bounce
                 for bounce in range(a.header.sizes["bounce"])
@@ -203,13 +195,13 @@ def blocks(a: OpenCapture, b: OpenCapture, with_variance: bool) -> Iterator[Bloc
             yield Block(laser, rows, columns, stored, *samples, *variances)
 
 
-def _tiles(capture: OpenCapture) -> Iterator[tuple[slice, slice]]:
-    """Cut the sensor grid into tiles of about ``BLOCK_SAMPLES``, whole chunks unless these are far larger."""
+def _tiles(capture: OpenCapture, block_samples: int) -> Iterator[tuple[slice, slice]]:
+    """Cut the sensor grid into tiles of about ``block_samples``, whole chunks unless these are far larger."""
     header = capture.header
     n_rows, n_columns = capture.sensors.turned_shape
-    points = max(BLOCK_SAMPLES // (header.sizes["channel"] * len(header.bounce_indices) * header.n_bins), 1)
+    points = max(block_samples // (header.sizes["channel"] * len(header.bounce_indices) * header.n_bins), 1)
     height, width = capture.tile
-    if height * width > LARGEST_CHUNK * points:
+    if height * width > MAX_CHUNK * points:
         height, width = 1, 1
     chunks = max(points // (height * width), 1)
     across = min(chunks, -(-n_columns // width))

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from nlosrender.analysis.comparison.alignment import align
-from nlosrender.analysis.comparison.blocks import OpenCapture, blocks, open_for_comparison
+from nlosrender.analysis.comparison.blocks import BLOCK_SAMPLES, OpenCapture, blocks, open_for_comparison
 from nlosrender.analysis.comparison.differences import Differences
 from nlosrender.analysis.comparison.shift import TimeShift
 from nlosrender.analysis.comparison.structure import StructureDifference, structure_differences
@@ -86,10 +86,6 @@ class Comparison:
         exceeding = (str(finding) for finding in self.findings if finding.exceeds)
         return (*(str(difference) for difference in self.structure), *exceeding)
 
-    def bounce_name(self, bounce: int) -> str:
-        """Return what an index of the bounce axis holds: a bounce number, "7 and above" or "all"."""
-        return bounce_name(self.header, bounce)
-
 
 def bounce_name(header: StoredHeader, bounce: int) -> str:
     """Return what an index of a file's bounce axis holds: a bounce number, "7 and above" or "all"."""
@@ -98,8 +94,10 @@ def bounce_name(header: StoredHeader, bounce: int) -> str:
     return BounceAxis(highest, header.split_bounces is not False, header.first_bounce).name(bounce)
 
 
-def compare_captures(path: str | Path, reference: str | Path, tolerances: Tolerances) -> Comparison:
-    """Compare a capture with a reference, a block of samples at a time.
+def compare_captures(
+    path: str | Path, reference: str | Path, tolerances: Tolerances, block_samples: int = BLOCK_SAMPLES
+) -> Comparison:
+    """Compare a capture with a reference, about ``block_samples`` samples at a time.
 
     Raises
     ------
@@ -116,21 +114,14 @@ def compare_captures(path: str | Path, reference: str | Path, tolerances: Tolera
             a.align(alignment.sensors, alignment.lasers, alignment.lead, header.n_bins)
             b.align(b.sensors, b.lasers, alignment.reference_lead, header.n_bins)
             test = None if tolerances.significance is None else _z_test(a, b, header, tolerances.significance)
-            _look_at_samples(a, b, differences, shift, test)
+            for block in blocks(a, b, with_variance=test is not None, block_samples=block_samples):
+                for sums in (differences, shift, test):
+                    if sums is not None:
+                        sums.add(block)
+            if test is not None:
+                test.finish()
             findings = tuple(_findings(header, differences, shift, test, tolerances))
         return Comparison(a.path, b.path, structure, alignment.notes, header, differences, shift, test, findings)
-
-
-def _look_at_samples(
-    a: OpenCapture, b: OpenCapture, differences: Differences, shift: TimeShift, test: ZTest | None
-) -> None:
-    for block in blocks(a, b, with_variance=test is not None):
-        differences.add(block)
-        shift.add(block)
-        if test is not None:
-            test.add(block)
-    if test is not None:
-        test.finish()
 
 
 def _z_test(a: OpenCapture, b: OpenCapture, header: StoredHeader, significance: float) -> ZTest:
@@ -147,12 +138,12 @@ def _findings(
 ) -> Iterator[Finding]:
     """Hold every number that has a tolerance against it."""
     if tolerances.max_rel_l2 is not None:
-        yield Finding("relative L2", differences.relative_l2, tolerances.max_rel_l2)
+        yield Finding("relative L2", differences.relative_l2(), tolerances.max_rel_l2)
     if tolerances.max_energy is not None:
         for bounce in differences.lit_bounces:
-            energy = differences.relative_energy_of(bounce)
+            energy = differences.relative_energy(bounce)
             yield Finding(f"energy of bounce {bounce_name(header, bounce)}", energy, tolerances.max_energy)
-        yield Finding("energy", differences.relative_energy, tolerances.max_energy)
+        yield Finding("energy", differences.relative_energy(), tolerances.max_energy)
     if tolerances.max_shift is not None:
         worst = shift.worst()
         if worst is not None:

@@ -8,10 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from nlosrender.analysis.comparison.blocks import Block, Samples
+from nlosrender.analysis.comparison.blocks import Block
 from nlosrender.files.reading.stored_header import StoredHeader
 
 Float64 = NDArray[np.float64]
+ALL = slice(None)  # bounces
 
 
 @dataclass(frozen=True)
@@ -79,23 +80,14 @@ class Differences:
         self.squares_laser[block.laser] += squares.sum()
         self.squares_bin += squares.sum(axis=(0, 1, 2, 3))
 
-    @property
-    def relative_l2(self) -> float:
-        """Relative L2 norm of a - b, over everything."""
-        return ratio(math.sqrt(self.squares_bounce.sum()), math.sqrt(self.squares_b.sum()))
+    def relative_l2(self, bounce: int | slice = ALL) -> float:
+        """Return the relative L2 norm of a - b over everything, or in one bounce index."""
+        return ratio(math.sqrt(self.squares_bounce[bounce].sum()), math.sqrt(self.squares_b[bounce].sum()))
 
-    def relative_l2_of(self, bounce: int) -> float:
-        """Relative L2 norm of a - b in one bounce index."""
-        return ratio(math.sqrt(self.squares_bounce[bounce]), math.sqrt(self.squares_b[bounce]))
-
-    def relative_energy_of(self, bounce: int) -> float:
-        """Return (energy of a - energy of b) / energy of b of one bounce index; signed."""
-        return ratio(float(self.energy_a[bounce] - self.energy_b[bounce]), float(self.energy_b[bounce]))
-
-    @property
-    def relative_energy(self) -> float:
-        """The same over all bounces."""
-        return ratio(float(self.energy_a.sum() - self.energy_b.sum()), float(self.energy_b.sum()))
+    def relative_energy(self, bounce: int | slice = ALL) -> float:
+        """Return (energy of a - energy of b) / energy of b over everything, or in one bounce index; signed."""
+        a, b = float(self.energy_a[bounce].sum()), float(self.energy_b[bounce].sum())
+        return ratio(a - b, b)
 
     @property
     def lit_bounces(self) -> tuple[int, ...]:
@@ -107,24 +99,18 @@ class Differences:
         """Where most of the squared difference is; None where there is none."""
         if self.largest is None:
             return None
-        return WorstPlaces(
-            laser=_index(self.squares_laser),
-            sensor=_index(self.squares_sensor),
-            bounce=int(np.argmax(self.squares_bounce)),
-            bin=int(np.argmax(self.squares_bin)),
-        )
+        laser, sensor = index_of_max(self.squares_laser), index_of_max(self.squares_sensor)
+        (bounce,), (time_bin,) = index_of_max(self.squares_bounce), index_of_max(self.squares_bin)
+        return WorstPlaces((laser[0], laser[1]), (sensor[0], sensor[1]), bounce, time_bin)
 
     def _note_largest(self, block: Block, difference: Float64) -> None:
-        flat = int(np.argmax(np.abs(difference)))
-        where = np.unravel_index(flat, difference.shape)
-        value, reference = _value(block.a, where), _value(block.b, where)
+        where = channel, slot, row, column, time_bin = index_of_max(np.abs(difference))
+        value, reference = float(block.a[where]), float(block.b[where])
         if self.largest and abs(value - reference) <= abs(self.largest.value - self.largest.reference):
             return
-        channel, slot, row, column, time_bin = (int(index) for index in where)
         sensor = (block.rows.start + row, block.columns.start + column)
-        self.largest = LargestDifference(
-            block.laser, sensor, block.bounces[slot], channel, time_bin, value, reference
-        )  # fmt: skip
+        place = (block.laser, sensor, block.bounces[slot])
+        self.largest = LargestDifference(*place, channel, time_bin, value, reference)
 
 
 def ratio(numerator: float, denominator: float) -> float:
@@ -134,10 +120,6 @@ def ratio(numerator: float, denominator: float) -> float:
     return numerator / denominator if denominator != 0 else math.copysign(math.inf, numerator)
 
 
-def _index(sums: Float64) -> tuple[int, int]:
-    row, column = np.unravel_index(int(np.argmax(sums)), sums.shape)
-    return int(row), int(column)
-
-
-def _value(samples: Samples, where: tuple[np.intp, ...]) -> float:
-    return float(samples[where])
+def index_of_max(values: Float64) -> tuple[int, ...]:
+    """Return the index of the largest value."""
+    return tuple(int(index) for index in np.unravel_index(np.argmax(values), values.shape))

@@ -24,14 +24,16 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from nlosrender.analysis.comparison.blocks import Block, Samples
+from nlosrender.analysis.comparison.differences import index_of_max
 from nlosrender.capture.bounces import FIRST_BOUNCE, LAST_FILE_BOUNCE, THIRD_BOUNCE
 
 Float64 = NDArray[np.float64]
+Place = tuple[int, int] | None  # row and column in a grid
 
 MIN_LIGHT = 5.0  # standard deviations: a sum of 25 equal deposits
 MIN_FREEDOM = 10.0  # degrees of freedom: below it t is so wide that a statement says nothing
-MOST_FREEDOM = 1e9
-FEWEST_REPLICAS = 2  # behind a stored variance, where the file does not say
+MAX_FREEDOM = 1e9  # t is normal long before
+MIN_REPLICAS = 2  # behind a stored variance, where the file does not say
 ROUNDING = 1e-5  # relative: float32 samples, and arithmetic that differs between processors
 MANY_BOUNCES = 10  # deposits of one path in one index, where paths have no limit: later ones are weak
 
@@ -41,8 +43,8 @@ class Deviation:
     """The statement that two captures agree least on, about bins first_bin to last_bin."""
 
     z: float  # inf: light against none at all
-    laser: tuple[int, int] | None  # None: of all laser points
-    sensor: tuple[int, int] | None  # None: of all sensor points
+    laser: Place  # None: of all laser points
+    sensor: Place  # None: of all sensor points
     bounce: int  # index on the file's bounce axis
     channel: int
     first_bin: int
@@ -87,23 +89,16 @@ class Side:
 
 
 class Described(Protocol):
-    """What is known of a capture, stored or in memory: a ``StoredHeader``, or as much of one as the test asks for."""
+    """What the test asks of a capture, stored (``StoredHeader``) or in memory."""
 
     @property
-    def attributes(self) -> Mapping[str, object]:
-        """Return ``render_engine``, ``replicas`` and ``max_bounces``, where they are known."""
-
+    def attributes(self) -> Mapping[str, object]: ...  # render_engine, replicas, max_bounces, where they are known
     @property
-    def sizes(self) -> Mapping[str, int]:
-        """Return the lengths of at least the axes channel and bounce."""
-
+    def sizes(self) -> Mapping[str, int]: ...  # of at least the axes channel and bounce
     @property
-    def split_bounces(self) -> bool | None:
-        """Return whether each bounce has an index of its own; None: not known."""
-
+    def split_bounces(self) -> bool | None: ...  # whether each bounce has an index of its own; None: not known
     @property
-    def n_bins(self) -> int:
-        """Return the number of bins."""
+    def n_bins(self) -> int: ...
 
 
 class ErrorModel:
@@ -119,7 +114,7 @@ class ErrorModel:
         attributes, n_bounces = header.attributes, header.sizes["bounce"]
         replicas, limit = attributes.get("replicas"), attributes.get("max_bounces")
         self.is_independent = attributes.get("render_engine") != "virtual_lights"
-        freedom = max(replicas if isinstance(replicas, int) else 0, FEWEST_REPLICAS) - 1
+        freedom = max(replicas if isinstance(replicas, int) else 0, MIN_REPLICAS) - 1
         self.freedom = freedom if self.is_independent else 1
         third = THIRD_BOUNCE - FIRST_BOUNCE
         self._is_noise = np.ones(n_bounces, dtype=bool)
@@ -174,9 +169,9 @@ def deviations(a: Side, b: Side, per_light_a: Float64, per_light_b: Float64) -> 
     square += np.square(a.bound) + np.square(b.bound) + np.square(rounding)
     estimates, spread = a.estimates + b.estimates, a.estimates_squared + b.estimates_squared
     # Satterthwaite 1946, with E[v^2] = var^2 (1 + 2 / f) taken out of the estimates v with f degrees of freedom
-    freedom = np.full_like(difference, MOST_FREEDOM)
+    freedom = np.full_like(difference, MAX_FREEDOM)
     np.divide(np.square(estimates), spread, out=freedom, where=spread > 0)
-    freedom = np.where(spread > 0, freedom - 2, MOST_FREEDOM)
+    freedom = np.where(spread > 0, freedom - 2, MAX_FREEDOM)
     lit = np.square(np.maximum(np.abs(a.value), np.abs(b.value))) >= MIN_LIGHT**2 * square
     stated = ((difference > 0) | (estimates > 0)) & lit & (freedom >= MIN_FREEDOM)
     t = np.divide(difference, np.sqrt(square), out=np.zeros_like(difference), where=stated & (square > 0))
@@ -220,9 +215,9 @@ class ZTest:
             sums, known = (a.summed(slot), b.summed(slot)), self._sums.get(bounce)
             self._sums[bounce] = (known[0].plus(sums[0]), known[1].plus(sums[1])) if known else sums
         for z, width in self._state(a, b, block.bounces):
-            channel, slot, y, x, joint = _largest(z)
+            channel, slot, y, x, joint = index_of_max(z)
             sensor = (block.rows.start + y, block.columns.start + x)
-            self._note(float(z.max()), self._laser, sensor, block.bounces[slot], channel, joint * width, width)
+            self._note(float(z.max()), (self._laser, sensor, block.bounces[slot], channel), joint * width, width)
 
     def finish(self) -> None:
         """Take the last statements: about the last laser, and about bounces that one side lacks altogether."""
@@ -230,14 +225,14 @@ class ZTest:
         light = [model.light for model in self.models]
         for channel, bounce in np.argwhere((light[0] > 0) != (light[1] > 0)).tolist():
             self.n_statements += 1
-            self._note(math.inf, None, None, bounce, channel, 0, self._n_bins)
+            self._note(math.inf, (None, None, bounce, channel), 0, self._n_bins)
 
     def _finish_laser(self) -> None:
         """Take the statements about the sums over the sensor points of the laser."""
         for bounce, (a, b) in self._sums.items():
             for z, width in self._state(a, b, (bounce,)):
-                channel, _, joint = _largest(z)
-                self._note(float(z.max()), self._laser, None, bounce, channel, joint * width, width)
+                channel, _, joint = index_of_max(z)
+                self._note(float(z.max()), (self._laser, None, bounce, channel), joint * width, width)
         self._sums = {}
 
     @property
@@ -264,23 +259,9 @@ class ZTest:
                 return
             a, b, width = a.joined(), b.joined(), 2 * width
 
-    def _note(
-        self,
-        z: float,
-        laser: tuple[int, int] | None,
-        sensor: tuple[int, int] | None,
-        bounce: int,
-        channel: int,
-        first_bin: int,
-        width: int,
-    ) -> None:
+    def _note(self, z: float, where: tuple[Place, Place, int, int], first_bin: int, width: int) -> None:
         if z > self.z:
-            last = min(first_bin + width, self._n_bins) - 1
-            self.worst = Deviation(z, laser, sensor, bounce, channel, first_bin, last)
-
-
-def _largest(z: Float64) -> tuple[int, ...]:
-    return tuple(int(index) for index in np.unravel_index(int(np.argmax(z)), z.shape))
+            self.worst = Deviation(z, *where, first_bin, min(first_bin + width, self._n_bins) - 1)
 
 
 def _pairs(part: Float64) -> Float64:
