@@ -18,9 +18,7 @@ from nlosrender.cli.bench_command import bench
 from nlosrender.cli.check_engines_command import check_engines
 from nlosrender.cli.compare_command import check, compare
 from nlosrender.cli.config_commands import new, schema, validate
-from nlosrender.cli.export_command import export
-from nlosrender.cli.file_commands import info, plot
-from nlosrender.cli.frames_command import frames
+from nlosrender.cli.file_commands import export, frames, info, plot
 from nlosrender.cli.interrupt_watch import InterruptWatch
 from nlosrender.cli.json_output import OUTPUT
 from nlosrender.cli.machine_commands import doctor

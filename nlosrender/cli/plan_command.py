@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from typing import TYPE_CHECKING
+from collections.abc import Iterator, Sequence
+from typing import TYPE_CHECKING, Any
 
 import typer
 
@@ -15,23 +15,20 @@ from nlosrender.readable import readable_duration, readable_size
 
 if TYPE_CHECKING:
     from nlosrender.analysis.render_plan import RenderPlan
+    from nlosrender.config.sweep_load import Sweep
 
+PILOTS = 3  # captures of a sweep whose cost is measured: the first, the last and those between
 NOTABLE_BYTES = 50e6  # of a scene's triangles
-KEEP_SECONDS = 30.0  # units that take longer are kept on the way, see ``rendering.unit_in_flight``
+KEEP_SECONDS = 30.0  # units that take longer are kept on the way, see ``rendering.item_in_flight``
 
 
-def plan(
-    config: ConfigFile,
-    overrides: Overrides = None,
-    as_json: AsJson = False,
-) -> None:
+def plan(config: ConfigFile, overrides: Overrides = None, as_json: AsJson = False) -> None:
     """Say what a render will do, what it skips and why, and what it costs; a short pilot measures the speed.
 
     Example: nlosrender plan configs/z-letter.yaml --set render.target_error=0.001 (writes nothing; prints the engine
     and why, what is skipped, memory, file size and an estimate of the time)
     """
     from nlosrender.analysis.render_plan import plan_render
-    from nlosrender.cli.sweep_command import plan_all
     from nlosrender.config.load import load_config
     from nlosrender.config.sweep_load import load_sweep
 
@@ -39,7 +36,7 @@ def plan(
     sweep = load_sweep(config, changes)
     with config_places(config, changes):
         if sweep is not None:
-            plan_all(sweep, as_json)
+            _plan_all(sweep, as_json)
             return
         found = plan_render(load_config(config, changes))
     if as_json:
@@ -101,3 +98,48 @@ def _scan(plan: RenderPlan) -> str:
     if plan.scan_type != "exhaustive":
         return f"{plan.scan_type}, {sensors}"
     return "exhaustive, {}, {} x {} laser points".format(sensors, *plan.laser_grid)
+
+
+def _plan_all(sweep: Sweep, as_json: bool) -> None:
+    """Print what a sweep will take, measured on a few of its captures."""
+    from nlosrender.analysis.render_plan import plan_render
+
+    indices = pilot_captures(len(sweep))
+    plans = [plan_render(sweep.config(index)) for index in indices]
+    total = _total(sweep, indices, plans)
+    if as_json:
+        OUTPUT.print(total | {"pilots": [plan.as_json() for plan in plans]})
+        return
+    basis = f"measured on {len(indices)} of them"
+    seconds = total["seconds_estimate"]
+    logical, disk = readable_size(total["logical_bytes"]), readable_size(total["disk_bytes_estimate"])
+    rows = [
+        ("captures", f"{len(sweep)}, in {sweep.output_folder}"),
+        ("keys", ", ".join(sweep.values(0))),
+        ("engine", f"{', '.join(sorted({plan.engine for plan in plans}))} ({basis})"),
+        ("files", f"{logical} for a reader, about {disk} on disk ({basis})"),
+        ("takes", f"{'unknown time' if seconds is None else f'about {readable_duration(seconds)}'} ({basis})"),
+    ]
+    print_table(rows)
+    for warning in dict.fromkeys(warning for plan in plans for warning in plan.warnings):
+        typer.echo(f"warning: {warning}", err=True)
+
+
+def pilot_captures(n_captures: int) -> list[int]:
+    """Return up to ``PILOTS`` captures spread over a sweep."""
+    return sorted({round((n_captures - 1) * step / (PILOTS - 1)) for step in range(PILOTS)})
+
+
+def _total(sweep: Sweep, indices: Sequence[int], plans: Sequence[RenderPlan]) -> dict[str, Any]:
+    """Return the sums over all captures, by the mean of those that were looked at."""
+    share = len(sweep) / len(plans)
+    seconds = [plan.seconds_estimate for plan in plans if plan.seconds_estimate is not None]
+    return {
+        "captures": len(sweep),
+        "folder": str(sweep.output_folder),
+        "keys": list(sweep.values(0)),
+        "measured_captures": list(indices),
+        "logical_bytes": round(share * sum(plan.file.logical_bytes for plan in plans)),
+        "disk_bytes_estimate": round(share * sum(plan.file.disk_bytes_estimate for plan in plans)),
+        "seconds_estimate": share * sum(seconds) if len(seconds) == len(plans) else None,
+    }

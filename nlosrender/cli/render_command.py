@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import json
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from enum import StrEnum
 from pathlib import Path
@@ -23,13 +24,16 @@ from nlosrender.cli.options import (
     refuse_folder,
     two_numbers,
 )
+from nlosrender.cli.progress import reporting
 from nlosrender.cli.tables import print_table
 from nlosrender.readable import readable_duration
 
 if TYPE_CHECKING:
     from nlosrender.capture.part import Selection
+    from nlosrender.config.document import Config
+    from nlosrender.config.sweep_load import Sweep
     from nlosrender.rendering.dask_cluster import Cluster
-    from nlosrender.rendering.render_report import RenderReport
+    from nlosrender.rendering.render_report import Progress, RenderReport, Warn
 
 
 class Executor(StrEnum):
@@ -90,8 +94,6 @@ def render(
         hint = "--workers" if scheduler is None else "--scheduler"
         raise typer.BadParameter("needs --executor dask", param_hint=hint)
 
-    from nlosrender.cli.progress import reporting
-    from nlosrender.cli.sweep_command import render_all
     from nlosrender.config.load import load_config
     from nlosrender.config.sweep_load import load_sweep
     from nlosrender.files.atomic_write import refuse_sources
@@ -107,7 +109,7 @@ def render(
             raise typer.BadParameter("cuts one capture, not a sweep; use --shard", param_hint="--lasers")
         with _cluster(executor, scheduler, workers) as cluster:
             how = functools.partial(render_capture, cluster=cluster, strict=strict)
-            render_all(sweep, changes, how, shard=selection.shard, resume=resume, quiet=quiet, as_json=as_json)
+            _render_all(sweep, changes, how, shard=selection.shard, resume=resume, quiet=quiet, as_json=as_json)
         return
     loaded = load_config(config, changes)
     refuse_sources(loaded.output.path, [config])
@@ -123,6 +125,40 @@ def render(
         OUTPUT.print(dataclasses.asdict(report) | {"output": str(report.output)})
     elif not quiet:
         _print_report(report)
+
+
+def _render_all(
+    sweep: Sweep,
+    overrides: Sequence[str],
+    render_capture: Callable[..., RenderReport],
+    *,
+    shard: tuple[int, int] | None,
+    resume: bool | None,
+    quiet: bool,
+    as_json: bool,
+) -> None:
+    """Render the captures of a sweep, each by ``render_capture``, and print the report."""
+    from nlosrender.errors import EXIT_FAILURE, EXIT_OK, RenderError
+    from nlosrender.rendering.sweep_render import render_sweep
+
+    with reporting("sweep", quiet) as listeners:
+
+        def render(config: Config, progress: Progress, warn: Warn, resume: bool | None) -> RenderReport:
+            with config_places(Path(sweep.source), overrides):  # a capture that fails is reported by the sweep
+                return render_capture(config, progress, warn, resume=resume, watch=listeners.watch)
+
+        report = render_sweep(sweep, render, shard=shard, resume=resume, **listeners._asdict())
+    if as_json:
+        OUTPUT.print(
+            dataclasses.asdict(report) | {"index": str(report.index)}, EXIT_FAILURE if report.failed else EXIT_OK
+        )
+    elif not quiet:
+        typer.echo(f"wrote {report.index}: {report.captures} captures")
+        rendered = f"{report.rendered}, finished by earlier runs {report.earlier}"
+        print_table([("rendered", rendered), ("took", readable_duration(report.seconds))], indent=2)
+    if report.failed:
+        listed = "\n".join(f"{entry.file}: {entry.message}" for entry in report.failed)
+        raise RenderError(f"{listed}\n{len(report.failed)} of {report.captures} captures failed.")
 
 
 def _cluster(

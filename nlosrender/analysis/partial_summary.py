@@ -22,7 +22,7 @@ def is_unfinished(path: str | Path) -> bool:
         return (Path(path) / JOURNAL).is_file()
 
 
-def summarise_unfinished(folder: str | Path) -> dict[str, object]:
+def partial_summary(folder: str | Path) -> dict[str, object]:
     """Return what the journal of an unfinished capture says, as JSON can hold it.
 
     Raises
