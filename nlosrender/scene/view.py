@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -12,9 +12,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from nlosrender.config.emitters import PointLamp, SpotLamp
+from nlosrender.errors import ConfigError
 from nlosrender.scene.bounding_box import Bounds, box_corners, joined_bounds
-from nlosrender.scene.build import load_surface, shape_bounds
-from nlosrender.scene.materials import check_surface, medium_warnings, mitsuba_spectrum, rejected
+from nlosrender.scene.loading.materials import check_surface, medium_warnings, mitsuba_spectrum
+from nlosrender.scene.loading.mitsuba_shapes import load_surface, shape_bounds
+from nlosrender.scene.loading.xml_loading import WHERE, load_xml_scene
 from nlosrender.scene.meshes.mesh_report import MeshReport
 from nlosrender.scene.meshes.triangle_mesh import TriangleMesh
 from nlosrender.scene.picture_orientation import upright_bsdf
@@ -22,8 +24,8 @@ from nlosrender.scene.pose import Float64, Pose
 from nlosrender.scene.read_surfaces import read_surfaces
 from nlosrender.scene.surfaces import ShapeDescription, Surface, all_surfaces
 from nlosrender.scene.walls.image_plane import ImagePlane, image_plane
+from nlosrender.scene.walls.wall import RelayWall
 from nlosrender.scene.walls.wall_from_config import relay_wall_from_config
-from nlosrender.scene.xml_loading import WHERE, load_xml_scene
 
 if TYPE_CHECKING:
     from nlosrender.config.capture import CaptureConfig
@@ -65,23 +67,27 @@ def build_view(scene_config: SceneConfig, capture_config: CaptureConfig) -> Buil
     Raises
     ------
     ConfigError
-        Mitsuba rejects a shape, a BSDF or the scene's file, or a mesh cannot be read; the item is named.
-    ValueError
-        A pose is degenerate; the message begins with the item's key.
+        Mitsuba rejects a shape, a BSDF or the scene's file, a mesh cannot be read, or a pose is degenerate; the item is
+        named.
     """
     whole, of_whole, left_out = None, (), ()  # type: tuple[mi.Scene | None, tuple[MeshReport, ...], tuple[str, ...]]
     if scene_config.mitsuba is not None:
         whole, of_whole, left_out = load_xml_scene(scene_config.mitsuba)
-    plane = _image_plane(capture_config, whole)
-    frame = _engine_frame(scene_config, plane)
-    surfaces = tuple(_surfaces(scene_config, frame))
+    try:
+        plane = _image_plane(capture_config, whole)
+    except ValueError as error:
+        raise ConfigError.at("capture.camera", f"{error}.") from error
+    wall = None if scene_config.relay_wall is None else relay_wall_from_config(scene_config.relay_wall)
+    frame = _engine_frame(scene_config, wall, plane)
+    surfaces = all_surfaces(scene_config, frame)
+    if wall is not None:
+        surfaces = (_wall_surface(wall, scene_config.wall.bsdf, frame), *surfaces)
     read = read_surfaces(surfaces)
-    loaded = read.shapes
     lamps = [item for item in scene_config.emitters if isinstance(item, (PointLamp, SpotLamp))]
     points = [frame.to_local(lamp.position) for lamp in lamps]
     camera = frame.to_local(plane.pose.to_scene(plane.default_device_position))
-    unit = 1.0 if whole is not None else _unit_length([shape.bounds() for shape in loaded], [*points, camera])
-    shapes = [load_surface(surface, shape, unit) for surface, shape in zip(surfaces, loaded, strict=True)]
+    unit = 1.0 if whole is not None else _unit_length([shape.bounds() for shape in read.shapes], [*points, camera])
+    shapes = [load_surface(surface, shape, unit) for surface, shape in zip(surfaces, read.shapes, strict=True)]
     contents: dict[str, object] = {f"lamp_{index}": _lamp(lamp, frame, unit) for index, lamp in enumerate(lamps)}
     if whole is not None:
         shapes += whole.shapes()
@@ -107,29 +113,25 @@ def build_view(scene_config: SceneConfig, capture_config: CaptureConfig) -> Buil
     )
 
 
-def _surfaces(scene_config: SceneConfig, frame: Pose) -> Iterator[Surface]:
-    """Yield relay wall, hidden geometry and shining surfaces in the engine's frame [m]."""
-    if scene_config.relay_wall is not None:
-        wall = relay_wall_from_config(scene_config.relay_wall)
-        description = wall.shape_description()
-        to_frame = frame.inverse_matrix() @ wall.pose.matrix()
-        shape: TriangleMesh | ShapeDescription
-        if isinstance(description, TriangleMesh):
-            shape = description.transformed(to_frame)
-        else:
-            to_world = to_frame @ np.asarray(description.get("to_world", np.eye(4)))
-            shape = ShapeDescription({**description, "to_world": to_world})
-        bsdf = upright_bsdf(description, scene_config.relay_wall.bsdf)
-        yield Surface("relay_wall", "scene.relay_wall", shape, bsdf)
-    yield from all_surfaces(scene_config, frame)
+def _wall_surface(wall: RelayWall, bsdf: Mapping[str, object], frame: Pose) -> Surface:
+    """Return a relay wall as any other surface, in the engine's frame."""
+    description = wall.shape_description()
+    to_frame = frame.inverse_matrix() @ wall.pose.matrix()
+    shape: TriangleMesh | ShapeDescription
+    if isinstance(description, TriangleMesh):
+        shape = description.transformed(to_frame)
+    else:
+        to_world = to_frame @ np.asarray(description.get("to_world", np.eye(4)))
+        shape = ShapeDescription({**description, "to_world": to_world})
+    return Surface("relay_wall", "scene.relay_wall", shape, upright_bsdf(description, bsdf))
 
 
-def _engine_frame(scene_config: SceneConfig, plane: ImagePlane) -> Pose:
+def _engine_frame(scene_config: SceneConfig, wall: RelayWall | None, plane: ImagePlane) -> Pose:
     """Return where the engine's origin lies: a Mitsuba scene stays where it is, all else comes near the origin."""
     if scene_config.mitsuba is not None:
         return Pose.identity()
-    if scene_config.relay_wall is not None:
-        return relay_wall_from_config(scene_config.relay_wall).pose  # a room is built around it
+    if wall is not None:
+        return wall.pose  # a room is built around it
     return Pose(np.eye(3), plane.pose.origin)
 
 
@@ -138,14 +140,14 @@ def _image_plane(capture_config: CaptureConfig, whole: mi.Scene | None) -> Image
     if camera is not None:
         return image_plane(camera.position, camera.look_at, camera.up, camera.fov_deg, pixels)
     if whole is None or not whole.sensors():
-        raise rejected(
+        raise ConfigError.at(
             "capture.camera", "missing, and there is no Mitsuba scene with a perspective sensor that has a whole film."
         )
     parameters = mi.traverse(whole.sensors()[0])
     to_world = np.array(parameters["to_world"].matrix, dtype=np.float64).reshape(4, 4)
     offset = [float(np.ravel(parameters[f"principal_point_offset_{axis}"])[0]) for axis in "xy"]
     if not np.isfinite(to_world).all() or np.linalg.det(to_world[:3, :3]) <= 0 or any(offset):
-        raise rejected(WHERE, "its sensor is mirrored or shifted, which is not supported; give capture.camera.")
+        raise ConfigError.at(WHERE, "its sensor is mirrored or shifted, which is not supported; give capture.camera.")
     position, forward, up = to_world[:3, 3], to_world[:3, 2], to_world[:3, 1]
     fov = float(np.ravel(parameters["x_fov"])[0])
     return image_plane(position, position + forward / np.linalg.norm(forward), up, fov, pixels)

@@ -5,6 +5,7 @@ Right values are sums of float64 quadrature over the plates that are seen; wide 
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -193,12 +194,12 @@ def test_nothing_is_moved_where_nothing_coincides(tmp_path: Path) -> None:
     start_backend("llvm", colored=False, polarized=False)
     import mitsuba as mi
 
-    from nlosrender.scene.coincident import overlaps
+    from nlosrender.scene.loading.coincident import overlaps
 
     random = np.random.default_rng(1)
     wavy, other = sheet(40, random, 0.05), sheet(40, random, -0.07)
-    other = other.with_vertices(other.vertices + np.array([0, 0, 0.0137]))
-    behind = wavy.with_vertices(wavy.vertices + np.array([0, 0, 1e-4]))
+    other = replace(other, vertices=other.vertices + np.array([0, 0, 0.0137]))
+    behind = replace(wavy, vertices=wavy.vertices + np.array([0, 0, 1e-4]))
     crossing = TriangleMesh(
         np.array([[-0.5, 0, 0.5], [0.5, 0, 0.5], [0.5, 0.01, 1.5], [-0.5, 0.01, 1.5]]), np.array([[0, 1, 2], [0, 2, 3]])
     )
@@ -213,11 +214,11 @@ def test_a_sheet_cut_twice_becomes_two_layers() -> None:
     start_backend("llvm", colored=False, polarized=False)
     import mitsuba as mi
 
-    from nlosrender.scene.coincident import GAP, PASSES, STEP, moved_apart, overlaps
+    from nlosrender.scene.loading.coincident import GAP, MAX_LAYERS, STEP, moved_apart, overlaps
 
     random = np.random.default_rng(2)
     meshes = {number: sheet(30, random, 0.0) for number in range(2)}
-    for seed in range(PASSES):
+    for seed in range(MAX_LAYERS):
         shapes = [device_mesh(mi, f"m{number}", mesh) for number, mesh in meshes.items()]
         scene = mi.load_dict({"type": "scene", **{f"m{i}": shape for i, shape in enumerate(shapes)}})
         found = overlaps(scene, shapes, meshes, seed)

@@ -369,7 +369,7 @@ def test_the_metals_and_media_that_are_known_are_those_mitsuba_has() -> None:
     start_backend("llvm", colored=True, polarized=False)
     import mitsuba as mi
 
-    from nlosrender.scene.materials import load_bsdf
+    from nlosrender.scene.loading.materials import load_bsdf
 
     data = Path(mi.__file__).parent / "data" / "ior"
     assert set(METALS) == {file.name.split(".")[0] for file in data.glob("*.spd")}

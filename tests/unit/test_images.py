@@ -10,7 +10,7 @@ import numpy as np
 import OpenEXR
 import pytest
 
-from nlosrender.scene.images import MOST_TEXELS, check_image, image_files
+from nlosrender.scene.loading.image_size import MAX_TEXELS, check_image, image_files
 
 
 def _png(path: Path, width: int, height: int) -> Path:
@@ -36,7 +36,7 @@ def test_a_small_file_of_too_many_texels_is_refused(tmp_path: Path, side: int) -
 
 def test_an_image_within_the_limit_passes(tmp_path: Path) -> None:
     """The limit itself is allowed."""
-    check_image(_png(tmp_path / "large.png", MOST_TEXELS // 2**13, 2**13))
+    check_image(_png(tmp_path / "large.png", MAX_TEXELS // 2**13, 2**13))
 
 
 def test_the_data_window_of_an_exr_counts(tmp_path: Path) -> None:

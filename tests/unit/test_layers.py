@@ -14,16 +14,8 @@ STAGES = ("config", "scene", "capture", "engine", "sensor", "files", "rendering"
 SHARED = ("constants", "errors", "interruption", "readable")
 MODULES = sorted(PACKAGE.rglob("*.py"))
 IN_STAGES = [path for path in MODULES if path.relative_to(PACKAGE).parts[0] in STAGES]
-RENDERING_SCENE = (
-    "build.py",
-    "coincident.py",
-    "materials.py",
-    "round_surfaces.py",
-    "view.py",
-    "xml_loading.py",
-    "xml_textures.py",
-)
-BUILDERS = tuple(PACKAGE / "scene" / name for name in RENDERING_SCENE)
+SCENE = PACKAGE / "scene"
+BUILDERS = (SCENE / "build.py", SCENE / "view.py", *(SCENE / "loading").glob("*.py"))
 MUST_NOT_RENDER = [
     path for path in MODULES if path.relative_to(PACKAGE).parts[0] not in ("engine", "bench") and path not in BUILDERS
 ]

@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 
 from nlosrender.capture.grids import Capture
 from nlosrender.capture.time_axis import TimeAxis
-from nlosrender.scene.build import WALL_ID, BuiltScene
+from nlosrender.scene.build import BuiltScene
+from nlosrender.scene.loading.mitsuba_shapes import WALL_ID
 from nlosrender.scene.pose import Float64
 from nlosrender.scene.walls.mesh_wall import MIN_SAME_COSINE, too_fine
 

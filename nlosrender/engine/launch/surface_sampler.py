@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 
 from nlosrender.engine.launch.device_arrays import on_device
 from nlosrender.engine.launch.morton import morton_order
-from nlosrender.scene.build import WALL_ID, BuiltScene, wall_box
+from nlosrender.scene.build import BuiltScene, wall_box
+from nlosrender.scene.loading.mitsuba_shapes import WALL_ID
 from nlosrender.scene.pose import Float64
 
 SAMPLEABLE_PLUGINS = ("Rectangle", "Disk", "Sphere", "Cylinder")

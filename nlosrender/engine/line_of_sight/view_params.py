@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from nlosrender.capture.bounces import BounceAxis
 from nlosrender.capture.grids import Capture
 from nlosrender.capture.time_axis import TimeAxis
-from nlosrender.scene.materials import index_behind
+from nlosrender.scene.loading.materials import index_behind
 from nlosrender.scene.view import BuiltView
 
 STOKES = 4  # components of a Stokes vector: channels of a polarised capture

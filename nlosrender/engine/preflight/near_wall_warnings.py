@@ -15,8 +15,8 @@ from nlosrender.engine.path.engine import PathEngine
 from nlosrender.engine.path.laser_connections import WALL_OFFSET, ray_offset
 from nlosrender.engine.virtual_lights.engine import RARE, VirtualLightEngine
 from nlosrender.scene.build import BuiltScene, wall_box
+from nlosrender.scene.loading.round_surfaces import curvature
 from nlosrender.scene.pose import Float64
-from nlosrender.scene.round_surfaces import curvature
 from nlosrender.scene.walls.mesh_wall import MeshWall
 
 NEAREST_KNOWN = 1e-6  # engine units; nearer surfaces that are tilted or round lie some per cent nearer or farther

@@ -9,8 +9,8 @@ import numpy as np
 
 from nlosrender.engine.virtual_lights.elements.patches import Patches, split_weights
 from nlosrender.engine.virtual_lights.elements.subdivision import WallDistance
+from nlosrender.scene.loading.round_surfaces import RoundSurface
 from nlosrender.scene.pose import Float64
-from nlosrender.scene.round_surfaces import RoundSurface
 
 FEWEST_AROUND = 6  # parts of a cylinder's circumference
 EDGE = 1.052  # of the icosahedron in its unit sphere

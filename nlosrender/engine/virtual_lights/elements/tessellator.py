@@ -20,8 +20,9 @@ from nlosrender.engine.virtual_lights.elements.round_shapes import RoundShape
 from nlosrender.engine.virtual_lights.elements.sensor_regions import regions_of
 from nlosrender.engine.virtual_lights.elements.size_field import SizedElements, SizeField
 from nlosrender.engine.virtual_lights.elements.subdivision import Elements, WallDistance, elements_of_mesh, subdivide
-from nlosrender.scene.build import WALL_ID, BuiltScene
-from nlosrender.scene.round_surfaces import ROUND_PLUGINS
+from nlosrender.scene.build import BuiltScene
+from nlosrender.scene.loading.mitsuba_shapes import WALL_ID
+from nlosrender.scene.loading.round_surfaces import ROUND_PLUGINS
 
 MAX_PATCHES = 2_000_000  # of one gather; beyond it the path engine is the better choice
 MOST_KEPT = 200_000  # patches of one resolution that are kept for the next call

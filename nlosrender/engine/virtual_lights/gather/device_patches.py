@@ -19,8 +19,8 @@ from nlosrender.engine.virtual_lights.elements.patches import Patches, split_wei
 from nlosrender.engine.virtual_lights.elements.round_shapes import RoundShape
 from nlosrender.engine.virtual_lights.visibility.masks import Surface
 from nlosrender.scene.build import BuiltScene
+from nlosrender.scene.loading.round_surfaces import ROUND_PLUGINS
 from nlosrender.scene.pose import Float64
-from nlosrender.scene.round_surfaces import ROUND_PLUGINS
 
 # A textured patch is cut into this many squared parts, a random point of each is looked up: 16 of many, 144 of few.
 TEXTURE_SPLITS, FEW_PATCHES = (4, 12), 2**14

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import mitsuba as mi
 import numpy as np
 
-from nlosrender.scene.coincident import GAP, STEP
+from nlosrender.scene.loading.coincident import GAP, STEP
 from nlosrender.scene.pose import Float64
 
 ROUND_PLUGINS = ("Sphere", "Cylinder")

@@ -15,10 +15,12 @@ from nlosrender.config.fields import LONGEST, SHORTEST
 from nlosrender.config.mitsuba_xml import image_files, read_mitsuba_xml
 from nlosrender.config.xml_shapes import named, placement, shape_parameters
 from nlosrender.config.xml_tree import numbered_text, place_of
+from nlosrender.errors import ConfigError
 from nlosrender.scene.bounding_box import box_corners
-from nlosrender.scene.build import load_flat_serialized, shape_bounds
-from nlosrender.scene.images import check_image
-from nlosrender.scene.materials import first_line, rejected
+from nlosrender.scene.loading.image_size import check_image
+from nlosrender.scene.loading.materials import first_line
+from nlosrender.scene.loading.mitsuba_shapes import load_flat_serialized, shape_bounds
+from nlosrender.scene.loading.xml_textures import check_attributes, has_two_sides, picture_warnings
 from nlosrender.scene.meshes.file_mesh import FileMesh
 from nlosrender.scene.meshes.mesh_file import read_mesh_file
 from nlosrender.scene.meshes.mesh_normals import with_normals
@@ -28,7 +30,6 @@ from nlosrender.scene.meshes.triangle_mesh import TriangleMesh
 from nlosrender.scene.pose import Float64
 from nlosrender.scene.surfaces import MESH_PLUGINS, ShapeDescription
 from nlosrender.scene.transforms import transform_matrix
-from nlosrender.scene.xml_textures import check_attributes, has_two_sides, picture_warnings
 
 WHERE = "scene.mitsuba"
 SAME_AREA = 0.01  # float32, and bent quadrangles cut along the other diagonal
@@ -68,7 +69,7 @@ def load_xml_scene(path: Path) -> tuple[mi.Scene, tuple[MeshReport, ...], tuple[
         for image in image_files(root):
             check_image(image)
     except ValueError as error:
-        raise rejected(WHERE, f"{path}: {error}.") from error
+        raise ConfigError.at(WHERE, f"{path}: {error}.") from error
     scene, warnings = _loaded(root, path)
     for shape in scene.shapes():
         _check_bounds(shape, path)
@@ -88,7 +89,7 @@ def _loaded(root: Element, path: Path) -> tuple[mi.Scene, tuple[str, ...]]:
             plugin = elements[int(unknown[1]) - 1] if unknown else None
             if plugin is None or not any(child.get("name") in names for child in plugin):
                 told = _LINE.sub(lambda found: place_of(elements[int(found[1]) - 1]), first_line(error))  # noqa: B023
-                raise rejected(WHERE, f"{path}: Mitsuba rejects this scene: {told}.") from error
+                raise ConfigError.at(WHERE, f"{path}: Mitsuba rejects this scene: {told}.") from error
             warnings.append(_without_parameters(plugin, names))
 
 
@@ -207,4 +208,4 @@ def _check_bounds(shape: mi.Shape, path: Path) -> None:
     if box is None or not float(np.abs(box).max()) <= LONGEST:
         extent = "has no extent" if box is None else f"reaches {float(np.abs(box).max()):.4g} m from the origin"
         identity = f" {shape.id()!r}" if shape.id() else ""
-        raise rejected(WHERE, f"{path}: its {shape.class_name()}{identity} {extent}. {_ADVICE}")
+        raise ConfigError.at(WHERE, f"{path}: its {shape.class_name()}{identity} {extent}. {_ADVICE}")

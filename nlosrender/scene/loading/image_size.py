@@ -6,7 +6,7 @@ import warnings
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
-MOST_TEXELS = 2**27  # 1.6 GB as three float32 channels; more than any texture of a hidden scene has use for
+MAX_TEXELS = 2**27  # 1.6 GB as three float32 channels; more than any texture of a hidden scene has use for
 
 
 def image_files(plugin: Mapping[str, object]) -> Iterator[Path]:
@@ -20,7 +20,7 @@ def image_files(plugin: Mapping[str, object]) -> Iterator[Path]:
 
 
 def check_image(path: Path) -> None:
-    """Refuse an image that would unpack to more than ``MOST_TEXELS``; of formats not known here nothing is said.
+    """Refuse an image that would unpack to more than ``MAX_TEXELS``; of formats not known here nothing is said.
 
     Raises
     ------
@@ -28,8 +28,8 @@ def check_image(path: Path) -> None:
         It is too large.
     """
     size = _exr_size(path) if path.suffix.lower() == ".exr" else _bitmap_size(path)
-    if size is not None and size[0] * size[1] > MOST_TEXELS:
-        raise ValueError(f"{path} has {size[0]} x {size[1]} texels, need at most {MOST_TEXELS:_}. Scale it down.")
+    if size is not None and size[0] * size[1] > MAX_TEXELS:
+        raise ValueError(f"{path} has {size[0]} x {size[1]} texels, need at most {MAX_TEXELS:_}. Scale it down.")
 
 
 def _bitmap_size(path: Path) -> tuple[int, int] | None:

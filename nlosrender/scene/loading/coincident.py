@@ -20,12 +20,12 @@ from nlosrender.scene.meshes.triangle_mesh import TriangleMesh, unit_rows
 from nlosrender.scene.pose import Float64
 
 GAP = 2e-6  # over 1 + the largest coordinate [engine units]: four times the ray offset
-LEAST_POINTS = 2**16  # tried on all meshes of a scene
+MIN_POINTS = 2**16  # tried on all meshes of a scene
 STEP = 1.25  # gaps by which triangles are moved: what has been moved is not found again
 FLATNESS = 4.0  # gaps that the corners of a triangle may be off the plane of the other
 EDGE = 1e-3  # barycentric distance from an edge within which a neighbour in the same plane may be met
 DISK_POINTS = 4096  # tried on each disk; of crossing surfaces a hundredth is never within the gap
-PASSES = 32  # so many layers in one place are told apart
+MAX_LAYERS = 32  # so many layers in one place are told apart
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,7 +123,7 @@ def _pairs(scene: mi.Scene, mesh: TriangleMesh, areas: Float64, first: mi.UInt32
     ``areas`` (m,) are those of its triangles. ``first`` tells for each shape of the scene with which triangle of
     ``mesh`` it begins, plus 1; 0 for other shapes.
     """
-    count = max(LEAST_POINTS, len(areas))
+    count = max(MIN_POINTS, len(areas))
     copies = 1 + np.ceil(areas / areas.sum() * count).astype(np.intp)
     own = mi.UInt32(np.repeat(np.arange(len(areas), dtype=np.uint32), copies))
     faces, vertices = mi.UInt32(np.ravel(mesh.faces)), mi.Float(np.ravel(mesh.vertices).astype(np.float32))

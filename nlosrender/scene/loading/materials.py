@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nlosrender.errors import ConfigError
-from nlosrender.scene.images import check_image, image_files
+from nlosrender.scene.loading.image_size import check_image, image_files
 from nlosrender.scene.surfaces import Radiance
 from nlosrender.scene.transforms import transform_matrix
 
@@ -35,7 +35,7 @@ def load_bsdf(bsdf: Mapping[str, object], key: str) -> mi.BSDF:
             check_image(image)
         loaded = mi.load_dict(mitsuba_value(bsdf))
     except (RuntimeError, TypeError, ValueError) as error:
-        raise rejected(key, f"Mitsuba rejects this BSDF: {first_line(error)}") from error
+        raise ConfigError.at(key, f"Mitsuba rejects this BSDF: {first_line(error)}") from error
     parameters = mi.traverse(loaded)
     for name in parameters.keys():  # noqa: SIM118  # not its items: some of other parameters cannot be read
         if name.endswith(".data"):
@@ -87,7 +87,7 @@ def check_surface(shape: mi.Shape, key: str) -> None:
     try:
         index_behind(bsdf)
     except ValueError as error:
-        raise rejected(key, f"{what}: {error}.") from error
+        raise ConfigError.at(key, f"{what}: {error}.") from error
     point = dr.zeros(mi.SurfaceInteraction3f)
     point.shape = mi.ShapePtr(shape)
     point.wi = mi.Vector3f(0.6, 0, 0.8)
@@ -96,7 +96,7 @@ def check_surface(shape: mi.Shape, key: str) -> None:
         bsdf.sample(mi.BSDFContext(), point, 0.5, mi.Point2f(0.5))  # recorded, never run
     except RuntimeError as error:
         advice = "Bump and normal maps need a bitmap with raw: true, a normal map one of three channels."
-        raise rejected(key, f"{what}: Mitsuba cannot evaluate its BSDF: {first_line(error)}. {advice}") from error
+        raise ConfigError.at(key, f"{what}: Mitsuba cannot evaluate its BSDF: {first_line(error)}. {advice}") from error
 
 
 def index_behind(bsdf: mi.BSDF) -> float:
@@ -190,14 +190,9 @@ def _check_texels(values: NDArray, name: str, key: str) -> None:
     wrong = ~((values >= 0) & (values <= most * (1 + TEXEL_ROUNDING)) & np.isfinite(values))
     if wrong.any():
         found, need = float(values[wrong][0]), "from 0 to 1" if most == 1 else "finite and not negative"
-        raise rejected(
+        raise ConfigError.at(
             key, f"{int(wrong.sum())} of {values.size} values of the image, such as {found:g}, are not {need}."
         )
-
-
-def rejected(key: str, message: str) -> ConfigError:
-    """Return the error about an item of the configuration."""
-    return ConfigError.at(key, message)
 
 
 def first_line(error: BaseException) -> str:

@@ -11,7 +11,7 @@ import numpy as np
 from nlosrender.config.bsdf_table import TRANSMITTING
 from nlosrender.config.xml_shapes import named, shape_parameters
 from nlosrender.config.xml_tree import place_of
-from nlosrender.scene.meshes.mesh_attributes import AttributeUse
+from nlosrender.scene.loading.mesh_attributes import AttributeUse
 from nlosrender.scene.meshes.triangle_mesh import TriangleMesh
 from nlosrender.scene.picture_orientation import TEXTURES_WITH_A_PLACE
 from nlosrender.scene.pose import Float64
