@@ -102,6 +102,6 @@ def wait_for_units(folder: Path, process: Process, count: int) -> int:
     """Wait until so many units of ``a.hdf5`` are saved, or the process ends; return how many are."""
     units = saved_units(folder)
     while units < count and process.poll() is None:
-        time.sleep(0.002)
+        time.sleep(0.005)
         units = saved_units(folder)
     return units

@@ -90,11 +90,11 @@ def test_many_values_are_refused_too() -> None:
 
 
 def test_broken_text_never_gives_a_traceback() -> None:
-    """Any damage to a config is a config or a ConfigError: 400 random edits of the starter."""
+    """Any damage to a config is a config or a ConfigError: 150 random edits of the starter."""
     generator = random.Random(7)
     start = starter_config("exhaustive")
     refusals: list[ConfigError] = []
-    for _ in range(400):
+    for _ in range(150):
         text = start
         for _ in range(generator.randint(1, 3)):
             i = generator.randrange(len(text))
@@ -107,7 +107,7 @@ def test_broken_text_never_gives_a_traceback() -> None:
         except ConfigError as error:
             refusals.append(error)
     assert all(error.issues and all(problem.message for problem in error.issues) for error in refusals)
-    assert len(refusals) > 40  # edits inside comments, a half of the text, change nothing
+    assert len(refusals) > 15  # edits inside comments, a half of the text, change nothing
 
 
 # --- overrides ---
