@@ -33,7 +33,7 @@ from nlosrender.analysis.theme import (
     power_of_ten,
     style,
 )
-from nlosrender.capture.bounces import FILE_BOUNCES, LINE_OF_SIGHT
+from nlosrender.capture.bounces import LINE_OF_SIGHT
 from nlosrender.config.encodable import encodable
 from nlosrender.constants import opl_to_seconds
 from nlosrender.errors import OptionError
@@ -252,13 +252,8 @@ def _unit(header: StoredHeader) -> str:
 
 
 def _bounce_label(header: StoredHeader, slot: int) -> str:
-    if header.bounces_known and not header.split_bounces:
-        return "all bounces"
-    bounce = header.bounce_indices[slot] + header.first_bounce
-    last = header.first_bounce + FILE_BOUNCES - 1
-    limit = header.attributes.get("max_bounces")
-    more = bounce == last and not (isinstance(limit, int) and limit <= last)
-    return f"bounce {bounce}{'+' if more else ''}"
+    name = header.bounce_name(header.bounce_indices[slot]).replace(" and above", "+")
+    return "all bounces" if name == "all" else f"bounce {name}"
 
 
 def _wall_extent(header: StoredHeader) -> tuple[tuple[float, float, float, float], str, str]:

@@ -142,7 +142,7 @@ def test_wavelengths_that_alias_or_blur_are_warned_of(tmp_path: Path) -> None:
     assert not pulse_warnings(scan, Pulse(0.3), box)
 
 
-def test_the_default_volume_holds_the_hidden_box(tmp_path: Path) -> None:
+def test_the_default_volume_holds_the_hidden_scene(tmp_path: Path) -> None:
     """A margin of 15 % of the longest edge or 1.5 wavelengths on each side, and 128 cubic voxels along the longest."""
     scan = scan_of(tmp_path)
     low, high = points_header("single", cells(2, 2, 1.0, 1.0)).hidden_bounds
@@ -163,7 +163,7 @@ def test_impossible_volumes_are_refused(tmp_path: Path) -> None:
     with pytest.raises(OptionError, match=r"--voxel-size"):
         voxel_grid(scan, 0.1, (0, 0, 5.0), (9.0,), voxel_size=1e-3)
     with pytest.raises(FileError, match=r"give --volume-center X,Y,Z and --volume-size"):
-        voxel_grid(replace(scan, hidden_box=None), 0.1)
+        voxel_grid(replace(scan, hidden_aabb=None), 0.1)
 
 
 @pytest.mark.parametrize(

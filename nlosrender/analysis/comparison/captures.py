@@ -12,7 +12,6 @@ from nlosrender.analysis.comparison.differences import Differences
 from nlosrender.analysis.comparison.shift import TimeShift
 from nlosrender.analysis.comparison.structure import StructureDifference, structure_differences
 from nlosrender.analysis.comparison.z_test import ZTest
-from nlosrender.capture.bounces import BounceAxis
 from nlosrender.errors import FileError
 from nlosrender.files.reading.stored_header import StoredHeader
 
@@ -87,13 +86,6 @@ class Comparison:
         return (*(str(difference) for difference in self.structure), *exceeding)
 
 
-def bounce_name(header: StoredHeader, bounce: int) -> str:
-    """Return what an index of a file's bounce axis holds: a bounce number, "7 and above" or "all"."""
-    limit = header.attributes.get("max_bounces")
-    highest = limit if isinstance(limit, int) else None
-    return BounceAxis(highest, header.split_bounces is not False, header.first_bounce).name(bounce)
-
-
 def compare_captures(
     path: str | Path, reference: str | Path, tolerances: Tolerances, block_samples: int = BLOCK_SAMPLES
 ) -> Comparison:
@@ -142,7 +134,7 @@ def _findings(
     if tolerances.max_energy is not None:
         for bounce in differences.lit_bounces:
             energy = differences.relative_energy(bounce)
-            yield Finding(f"energy of bounce {bounce_name(header, bounce)}", energy, tolerances.max_energy)
+            yield Finding(f"energy of bounce {header.bounce_name(bounce)}", energy, tolerances.max_energy)
         yield Finding("energy", differences.relative_energy(), tolerances.max_energy)
     if tolerances.max_shift is not None:
         worst = shift.worst()

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import asdict
 from typing import Any
 
-from nlosrender.analysis.comparison.captures import Comparison, bounce_name
+from nlosrender.analysis.comparison.captures import Comparison
 from nlosrender.analysis.comparison.differences import LargestDifference, WorstPlaces
 from nlosrender.analysis.comparison.z_test import Deviation
 from nlosrender.analysis.json_values import finite_or_none
@@ -14,7 +14,7 @@ from nlosrender.analysis.json_values import finite_or_none
 def comparison_report(comparison: Comparison) -> dict[str, Any]:
     """Return everything that a comparison found.
 
-    Grid positions are [row, column]; bounces are named as in ``captures.bounce_name``; a number is None where the
+    Grid positions are [row, column]; bounces are named as in ``StoredHeader.bounce_name``; a number is None where the
     quotient is infinite: something against nothing.
     """
     report: dict[str, object] = {
@@ -36,7 +36,7 @@ def comparison_report(comparison: Comparison) -> dict[str, Any]:
         "relative_energy": differences.relative_energy(),
         "bounces": [
             {
-                "bounce": bounce_name(comparison.header, bounce),
+                "bounce": comparison.header.bounce_name(bounce),
                 "energy": float(differences.energy_a[bounce]),
                 "reference_energy": float(differences.energy_b[bounce]),
                 "relative_energy": differences.relative_energy(bounce),
@@ -54,7 +54,7 @@ def comparison_report(comparison: Comparison) -> dict[str, Any]:
 
 
 def _place(comparison: Comparison, found: LargestDifference | WorstPlaces | Deviation | None) -> dict[str, Any] | None:
-    return None if found is None else asdict(found) | {"bounce": bounce_name(comparison.header, found.bounce)}
+    return None if found is None else asdict(found) | {"bounce": comparison.header.bounce_name(found.bounce)}
 
 
 def _z_test(comparison: Comparison) -> dict[str, object] | None:

@@ -12,11 +12,12 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from nlosrender.analysis.reconstruction.spectrum import path_lengths
-from nlosrender.analysis.reconstruction.threads import Progress, in_threads, portion
+from nlosrender.analysis.reconstruction.threads import in_threads, portion
 from nlosrender.analysis.reconstruction.voxel_grid import VoxelGrid
 from nlosrender.files.layout import Float64
 from nlosrender.files.reading.reader import StoredCapture
 from nlosrender.files.reading.scan import Float32, Scan, light_bands
+from nlosrender.rendering.render_report import Progress
 
 FINER = 4  # samples per bin of the interpolated histograms; the nearest one is taken
 SLAB_VOXELS = 2**16  # voxels at a time: their distances stay in the cache
@@ -56,13 +57,7 @@ def laplacian_filtered(volume: Float32, voxel_size: float, sigma: float) -> Floa
 
 
 def _add_band(
-    total: Float32,
-    scan: Scan,
-    grid: VoxelGrid,
-    light: Float32,
-    rows: slice,
-    laser: tuple[int, int],
-    progress: Progress,
+    total: Float32, scan: Scan, grid: VoxelGrid, light: Float32, rows: slice, laser: tuple[int, int], progress: Progress
 ) -> None:
     sensors = scan.sensors[rows].reshape(-1, 3)
     legs = scan.sensor_legs[rows] + (scan.laser_legs[rows] if scan.confocal else scan.laser_legs[laser])
@@ -75,39 +70,26 @@ def _add_band(
     scale = FINER / width  # samples per metre
     starts = (legs.ravel() - centres[first]) * scale + FINER  # sample of path length 0: FINER zeros come first
     planes = max(SLAB_VOXELS // (len(grid.y) * len(grid.x)), 1)
-    source = None if scan.confocal else scan.lasers[laser]
 
     def slab(number: int) -> None:
+        """Add the sum over sensor points for some planes of voxels."""
         part = slice(number * planes, (number + 1) * planes)
-        total[part] += _slab(grid, grid.z[part], sensors, source, fine, starts, scale)
+        z, single = grid.z[part], np.float32
+        light = np.zeros((len(z), len(grid.y), len(grid.x)), dtype=single)
+        samples, own = np.empty(light.shape, dtype=np.intp), np.empty_like(light)
+        to_laser = 0.0 if scan.confocal else _distances(grid, z, scan.lasers[laser]) * single(scale)
+        factor = single(2 * scale if scan.confocal else scale)
+        for sensor, histogram, start in zip(sensors, fine, starts, strict=True):
+            place = _distances(grid, z, sensor)
+            place *= factor
+            place += to_laser
+            place += single(start + 0.5)
+            np.copyto(samples, place, casting="unsafe")
+            np.take(histogram, samples, out=own, mode="clip")  # both ends are zeros
+            light += own
+        total[part] += light
 
     in_threads(slab, -(-len(grid.z) // planes), progress)
-
-
-def _slab(
-    grid: VoxelGrid,
-    z: Float64,
-    sensors: Float64,
-    laser: Float64 | None,
-    fine: Float32,
-    starts: Float64,
-    scale: float,
-) -> Float32:
-    """Return the sum over sensor points for the planes ``z``, (z, y, x)."""
-    single = np.float32
-    total = np.zeros((len(z), len(grid.y), len(grid.x)), dtype=single)
-    samples, light = np.empty(total.shape, dtype=np.intp), np.empty_like(total)
-    lit = 0.0 if laser is None else _distances(grid, z, laser) * single(scale)
-    factor = single(scale if laser is not None else 2 * scale)
-    for sensor, histogram, start in zip(sensors, fine, starts, strict=True):
-        place = _distances(grid, z, sensor)
-        place *= factor
-        place += lit
-        place += single(start + 0.5)
-        np.copyto(samples, place, casting="unsafe")
-        np.take(histogram, samples, out=light, mode="clip")  # both ends are zeros
-        total += light
-    return total
 
 
 def _distances(grid: VoxelGrid, z: Float64, point: Float64) -> Float32:

@@ -10,6 +10,8 @@ with H_k the histograms' spectra and P_k the pulse's. Confocal captures have l =
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -17,12 +19,13 @@ from nlosrender.analysis.reconstruction.lattice import Lattice, lattice_of
 from nlosrender.analysis.reconstruction.propagation import Complex64, Propagator
 from nlosrender.analysis.reconstruction.pulse import Pulse
 from nlosrender.analysis.reconstruction.spectrum import spectra, unambiguous_period
-from nlosrender.analysis.reconstruction.threads import Progress, in_threads, portion
+from nlosrender.analysis.reconstruction.threads import in_threads, portion
 from nlosrender.analysis.reconstruction.voxel_grid import VoxelGrid
 from nlosrender.errors import FileError, OptionError
 from nlosrender.files.layout import Float64
 from nlosrender.files.reading.reader import StoredCapture
 from nlosrender.files.reading.scan import Scan, light_bands
+from nlosrender.rendering.render_report import Progress
 
 SPECTRA_BYTES = 2**29  # of the laser points that are propagated together, sharing the kernels
 MAX_WAVENUMBERS = 20_000
@@ -62,18 +65,14 @@ def phasor_field(
         The wavelength is too short for the volume.
     """
     refuse_curved(scan)
-    lattice = lattice_of(scan.sensors)
-    wavenumbers = _wavenumbers(scan, grid, pulse)
+    camera = _Camera(capture, scan, grid, pulse, bounces, _wavenumbers(scan, grid, pulse), lattice_of(scan.sensors))
     lasers = [(0, 0)] if scan.confocal else list(np.ndindex(*scan.lasers.shape[:2]))
-    fitting = SPECTRA_BYTES // (8 * len(wavenumbers) * lattice.x.count * lattice.y.count)
+    fitting = SPECTRA_BYTES // (8 * len(camera.wavenumbers) * camera.lattice.x.count * camera.lattice.y.count)
     together = min(max(fitting, 1), LASERS_TOGETHER)
     total = np.zeros(grid.shape, dtype=np.complex64)
     for start in range(0, len(lasers), together):
         chosen = lasers[start : start + together]
-        read = _read_spectra(capture, scan, grid, pulse, bounces, wavenumbers, chosen, lattice)
-        points = None if scan.confocal else np.array([scan.lasers[laser] for laser in chosen])
-        told = portion(progress, start / len(lasers), len(chosen) / len(lasers))
-        _add_field(total, read, wavenumbers, lattice, points, grid, told)
+        camera.expose(total, chosen, portion(progress, start / len(lasers), len(chosen) / len(lasers)))
     return total
 
 
@@ -89,47 +88,44 @@ def _wavenumbers(scan: Scan, grid: VoxelGrid, pulse: Pulse) -> Float64:
     return pulse.wavenumbers(period)
 
 
-def _read_spectra(
-    capture: StoredCapture,
-    scan: Scan,
-    grid: VoxelGrid,
-    pulse: Pulse,
-    bounces: tuple[int, ...],
-    wavenumbers: Float64,
-    lasers: list[tuple[int, int]],
-    lattice: Lattice,
-) -> Complex64:
-    """Return (wavenumber, laser, Ny, Nx), points ascending."""
-    shape = (len(wavenumbers), len(lasers), *scan.sensors.shape[:2])
-    found = np.empty(shape, dtype=np.complex64)
-    for number, laser in enumerate(lasers):
-        for rows, light in light_bands(capture, laser, bounces):
-            found[:, number, rows] = spectra(scan, light, rows, laser, grid.bounds, pulse, wavenumbers)
-    return np.flip(found, axis=tuple(axis + 2 for axis in lattice.flips)) if lattice.flips else found
+@dataclass(frozen=True, eq=False)
+class _Camera:
+    """What the field of a few laser points is computed from."""
 
+    capture: StoredCapture
+    scan: Scan
+    grid: VoxelGrid
+    pulse: Pulse
+    bounces: tuple[int, ...]
+    wavenumbers: Float64
+    lattice: Lattice
 
-def _add_field(
-    total: Complex64,
-    spectra_at_points: Complex64,
-    wavenumbers: Float64,
-    lattice: Lattice,
-    lasers: Float64 | None,
-    grid: VoxelGrid,
-    progress: Progress,
-) -> None:
-    """Add the field of some laser points (laser, 3) to ``total``; None: each sensor point is its own laser."""
-    propagator = Propagator(lattice, grid.x, grid.y, ways=2 if lasers is None else 1)
+    def expose(self, total: Complex64, lasers: list[tuple[int, int]], progress: Progress) -> None:
+        """Add the field of some laser points to ``total``."""
+        scan, grid, wavenumbers = self.scan, self.grid, self.wavenumbers
+        spectra_at_points = self._spectra(lasers)
+        propagator = Propagator(self.lattice, grid.x, grid.y, ways=2 if scan.confocal else 1)
 
-    def plane(number: int) -> None:
-        z = float(grid.z[number])
-        if lasers is None:
-            total[number] = propagator.summed_field(spectra_at_points, wavenumbers, z)[0]
-            return
-        lighting = _Lighting(lasers, grid, z, wavenumbers)
-        for index, field in propagator.fields(spectra_at_points, wavenumbers, z):
-            total[number] += lighting.at(index, field)
+        def plane(number: int) -> None:
+            z = float(grid.z[number])
+            if scan.confocal:  # each sensor point is its own laser
+                total[number] = propagator.summed_field(spectra_at_points, wavenumbers, z)[0]
+                return
+            lighting = _Lighting(np.array([scan.lasers[laser] for laser in lasers]), grid, z, wavenumbers)
+            for index, field in propagator.fields(spectra_at_points, wavenumbers, z):
+                total[number] += lighting.at(index, field)
 
-    in_threads(plane, len(grid.z), progress)
+        in_threads(plane, len(grid.z), progress)
+
+    def _spectra(self, lasers: list[tuple[int, int]]) -> Complex64:
+        """Return (wavenumber, laser, Ny, Nx), points ascending."""
+        found = np.empty((len(self.wavenumbers), len(lasers), *self.scan.sensors.shape[:2]), dtype=np.complex64)
+        for number, laser in enumerate(lasers):
+            for rows, light in light_bands(self.capture, laser, self.bounces):
+                found[:, number, rows] = spectra(
+                    self.scan, light, rows, laser, self.grid.bounds, self.pulse, self.wavenumbers
+                )
+        return np.flip(found, axis=tuple(axis + 2 for axis in self.lattice.flips))
 
 
 class _Lighting:

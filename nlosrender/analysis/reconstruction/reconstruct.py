@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,13 +11,13 @@ import numpy as np
 from nlosrender.analysis.reconstruction.backprojection import backproject, laplacian_filtered
 from nlosrender.analysis.reconstruction.phasor import phasor_field, refuse_curved
 from nlosrender.analysis.reconstruction.pulse import DEFAULT_CYCLES, Pulse, default_wavelength, pulse_warnings
-from nlosrender.analysis.reconstruction.threads import Progress
 from nlosrender.analysis.reconstruction.voxel_grid import VoxelGrid, expected_box, voxel_grid
 from nlosrender.config.fields import LONGEST
 from nlosrender.errors import FileError, OptionError
 from nlosrender.files.layout import Float64
 from nlosrender.files.reading.reader import open_capture
 from nlosrender.files.reading.scan import Float32, chosen_bounces, read_scan
+from nlosrender.rendering.render_report import Progress, Warn, Warnings
 
 METHODS = ("phasor", "backprojection")
 FILTER_WAVELENGTHS = 1 / 8  # width of the backprojection's filter: about the depth resolution of phasor fields
@@ -105,7 +104,7 @@ def reconstruct_capture(
     path: str | Path,
     settings: ReconstructionSettings,
     progress: Progress = lambda share: None,
-    warn: Callable[[str], None] = lambda text: None,
+    warn: Warn = lambda text: None,
 ) -> Reconstruction:
     """Reconstruct the hidden scene of a capture.
 
@@ -116,9 +115,9 @@ def reconstruct_capture(
     settings
         What to do.
     progress
-        Told the share of the work done.
+        Called with the share of the work done.
     warn
-        Told every warning, before the work begins where possible.
+        Called with every warning, before the work begins where possible.
 
     Raises
     ------
@@ -129,12 +128,7 @@ def reconstruct_capture(
         The settings are impossible for this capture.
     """
     begun = time.perf_counter()
-    warnings: list[str] = []
-
-    def say(text: str) -> None:
-        warnings.append(text)
-        warn(text)
-
+    warnings = Warnings(warn)
     with open_capture(path) as capture:
         scan = read_scan(capture)
         phasor = settings.method == "phasor"
@@ -149,8 +143,8 @@ def reconstruct_capture(
             scan, wavelength, settings.volume_center, settings.volume_size, settings.voxels, settings.voxel_size
         )
         if phasor:
-            for text in pulse_warnings(scan, pulse, grid.bounds) if settings.wavelength is not None else ():
-                say(text)
+            if settings.wavelength is not None:
+                warnings.emit(pulse_warnings(scan, pulse, grid.bounds))
             volume = np.abs(phasor_field(capture, scan, grid, pulse, indices, progress))
         else:
             width = max(wavelength * FILTER_WAVELENGTHS, grid.voxel_size * FILTER_VOXELS)
@@ -159,7 +153,9 @@ def reconstruct_capture(
     if not np.isfinite(volume).all():
         raise FileError(f"{path}: data holds numbers so large that the volume is not finite; scale them down")
     if not volume.any():
-        say("no light of this capture comes from the volume: look elsewhere (--volume-center, --volume-size)")
+        warnings.emit(
+            ["no light of this capture comes from the volume: look elsewhere (--volume-center, --volume-size)"]
+        )
     return Reconstruction(
         volume=volume,
         grid=grid,
@@ -172,7 +168,7 @@ def reconstruct_capture(
         wall_to_file=scan.wall_to_file,
         wall_to_scene=scan.wall_to_scene,
         seconds=time.perf_counter() - begun,
-        warnings=tuple(warnings),
+        warnings=tuple(warnings.emitted),
     )
 
 

@@ -8,7 +8,7 @@ from concurrent.futures import ThreadPoolExecutor, as_completed
 
 from threadpoolctl import threadpool_limits
 
-Progress = Callable[[float], None]  # told the share of the work that is done, in [0, 1]
+from nlosrender.rendering.render_report import Progress
 
 
 def in_threads(work: Callable[[int], None], count: int, progress: Progress = lambda share: None) -> None:

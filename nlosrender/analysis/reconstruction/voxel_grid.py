@@ -106,10 +106,10 @@ def expected_box(
         As for ``voxel_grid``.
     """
     if center is None or size is None:
-        if scan.hidden_box is None:
+        if scan.hidden_aabb is None:
             return None
-        margin = MARGIN * float(np.ptp(scan.hidden_box, axis=0).max())
-        low, high = scan.hidden_box[0] - margin, scan.hidden_box[1] + margin
+        margin = MARGIN * float(np.ptp(scan.hidden_aabb, axis=0).max())
+        low, high = scan.hidden_aabb[0] - margin, scan.hidden_aabb[1] + margin
     middle = (low + high) / 2 if center is None else np.asarray(center, dtype=np.float64)
     half = (high - low) / 2 if size is None else np.broadcast_to(np.asarray(size, dtype=np.float64), 3) / 2
     return middle - half, middle + half
@@ -117,15 +117,15 @@ def expected_box(
 
 def _default_box(scan: Scan, wavelength: float) -> Bounds:
     box = expected_box(scan)
-    if box is None or scan.hidden_box is None:
+    if box is None or scan.hidden_aabb is None:
         raise FileError(
             "the file does not say where the hidden scene is: give --volume-center X,Y,Z and --volume-size W,H,D "
             "(m; x and y along the wall, z away from it, from the wall's centre)"
         )
-    edge = float(np.ptp(scan.hidden_box, axis=0).max())
+    edge = float(np.ptp(scan.hidden_aabb, axis=0).max())
     margin = min(MARGIN_WAVELENGTHS * wavelength, edge)  # waves longer than the scene show nothing of it
-    low = np.minimum(box[0], scan.hidden_box[0] - margin)
-    high = np.maximum(box[1], scan.hidden_box[1] + margin)
+    low = np.minimum(box[0], scan.hidden_aabb[0] - margin)
+    high = np.maximum(box[1], scan.hidden_aabb[1] + margin)
     if scan.planar:
         low[2] = max(low[2], min(NEAREST * wavelength, high[2] / 2))
     return low, high

@@ -124,8 +124,8 @@ def _write_enum(file: h5py.File, name: str, value: IntEnum) -> None:
 
 def _scene_info(capture: StoredCapture, scan: Scan) -> str:
     info: dict[str, object] = {"original_format": "HDF5_ZNLOS", "original_file": capture.path.name}
-    if scan.hidden_box is not None:
-        low, high = scan.hidden_box
+    if scan.hidden_aabb is not None:
+        low, high = scan.hidden_aabb
         info["volume"] = {"center": ((low + high) / 2).tolist(), "rotation": [0, 0, 0], "size": (high - low).tolist()}
     config = capture.header.attributes.get("config")
     if isinstance(config, str):

@@ -40,7 +40,7 @@ class Scan:
     start_opl: float  # m
     bin_width_opl: float  # m
     n_bins: int
-    hidden_box: Bounds | None  # around the hidden geometry, as the file has it
+    hidden_aabb: Bounds | None  # around the hidden geometry, as the file has it
     wall_to_file: Float64  # (4, 4)
     wall_to_scene: Float64 | None  # (4, 4); None when the file does not say
 
@@ -100,7 +100,7 @@ def read_scan(capture: StoredCapture) -> Scan:
         start_opl=header.start_opl,
         bin_width_opl=header.bin_width_opl,
         n_bins=header.n_bins,
-        hidden_box=_hidden_box(header, wall_from_file),
+        hidden_aabb=_hidden_aabb(header, wall_from_file),
         wall_to_file=wall_to_file,
         wall_to_scene=None if to_scene is None else to_scene @ wall_to_file,
     )
@@ -202,7 +202,7 @@ def _moved(points: Float64, matrix: Float64) -> Float64:
     return points @ matrix[:3, :3].T + matrix[:3, 3]
 
 
-def _hidden_box(header: StoredHeader, wall_from_file: Float64) -> Bounds | None:
+def _hidden_aabb(header: StoredHeader, wall_from_file: Float64) -> Bounds | None:
     edges, center = header.hidden_volume_edges, header.hidden_volume_position
     if not edges or not max(edges) > 0 or center is None or len(center) != 3:
         return None

@@ -12,7 +12,14 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from nlosrender.capture.bounces import FILE_BOUNCES, FIRST_BOUNCE, LINE_OF_SIGHT, THIRD_BOUNCE, first_bounce_of
+from nlosrender.capture.bounces import (
+    FILE_BOUNCES,
+    FIRST_BOUNCE,
+    LINE_OF_SIGHT,
+    THIRD_BOUNCE,
+    BounceAxis,
+    first_bounce_of,
+)
 from nlosrender.errors import FileError
 from nlosrender.files import layout
 from nlosrender.files.attributes import get_attributes
@@ -82,6 +89,12 @@ class StoredHeader:
     def laser_grid(self) -> tuple[int, int]:
         """Rows and columns of the laser grid; a confocal capture has its sensor grid here."""
         return self.sensor_grid if self.confocal else (self.sizes["laser_y"], self.sizes["laser_x"])
+
+    def bounce_name(self, index: int) -> str:
+        """Return what an index of the bounce axis holds: a bounce number, "7 and above" or "all"."""
+        limit = self.attributes.get("max_bounces")
+        highest = limit if isinstance(limit, int) else None
+        return BounceAxis(highest, self.split_bounces is not False, self.first_bounce).name(index)
 
 
 def intensity(header: StoredHeader, block: NDArray[T]) -> NDArray[T]:
