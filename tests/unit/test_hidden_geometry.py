@@ -140,25 +140,6 @@ def test_to_world_may_be_a_matrix_or_missing():
     np.testing.assert_allclose(plain @ WALL.pose.matrix(), np.eye(4), atol=1e-14)
 
 
-@pytest.mark.parametrize(
-    ("to_world", "message"),
-    [
-        ("up", "need a 4 x 4 matrix or a list"),
-        ([[1, 2], [3, 4]], r"shape \(2, 2\)"),
-        ([{"scale": 1}, {"move": [1, 2, 3]}], "to_world.1: got move"),
-        ([{"translate": [1, 2]}], "to_world.0.translate.*three finite numbers"),
-        ([{"translate": 1}], "to_world.0.translate"),
-        ([{"rotate": {"axis": [0, 0, 0], "angle_deg": 3}}], "no rotation"),
-        ([{"rotate": {"axis": [0, 0, 1]}}], "to_world.0: got rotate"),
-        ([{"scale": 1, "translate": [0, 0, 0]}], "to_world.0"),
-    ],
-)
-def test_impossible_transforms_are_refused(to_world, message):
-    """A step that is not understood is refused with its place."""
-    with pytest.raises(ValueError, match=message):
-        transform_matrix(to_world)
-
-
 def test_errors_name_the_item():
     """A mistake in the third item is reported under its key."""
     good = item("room", size=[1, 2, 3])

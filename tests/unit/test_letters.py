@@ -142,25 +142,3 @@ def test_default_stroke_and_spacing_are_a_fifth_of_the_height():
     # 0.14 / 0.7 rounds: vertices may come in another order, what they cover is the same
     assert default.area == pytest.approx(explicit.area, rel=1e-12)
     np.testing.assert_allclose(default.bounds(), explicit.bounds(), atol=1e-14)
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (("z", 1.0), "no glyph for 'z', need A-Z, 0-9 or space. Write it in upper case"),
-        (("A-B", 1.0), "no glyph for '-', need A-Z, 0-9 or space.$"),
-        (("  ", 1.0), "at least one character"),
-        (("", 1.0), "at least one character"),
-        (("A", 0.0), "height: got 0.0"),
-        (("A", 1.0, -0.1), "thickness: got -0.1"),
-        (("A", 1.0, np.inf), "thickness: got inf"),
-        (("A", 1.0, 0.0, 0.5), "stroke_width: got 0.5, need a number > 0 and < 0.5"),
-        (("A", 1.0, 0.0, 0.0), "stroke_width: got 0.0"),
-        (("A", 1.0, 0.0, np.nan), "stroke_width: got nan"),
-        (("A", 1.0, 0.0, None, -0.1), "spacing: got -0.1"),
-    ],
-)
-def test_impossible_text_is_refused(arguments, message):
-    """Unknown characters and sizes are refused with the value and what is allowed."""
-    with pytest.raises(ValueError, match=message):
-        letters_mesh(*arguments)

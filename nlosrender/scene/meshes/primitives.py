@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from nlosrender.scene.meshes.triangle_mesh import TriangleMesh
-from nlosrender.scene.pose import Float64, Pose
+from nlosrender.scene.pose import Pose
 
 _QUAD_FACES = np.array([[0, 1, 2], [0, 2, 3]])
 _QUAD_UVS = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
@@ -37,14 +37,8 @@ def rectangle_mesh(width: float, height: float, pose: Pose | None = None) -> Tri
     -------
     TriangleMesh
         4 vertices, 2 faces, texture coordinates 0 to 1 along x and y.
-
-    Raises
-    ------
-    ValueError
-        A size is not finite and positive.
     """
-    size = _positive_sizes("rectangle", [width, height])
-    corners = np.column_stack([(_QUAD_UVS - 0.5) * size, np.zeros(4)])
+    corners = np.column_stack([(_QUAD_UVS - 0.5) * [width, height], np.zeros(4)])
     return TriangleMesh(corners if pose is None else pose.to_scene(corners), _QUAD_FACES, _QUAD_UVS)
 
 
@@ -54,7 +48,7 @@ def box_mesh(size: ArrayLike, pose: Pose | None = None) -> TriangleMesh:
     Parameters
     ----------
     size
-        (3,) edge lengths along the pose's axes [m], > 0; ValueError for others.
+        (3,) edge lengths along the pose's axes [m], > 0.
     pose
         Centre and axes of the box in the mesh's frame; the frame itself when None.
 
@@ -63,9 +57,8 @@ def box_mesh(size: ArrayLike, pose: Pose | None = None) -> TriangleMesh:
     TriangleMesh
         12 faces; each side has its own 4 vertices and texture coordinates 0 to 1.
     """
-    edges = _positive_sizes("box", size, 3)
     sides = _cube_sides([_BACK, _FRONT, _RIGHT, _LEFT, _TOP, _BOTTOM])
-    vertices = sides.vertices * edges
+    vertices = sides.vertices * np.asarray(size, dtype=np.float64)
     return replace(sides, vertices=vertices if pose is None else pose.to_scene(vertices))
 
 
@@ -75,15 +68,15 @@ def room_mesh(size: ArrayLike) -> TriangleMesh:
     Parameters
     ----------
     size
-        (3,) width (x), height (y) and depth (z) [m], > 0; ValueError for others. The room is centred on the wall in x
-        and y and occupies z in [0, depth].
+        (3,) width (x), height (y) and depth (z) [m], > 0. The room is centred on the wall in x and y and occupies
+        z in [0, depth].
 
     Returns
     -------
     TriangleMesh
         10 faces with inward normals; each side has its own 4 vertices and texture coordinates 0 to 1.
     """
-    edges = _positive_sizes("room", size, 3)
+    edges = np.asarray(size, dtype=np.float64)
     sides = _cube_sides([_BACK, _RIGHT, _LEFT, _TOP, _BOTTOM])
     return replace(sides, vertices=sides.vertices * edges + [0.0, 0.0, edges[2] / 2], faces=sides.faces[:, ::-1])
 
@@ -91,10 +84,3 @@ def room_mesh(size: ArrayLike) -> TriangleMesh:
 def _cube_sides(sides: Sequence[tuple[list[int], list[int]]]) -> TriangleMesh:
     poses = [Pose.from_normal_up(0.5 * np.asarray(normal), normal, up) for normal, up in sides]
     return TriangleMesh.merged([rectangle_mesh(1.0, 1.0, pose) for pose in poses])
-
-
-def _positive_sizes(owner: str, sizes: ArrayLike, count: int = 2) -> Float64:
-    lengths = np.asarray(sizes, dtype=np.float64)
-    if lengths.shape != (count,) or not np.all(np.isfinite(lengths)) or not np.all(lengths > 0):
-        raise ValueError(f"{owner} size: got {lengths.tolist()}, need {count} finite numbers > 0 [m]")
-    return lengths
