@@ -19,6 +19,7 @@ from nlosrender.engine.launch.morton import morton_order
 from nlosrender.scene.build import BuiltScene, wall_box
 from nlosrender.scene.loading.mitsuba_shapes import WALL_ID
 from nlosrender.scene.pose import Float64
+from nlosrender.scene.triangle_point import triangle_weights
 
 SAMPLEABLE_PLUGINS = ("Rectangle", "Disk", "Sphere", "Cylinder")
 _FULL = 2.0**32
@@ -109,8 +110,7 @@ class SurfaceSampler:
         if self.n_triangles:
             on_triangle = active & is_triangle
             a, b, c = (self._corner(k, entry, on_triangle) for k in range(3))
-            root = dr.sqrt(u)  # uniform on the triangle: (1 - sqrt u, sqrt u (1 - v), sqrt u v)
-            within = mi.Point2f(root * (1 - v), root * v)
+            within = mi.Point2f(*triangle_weights(u, v, dr.sqrt)[1:])
             point = a + (b - a) * within.x + (c - a) * within.y
             normal = mi.Normal3f(dr.cross(b - a, c - a))
             primitive = dr.select(on_triangle, dr.gather(mi.UInt32, table.primitive, entry, on_triangle), ANALYTIC)

@@ -22,6 +22,7 @@ from nlosrender.engine.virtual_lights.third_bounce import COARSEST_SCALE, REFINE
 from nlosrender.scene.build import BuiltScene, wall_box
 from nlosrender.scene.pose import Float64
 from nlosrender.scene.surfaces import Surface
+from nlosrender.scene.triangle_point import triangle_weights
 from nlosrender.scene.view import BuiltView
 
 POINTS_PER_SURFACE = 64
@@ -132,9 +133,8 @@ def _surface_points(built: BuiltScene, shape: mi.Shape) -> _SurfacePoints:
             return _SurfacePoints(np.zeros((0, 3)), np.zeros((0, 3)))
         cumulative = np.cumsum(areas) / areas.sum()
         chosen = np.minimum(np.searchsorted(cumulative, u), len(areas) - 1)
-        root, across = np.sqrt(v), (k * 0.754877666 % 1)
         a, b, c = (triangles[chosen, corner] for corner in range(3))
-        weights = np.stack([1 - root, root * (1 - across), root * across], axis=1)
+        weights = np.stack(triangle_weights(v, k * 0.754877666 % 1), axis=1)
         points = a + (b - a) * weights[:, 1:2] + (c - a) * weights[:, 2:]
         normals = normals[chosen]
         if shape.has_vertex_normals():

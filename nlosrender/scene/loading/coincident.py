@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from nlosrender.scene.meshes.triangle_mesh import TriangleMesh, unit_rows
 from nlosrender.scene.pose import Float64
+from nlosrender.scene.triangle_point import triangle_weights
 
 GAP = 2e-6  # over 1 + the largest coordinate [engine units]: four times the ray offset
 MIN_POINTS = 2**16  # tried on all meshes of a scene
@@ -132,10 +133,10 @@ def _pairs(scene: mi.Scene, mesh: TriangleMesh, areas: Float64, first: mi.UInt32
         return [dr.gather(mi.Point3f, vertices, dr.gather(mi.UInt32, faces, 3 * face + k)) for k in range(3)]
 
     lane, number = dr.arange(mi.UInt32, dr.width(own)), dr.opaque(mi.UInt32, 2 * seed)
-    root, other = dr.sqrt(mi.sample_tea_float32(lane, number)), mi.sample_tea_float32(lane, number + 1)
-    v = EDGE + (1 - 2 * EDGE) * other
+    first_number, second_number = (mi.sample_tea_float32(lane, number + k) for k in range(2))
+    _, at_b, at_c = triangle_weights(first_number, EDGE + (1 - 2 * EDGE) * second_number, dr.sqrt)
     a, b, c = corners(own)
-    point = a + (b - a) * (root * (1 - v)) + (c - a) * (root * v)
+    point = a + (b - a) * at_b + (c - a) * at_c
     normal = dr.normalize(dr.cross(b - a, c - a))
     reach = normal * (GAP * (1 + dr.max(dr.abs(point))))
     hit = scene.ray_intersect_preliminary(mi.Ray3f(point + reach, -2 * reach, mi.Float(1), mi.Float(0), []))

@@ -21,6 +21,7 @@ from nlosrender.engine.virtual_lights.visibility.masks import Surface
 from nlosrender.scene.build import BuiltScene
 from nlosrender.scene.loading.round_surfaces import ROUND_PLUGINS
 from nlosrender.scene.pose import Float64
+from nlosrender.scene.triangle_point import triangle_weights
 
 # A textured patch is cut into this many squared parts, a random point of each is looked up: 16 of many, 144 of few.
 TEXTURE_SPLITS, FEW_PATCHES = (4, 12), 2**14
@@ -242,8 +243,7 @@ def _mean_reflectance(built: BuiltScene, patches: Patches, reflectance: mi.Spect
     parts = split_weights(TEXTURE_SPLITS[0 if len(chosen) > FEW_PATCHES else 1])
     total = mi.Spectrum(0)
     for part in parts:
-        root, v = np.sqrt(random.random(len(chosen))), random.random(len(chosen))
-        weights = np.stack([1 - root, root * (1 - v), root * v], axis=1) @ part
+        weights = np.stack(triangle_weights(random.random(len(chosen)), random.random(len(chosen))), axis=1) @ part
         positions = np.einsum("nk,nkx->nx", weights, some.corners)
         barycentric = np.einsum("nk,nkx->nx", weights, some.corner_barycentric)
         total += normal_reflectance(
@@ -266,9 +266,9 @@ def normal_reflectance(interaction: mi.SurfaceInteraction3f) -> mi.Spectrum:
 
 def point_inside(corners: list[mi.Vector3f], u: mi.Float, v: mi.Float) -> mi.Vector3f:
     """Return the point of a triangle that two uniform numbers choose, uniform by area."""
-    root = dr.sqrt(u)
+    _, at_b, at_c = triangle_weights(u, v, dr.sqrt)
     a, b, c = corners
-    return a + (b - a) * (root * (1 - v)) + (c - a) * (root * v)
+    return a + (b - a) * at_b + (c - a) * at_c
 
 
 def spread_numbers(start: mi.Vector2u, index: mi.UInt32) -> tuple[mi.Float, mi.Float]:

@@ -19,6 +19,7 @@ from nlosrender.engine.virtual_lights.elements.round_shapes import onto_round_sh
 from nlosrender.engine.virtual_lights.elements.subdivision import longest_edges, normals_and_areas
 from nlosrender.engine.virtual_lights.elements.tessellator import Tessellator
 from nlosrender.scene.pose import Float64
+from nlosrender.scene.triangle_point import triangle_weights
 
 # Barycentric coordinates of a cell's centre, and of the points between it and the corners.
 POINTS_OF_CELL = np.concatenate([np.full((1, 3), 1 / 3), np.full((3, 3), 1 / 6) + np.eye(3) / 2])
@@ -104,8 +105,7 @@ class VplSampler:
         starts = generator.integers(0, 2**32, 2, dtype=np.uint64)
         bits = (starts[:, None] + steps[:, None] * np.arange(count, dtype=np.uint64)) % 2**32
         u, v = bits / 2.0**32
-        root = np.sqrt(u)
-        weights = np.stack([1 - root, root * (1 - v), root * v], axis=1)
+        weights = np.stack(triangle_weights(u, v), axis=1)
         positions = np.einsum("nk,nkx->nx", weights, self._corners[element])
         barycentric = np.einsum("nk,nkb->nb", weights, self._weights[element])[:, 1:]
         areas = self._areas[element] / (count * self._probability[chosen])
