@@ -19,6 +19,7 @@ from nlosrender.config.document import Config
 from nlosrender.config.load import config_hash, config_to_dict
 from nlosrender.config.warnings import config_warnings
 from nlosrender.files.atomic_write import check_writable
+from nlosrender.files.capture_results import MISSED
 from nlosrender.files.file_kinds import CAPTURE
 from nlosrender.files.identity import capture_identity, files_read, identity_attributes
 from nlosrender.files.partial.partial_capture import PartialCapture
@@ -27,7 +28,7 @@ from nlosrender.files.provenance import provenance_attributes
 from nlosrender.rendering.dask_executor import render_on_cluster
 from nlosrender.rendering.dask_worker import Job
 from nlosrender.rendering.local_executor import render_items, resumable
-from nlosrender.rendering.outcome import Outcome, missing_light
+from nlosrender.rendering.outcome import missed_target, missing_light, summed_capture
 from nlosrender.rendering.process_layout import ONE_PROCESS
 from nlosrender.rendering.render_report import Progress, RenderReport, Stopwatch, Warn, Warnings, Watch
 from nlosrender.rendering.render_warnings import render_warnings
@@ -125,12 +126,15 @@ def render_capture(
                 warn=lambda text: warnings.emit([text]),
                 watch=(lambda standing: watch(replace(standing, error=None))) if unsampled else watch,
             )
-            tally = partial.finished
-            outcome = Outcome.of(config.render, engine, unsampled, tally.sums)
-            warnings.emit(outcome.warnings)
-            results = outcome.attributes(stopwatch.report(), is_whole=selection == WHOLE)
+            summed = summed_capture(engine, unsampled, partial.finished.sums)
+            missed = missed_target(config.render, summed.stated_error)
+            warnings.emit([f"H is zero everywhere: {'; '.join(summed.zero_because)}."] if summed.zero_because else [])
+            warnings.emit([missed] if missed else [])
+            results = summed.attributes(stopwatch.report())
             if selection != WHOLE:
-                results |= part_attributes(plan.part, plan.tiling, tally)
+                results |= part_attributes(plan.part, plan.tiling, partial.finished)
+            elif missed:
+                results[MISSED] = missed
             partial.publish(results)
     return RenderReport(
         output=Path(output.path),
@@ -140,16 +144,9 @@ def render_capture(
         part=None if selection == WHOLE else str(plan.part),
         units=earlier + len(items),
         resumed_units=earlier,
-        samples=tally.sums.samples or 0,
-        error_estimate=outcome.stated_error,
-        energy=tally.sums.energy_per_bounce(outcome.bounces),
-        out_of_window=float(tally.sums.outside),
         n_bins=header.n_bins,
         n_triangles=engine.built.n_triangles,
         seconds=stopwatch.report(),
         warnings=tuple(warnings.emitted),
-        unsampled_paths=outcome.missing,
-        zero_because=outcome.zero_because,
-        error_estimate_per_bounce=outcome.known_per_bounce(tally.sums.errors_per_bounce(outcome.bounces)),
-        energy_error_per_bounce=outcome.known_per_bounce(tally.sums.energy_errors(outcome.bounces)),
+        **summed.results(),
     )

@@ -9,7 +9,8 @@ from pathlib import Path
 from nlosrender.analysis.json_values import finite_or_none
 from nlosrender.constants import opl_to_seconds
 from nlosrender.errors import FileError
-from nlosrender.files.parts.part_attributes import UNSAMPLED, ZERO, text_list
+from nlosrender.files.attributes import text_list
+from nlosrender.files.capture_results import UNSAMPLED, ZERO
 from nlosrender.files.reading.reader import read_header
 
 # keys of the summary that are attributes of the file, as text, number or JSON

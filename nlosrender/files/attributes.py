@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping
+from typing import Any
 
 import h5py
 import numpy as np
@@ -63,6 +64,24 @@ def get_attributes(source: h5py.Group | h5py.Dataset) -> dict[str, object]:
         except (OSError, TypeError, ValueError, RuntimeError, KeyError):
             continue  # written by someone else in a type that has no meaning here
     return found
+
+
+def text_list(attributes: Mapping[str, object], name: str) -> tuple[str, ...]:
+    """Return an attribute that holds a list of texts as JSON; an empty one where it is missing or does not."""
+    try:
+        found = json.loads(str(attributes.get(name, "[]")))
+    except (ValueError, RecursionError):
+        return ()
+    return tuple(str(text) for text in found) if isinstance(found, list) else ()
+
+
+def json_object(text: object) -> dict[str, Any]:
+    """Return the mapping in an attribute that should hold one as JSON; an empty one where it does not."""
+    try:
+        found = json.loads(str(text))
+    except (ValueError, RecursionError):
+        return {}
+    return found if isinstance(found, dict) else {}
 
 
 def _is_ragged(kind: h5py.h5t.TypeID) -> bool:

@@ -12,8 +12,10 @@ from typing import Any, Literal
 
 from nlosrender.errors import FileError
 from nlosrender.files.atomic_write import replacing
+from nlosrender.files.attributes import json_object, text_list
+from nlosrender.files.capture_results import UNSAMPLED
 from nlosrender.files.file_kinds import INDEX
-from nlosrender.files.parts.part_attributes import PART, UNSAMPLED, json_object, text_list
+from nlosrender.files.parts.part_attributes import PART
 from nlosrender.files.reading.reader import read_header
 
 FORMAT_VERSION = 1

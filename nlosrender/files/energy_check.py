@@ -9,7 +9,7 @@ import h5py
 import numpy as np
 
 from nlosrender.files import layout
-from nlosrender.files.parts.part_attributes import json_object
+from nlosrender.files.attributes import json_object
 
 # Energies are sums of float64 samples, which the file holds rounded to float32: by at most half a unit in the last of
 # 24 digits, or of the smallest denormal number. Twice that leaves room for the float64 sums themselves.

@@ -24,10 +24,6 @@ def provenance_attributes(
     seed: int | None = None,
     meshes: Sequence[MeshReport] = (),
     created: datetime | None = None,
-    samples: int | None = None,
-    error_estimate: float | None = None,
-    seconds: Mapping[str, float] | None = None,
-    out_of_window_energy: float | Sequence[float] | None = None,
 ) -> dict[str, object]:
     """Return the attributes that say how a capture was made.
 
@@ -45,13 +41,6 @@ def provenance_attributes(
         What was read of mesh files.
     created
         Time of creation, with its time zone; now when omitted.
-    samples, error_estimate, seconds, out_of_window_energy
-        As in :func:`result_attributes`, when they are known already.
-
-    Returns
-    -------
-    dict
-        Text and numbers, for ``CaptureWriter``.
 
     Raises
     ------
@@ -75,58 +64,7 @@ def provenance_attributes(
         attributes["seed"] = seed
     if meshes:
         attributes["meshes"] = json.dumps([asdict(mesh) for mesh in meshes], ensure_ascii=False)
-    return attributes | result_attributes(
-        samples=samples, error_estimate=error_estimate, seconds=seconds, out_of_window_energy=out_of_window_energy
-    )
-
-
-def result_attributes(
-    *,
-    samples: int | None = None,
-    error_estimate: float | None = None,
-    seconds: Mapping[str, float] | None = None,
-    out_of_window_energy: float | Sequence[float] | None = None,
-    energy: Mapping[str, float] | None = None,
-    error_estimate_per_bounce: Mapping[str, float | None] | None = None,
-    energy_error_per_bounce: Mapping[str, float | None] | None = None,
-    energy_error: float | None = None,
-) -> dict[str, object]:
-    """Return what is known when a render ends, for ``CaptureWriter.set_attributes``; None is left out.
-
-    Parameters
-    ----------
-    samples
-        Paths per pair of laser and sensor point.
-    error_estimate
-        Estimated relative L2 error of H over the whole capture; NaN: not known.
-    seconds
-        Time spent in each stage [s].
-    out_of_window_energy
-        Light that arrived before the first or after the last bin, summed over all points: one number or one per
-        bounce [J m^-2 sr^-1].
-    energy
-        H summed over all samples, by bounce number [J m^-2 sr^-1].
-    error_estimate_per_bounce
-        Estimated relative L2 error of H, by bounce number; None: not known, or no light.
-    energy_error_per_bounce, energy_error
-        Estimated standard error of ``energy``, by bounce number and of all of it [J m^-2 sr^-1]; None and NaN: not
-        known.
-    """
-    known = {
-        "samples": samples,
-        "error_estimate": error_estimate,
-        "seconds": None if seconds is None else json.dumps({stage: float(spent) for stage, spent in seconds.items()}),
-        "out_of_window_energy": out_of_window_energy,
-        "energy": None if energy is None else json.dumps(dict(energy)),
-        "error_estimate_per_bounce": _json(error_estimate_per_bounce),
-        "energy_error_per_bounce": _json(energy_error_per_bounce),
-        "energy_error": energy_error,
-    }
-    return {name: value for name, value in known.items() if value is not None}
-
-
-def _json(errors: Mapping[str, float | None] | None) -> str | None:
-    return None if errors is None else json.dumps(dict(errors), allow_nan=False)
+    return attributes
 
 
 def package_versions() -> dict[str, str]:

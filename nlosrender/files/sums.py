@@ -1,4 +1,4 @@
-"""What is known of a whole capture as sums over its samples, exact, so that no order of the work shows in them."""
+"""Sums over the samples of a capture: exact, so that neither cuts nor the order of the work show in the results."""
 
 from __future__ import annotations
 
@@ -15,10 +15,8 @@ from numpy.typing import NDArray
 from nlosrender.capture.bounces import BounceAxis
 from nlosrender.capture.relative_error import relative_l2_error
 
-MANTISSA_BITS = 53  # of float64
-CONTRAST_BITS = 32  # that a work item's contrasts are rounded to
+CONTRAST_BITS = 32  # that a work item's contrasts are rounded to: journals keep their digits as text
 STATED_DIGITS = 4  # of errors that rest on them: more would depend on how the work is cut
-HALF = 26  # bits of the lower half of a mantissa: sums of 2^36 halves stay within 64-bit integers
 
 
 @dataclass(frozen=True)
@@ -58,17 +56,12 @@ class Sums:
     @property
     def error_estimate(self) -> float:
         """Relative L2 error of H over everything summed; NaN where H is zero everywhere, which has none."""
-        return relative_l2_error(float(self.noise), float(self.squares)) if self.squares else math.nan
-
-    def stated_error(self, unsampled: Sequence[str]) -> float:
-        """Return ``error_estimate``, or NaN where light is missing: ``unsampled`` lists the paths not sampled."""
-        return math.nan if unsampled else self.error_estimate
+        return _relative_error(self.noise, self.squares)
 
     def errors_per_bounce(self, bounces: BounceAxis) -> dict[str, float]:
         """Return the relative L2 error of H by bounce number; NaN where a bounce has no light."""
         pairs = zip(self.slot_noise, self.slot_squares, strict=True)
-        errors = [relative_l2_error(float(noise), float(squares)) if squares else math.nan for noise, squares in pairs]
-        return {bounces.name(slot): error for slot, error in enumerate(errors)}
+        return {bounces.name(slot): _relative_error(*pair) for slot, pair in enumerate(pairs)}
 
     def energy_errors(self, bounces: BounceAxis) -> dict[str, float]:
         """Return the standard error of ``energy_per_bounce`` by bounce number, NaN where it is not known."""
@@ -138,18 +131,38 @@ def sums_of(
     samples, seconds
         Paths per sensor point; time spent rendering.
     contrasts
-        (contrast, bounce) of the energy, see ``engine.energy_contrasts``; None: not known.
+        (contrast, bounce) of the energy, see ``engine.launch.energy_contrasts``; None: not known.
     """
-    noise, squares, energy = ([Fraction(0)] * mean.shape[1] for _ in range(3))
+    slots = range(mean.shape[1])
+    noise, squares, energy = ([Fraction(0) for _ in slots] for _ in range(3))
     # Over the bins of one histogram numpy's order depends on their number alone; the sums over histograms are exact.
     for laser in range(mean.shape[2]):  # one at a time: squaring makes a copy
         part = mean[:, :, laser]
         of_rows = np.square(part).sum(axis=-1), variance[:, :, laser].sum(axis=-1), part.sum(axis=-1)
         for sums, values in zip((squares, noise, energy), of_rows, strict=True):
-            for slot in range(mean.shape[1]):
+            for slot in slots:
                 sums[slot] += exact_sum(values[:, slot])
-    kept = () if contrasts is None else tuple(tuple(map(_short, row)) for row in contrasts.tolist())
+    kept = () if contrasts is None else tuple(tuple(map(_rounded, row)) for row in contrasts.tolist())
     return Sums(tuple(noise), tuple(squares), exact_sum(outside), tuple(energy), samples, seconds, kept)
+
+
+def exact_sum(values: NDArray[np.float64] | Sequence[float]) -> Fraction:
+    """Return the sum of finite float64 numbers without any rounding: ``math.fsum`` rounds once, the rest is summed on.
+
+    Raises
+    ------
+    OverflowError, ValueError
+        A number, or the sum, is not finite in float64.
+    """
+    rest, total = np.ravel(values).tolist(), Fraction(0)
+    while part := math.fsum(rest):
+        total += Fraction(part)
+        rest.append(-part)
+    return total
+
+
+def _relative_error(noise: Fraction, squares: Fraction) -> float:
+    return relative_l2_error(float(noise), float(squares)) if squares else math.nan
 
 
 def _root_mean_square(values: Sequence[Fraction]) -> float:
@@ -163,8 +176,7 @@ def _added(one: Sequence[Fraction], other: Sequence[Fraction]) -> tuple[Fraction
     return tuple(a + b for a, b in zip_longest(one, other, fillvalue=Fraction(0)))
 
 
-def _short(value: float) -> Fraction:
-    """Return a number rounded to as many bits as an error estimate has use for: journals keep its digits as text."""
+def _rounded(value: float) -> Fraction:
     mantissa, exponent = math.frexp(value)
     return Fraction(round(mantissa * 2**CONTRAST_BITS)) * Fraction(2) ** (exponent - CONTRAST_BITS)
 
@@ -177,29 +189,3 @@ def _fractions(stored: Sequence[str]) -> tuple[Fraction, ...]:
     if isinstance(stored, str):
         raise TypeError(f"got {stored!r}, need one number per bounce slot")
     return tuple(Fraction(value) for value in stored)
-
-
-def exact_sum(values: NDArray[np.float64] | Sequence[float]) -> Fraction:
-    """Return the sum of finite float64 numbers without any rounding.
-
-    Raises
-    ------
-    OverflowError, ValueError
-        A number is not finite.
-    """
-    flat = np.ravel(np.asarray(values, dtype=np.float64))
-    if not np.isfinite(flat).all():
-        raise ValueError("a number that is not finite")
-    flat = flat[flat != 0]
-    if flat.size == 0:
-        return Fraction(0)
-    mantissa, exponent = np.frexp(flat)
-    integers = np.ldexp(mantissa, MANTISSA_BITS).astype(np.int64)  # exact: 53 bits
-    lowest = int(exponent.min())
-    place = exponent - lowest
-    upper, lower = np.zeros((2, int(place.max()) + 1), dtype=np.int64)
-    np.add.at(upper, place, integers >> HALF)
-    np.add.at(lower, place, integers & (2**HALF - 1))
-    total = sum(((int(u) << HALF) + int(v)) << index for index, (u, v) in enumerate(zip(upper, lower, strict=True)))
-    shift = lowest - MANTISSA_BITS
-    return Fraction(total << shift) if shift >= 0 else Fraction(total, 1 << -shift)

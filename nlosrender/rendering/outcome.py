@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from nlosrender.capture.bounces import BounceAxis
 from nlosrender.config.render import RenderConfig
 from nlosrender.errors import ConfigError, ValidationIssue
-from nlosrender.files.parts.part_attributes import MISSED, known_of, summed_attributes
+from nlosrender.files.capture_results import SummedCapture
 
 if TYPE_CHECKING:
     from nlosrender.engine.preflight.unsampled_paths import UnsampledPaths
@@ -19,54 +16,17 @@ if TYPE_CHECKING:
 MISSED_BY = 1.25  # times the target: the estimate has an error of its own
 
 
-@dataclass(frozen=True)
-class Outcome:
-    """What is known of a render beside its samples."""
+def summed_capture(engine: Engine, unsampled: tuple[UnsampledPaths, ...], sums: Sums) -> SummedCapture:
+    """Return what is known of a render whose work items are ``sums`` together."""
+    from nlosrender.engine.preflight.zero_capture import zero_reasons
 
-    sums: Sums
-    bounces: BounceAxis
-    unsampled: tuple[UnsampledPaths, ...]
-    zero_because: tuple[str, ...]  # empty where H is not zero everywhere
-    missed: str | None  # a warning: the stated error is above the target
-
-    @classmethod
-    def of(cls, render: RenderConfig, engine: Engine, unsampled: tuple[UnsampledPaths, ...], sums: Sums) -> Outcome:
-        """Return the outcome of a render whose work items are ``sums`` together."""
-        from nlosrender.engine.preflight.zero_capture import zero_reasons
-
-        zero = () if sums.squares else zero_reasons(engine, unsampled, float(sums.outside))
-        stated = sums.stated_error(tuple(paths.summary for paths in unsampled))
-        return cls(sums, engine.options.bounces, unsampled, zero, missed_target(render, stated))
-
-    @property
-    def missing(self) -> tuple[str, ...]:
-        """The paths that are not sampled, one sentence for each class."""
-        return tuple(paths.summary for paths in self.unsampled)
-
-    @property
-    def stated_error(self) -> float:
-        """Relative L2 error of H; NaN where light is missing."""
-        return self.sums.stated_error(self.missing)
-
-    @property
-    def warnings(self) -> Sequence[str]:
-        """Warnings that take the finished capture."""
-        dark = [f"H is zero everywhere: {'; '.join(self.zero_because)}."] if self.zero_because else []
-        return [*dark, *([self.missed] if self.missed else [])]
-
-    def attributes(self, seconds: Mapping[str, float], *, is_whole: bool) -> dict[str, object]:
-        """Return the results that the file holds; of a part (not ``is_whole``) without what takes the whole capture."""
-        lowest = self._first_unknown_bounce
-        results = summed_attributes(self.sums, self.bounces, seconds, self.missing, self.zero_because, lowest)
-        return results | {MISSED: self.missed} if self.missed and is_whole else results
-
-    def known_per_bounce(self, errors: Mapping[str, float]) -> dict[str, float | None]:
-        """Return errors by bounce number; None where they are not known."""
-        return known_of(errors, self.bounces, self._first_unknown_bounce)
-
-    @property
-    def _first_unknown_bounce(self) -> int | None:
-        return min((paths.first_bounce for paths in self.unsampled), default=None)
+    return SummedCapture(
+        sums,
+        engine.options.bounces,
+        tuple(paths.summary for paths in unsampled),
+        () if sums.squares else zero_reasons(engine, unsampled, float(sums.outside)),
+        min((paths.first_bounce for paths in unsampled), default=None),
+    )
 
 
 def missing_light(engine: Engine, strict: bool = False) -> tuple[UnsampledPaths, ...]:

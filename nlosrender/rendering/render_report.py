@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
+
+from nlosrender.files.capture_results import CaptureResults
 
 Progress = Callable[[float], None]  # told the share of the work that is done, in [0, 1]
 Warn = Callable[[str], None]  # told one warning
@@ -48,8 +50,8 @@ class Stopwatch:
         return self.seconds | {"total": time.perf_counter() - self.begun}
 
 
-@dataclass(frozen=True)
-class RenderReport:
+@dataclass(frozen=True, kw_only=True)
+class RenderReport(CaptureResults):
     """What a finished render has to say for itself."""
 
     output: Path
@@ -59,18 +61,10 @@ class RenderReport:
     part: str | None  # which part of the capture; None: all of it
     units: int  # work items it was cut into
     resumed_units: int  # of them, finished by an earlier run
-    samples: int  # paths per sensor point, the least of all work items
-    error_estimate: float  # relative L2 error of H over the whole capture; NaN: not known
-    energy: dict[str, float]  # H summed over the capture, per bounce [J m^-2 sr^-1]
-    out_of_window: float  # the same outside the time window
     n_bins: int
     n_triangles: int
     seconds: dict[str, float]  # of this run
     warnings: tuple[str, ...]
-    unsampled_paths: tuple[str, ...] = ()  # classes of paths whose light is missing
-    zero_because: tuple[str, ...] = ()  # why H is zero everywhere; empty where it is not
-    error_estimate_per_bounce: Mapping[str, float | None] = field(default_factory=dict)  # None: not known, or no light
-    energy_error_per_bounce: Mapping[str, float | None] = field(default_factory=dict)  # standard error; None: not known
 
 
 @dataclass(frozen=True)

@@ -25,7 +25,7 @@ from nlosrender.files.reading.reader import open_capture
 
 def test_summary_says_what_was_written(tmp_path: Path, header_of: Callable, write_capture: Callable) -> None:
     """Grids as (nx, ny), the exact time axis, bounces by name, provenance unpacked; all of it JSON."""
-    provenance = provenance_attributes({"a": 1}, "abc", engine="path", seed=3, samples=64, error_estimate=0.02)
+    provenance = provenance_attributes({"a": 1}, "abc", engine="path", seed=3) | {"samples": 64, "error_estimate": 0.02}
     write_capture(tmp_path / "a.hdf5", header_of(), {**provenance, "seconds": json.dumps({"render": 1.5})})
     summary = summarise(tmp_path / "a.hdf5")
     assert json.loads(json.dumps(summary, allow_nan=False)) == summary

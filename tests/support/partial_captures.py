@@ -14,9 +14,10 @@ from nlosrender.capture.part import WHOLE, Part, Selection, Tiling
 from nlosrender.capture.tile import Tile, runs
 from nlosrender.files import layout
 from nlosrender.files.capture_header import CaptureHeader
+from nlosrender.files.capture_results import SummedCapture
 from nlosrender.files.identity import identity_attributes
 from nlosrender.files.partial.partial_capture import PartialCapture
-from nlosrender.files.parts.part_attributes import part_attributes, summed_attributes
+from nlosrender.files.parts.part_attributes import part_attributes
 from nlosrender.files.provenance import provenance_attributes
 from nlosrender.files.sums import Sums, sums_of
 
@@ -93,7 +94,7 @@ def write_part(
                 for chunk in partial.chunker.chunks(name, values[inside], *corner)
             )
             partial.store((sensors, lasers), chunks, sums_of_unit(block[inside], variance[inside]))
-        results = summed_attributes(partial.finished.sums, BOUNCES, {"render": 0.5})
+        results = SummedCapture(partial.finished.sums, BOUNCES).attributes({"render": 0.5})
         if selection != WHOLE:
             results |= part_attributes(part, tiling, partial.finished)
         partial.publish(results)

@@ -5,8 +5,8 @@ from __future__ import annotations
 import json
 import shutil
 import zlib
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -20,24 +20,13 @@ from nlosrender.config.canonical import tree_hash
 from nlosrender.errors import FileError
 from nlosrender.files import layout
 from nlosrender.files.atomic_write import check_writable, explained_write, replacing
-from nlosrender.files.attributes import set_attributes
+from nlosrender.files.attributes import json_object, set_attributes, text_list
+from nlosrender.files.capture_results import UNKNOWN_FROM, UNSAMPLED, ZERO, CaptureResults, SummedCapture
 from nlosrender.files.file_kinds import CAPTURE, FileKind, same_capture
 from nlosrender.files.hdf5_writer import HDF5Writer
 from nlosrender.files.identity import SELECTION
 from nlosrender.files.partial.work_item_log import CHECKSUM_RANGE, placed_checksum
-from nlosrender.files.parts.part_attributes import (
-    CHECKSUMS,
-    NOTE,
-    PART,
-    SUMS,
-    UNKNOWN_FROM,
-    UNSAMPLED,
-    ZERO,
-    json_object,
-    known_of,
-    summed_attributes,
-    text_list,
-)
+from nlosrender.files.parts.part_attributes import CHECKSUMS, NOTE, PART, SUMS
 from nlosrender.files.parts.shards import Shard, read_shards
 from nlosrender.files.reading.reader import explained_read, open_hdf5
 from nlosrender.files.sums import Sums
@@ -46,20 +35,12 @@ from nlosrender.interruption import uninterrupted
 Progress = Callable[[float], None]
 
 
-@dataclass(frozen=True)
-class MergeReport:
+@dataclass(frozen=True, kw_only=True)
+class MergeReport(CaptureResults):
     """What was put together."""
 
     output: Path
     parts: int
-    error_estimate: float  # relative L2 error of H over the whole capture; NaN: not known
-    energy: dict[str, float]  # H summed over the capture, per bounce [J m^-2 sr^-1]
-    out_of_window: float  # the same outside the time window
-    samples: int  # paths per sensor point, the least of all parts
-    unsampled_paths: tuple[str, ...] = ()  # classes of paths whose light is missing
-    zero_because: tuple[str, ...] = ()  # why H is zero everywhere; empty where it is not
-    error_estimate_per_bounce: Mapping[str, float | None] = field(default_factory=dict)  # None: not known, or no light
-    energy_error_per_bounce: Mapping[str, float | None] = field(default_factory=dict)  # standard error; None: not known
 
 
 def merge_captures(
@@ -90,7 +71,7 @@ def merge_captures(
     output = Path(output)
     check_writable(output, CAPTURE, paths)
     shards = read_shards([Path(path) for path in paths])
-    sums, bounces = sum((shard.stored.sums for shard in shards), Sums()), _bounces(shards[0])
+    summed = _summed(shards)
     with replacing(output, CAPTURE if overwrite else _whole(shards[0]), paths) as partial:
         with uninterrupted():
             shutil.copyfile(shards[0].path, partial)  # its samples included
@@ -101,19 +82,8 @@ def merge_captures(
             with writer.writing():
                 for name in (PART, SUMS, CHECKSUMS, NOTE, ZERO, SELECTION):
                     writer.file.attrs.pop(name, None)
-                set_attributes(writer.file, _attributes(shards, sums, output))
-    return MergeReport(
-        output=output,
-        parts=len(shards),
-        error_estimate=sums.stated_error(_told(shards, UNSAMPLED)),
-        energy=sums.energy_per_bounce(bounces),
-        out_of_window=float(sums.outside),
-        samples=sums.samples or 0,
-        unsampled_paths=_told(shards, UNSAMPLED),
-        zero_because=() if sums.squares else _told(shards, ZERO),
-        error_estimate_per_bounce=known_of(sums.errors_per_bounce(bounces), bounces, _unknown_from(shards)),
-        energy_error_per_bounce=known_of(sums.energy_errors(bounces), bounces, _unknown_from(shards)),
-    )
+                set_attributes(writer.file, _attributes(shards, summed, output))
+    return MergeReport(output=output, parts=len(shards), **summed.results())
 
 
 def _whole(shard: Shard) -> FileKind:
@@ -189,7 +159,7 @@ def _selection(shard: Shard, cell: Tile, chunk: tuple[int, ...]) -> tuple[slice,
     return layout.in_file_order(inside | rows, header.confocal)
 
 
-def _attributes(shards: Sequence[Shard], sums: Sums, output: Path) -> dict[str, object]:
+def _attributes(shards: Sequence[Shard], summed: SummedCapture, output: Path) -> dict[str, object]:
     """Return the attributes of the whole that its first part does not have."""
     attributes = shards[0].header.attributes
     seconds: dict[str, float] = {}
@@ -201,24 +171,21 @@ def _attributes(shards: Sequence[Shard], sums: Sums, output: Path) -> dict[str, 
     if isinstance(config.get("output"), dict):
         config["output"]["path"] = str(output)
         changed |= {"config": json.dumps(config, ensure_ascii=False), "config_hash": tree_hash(config)}
-    zero = () if sums.squares else _told(shards, ZERO)
-    missing = _told(shards, UNSAMPLED)
-    return changed | summed_attributes(sums, _bounces(shards[0]), seconds, missing, zero, _unknown_from(shards))
+    return changed | summed.attributes(seconds)
 
 
-def _unknown_from(shards: Sequence[Shard]) -> int | None:
-    """Return the lowest bounce that light is missing of in any shard."""
-    told = [shard.header.attributes.get(UNKNOWN_FROM) for shard in shards]
-    return min((bounce for bounce in told if isinstance(bounce, int)), default=None)
-
-
-def _told(shards: Sequence[Shard], name: str) -> tuple[str, ...]:
-    """Return the texts in a list of all shards, each once."""
-    return tuple(dict.fromkeys(text for shard in shards for text in text_list(shard.header.attributes, name)))
-
-
-def _bounces(shard: Shard) -> BounceAxis:
-    attributes = shard.header.attributes
-    limit = attributes.get("max_bounces")
-    highest = limit if isinstance(limit, int) else None
-    return BounceAxis(highest, bool(attributes.get("split_bounces")), shard.header.first_bounce)
+def _summed(shards: Sequence[Shard]) -> SummedCapture:
+    """Return the sums over all shards, and what any of them misses."""
+    attributes = [shard.header.attributes for shard in shards]
+    limit, sums = attributes[0].get("max_bounces"), sum((shard.stored.sums for shard in shards), Sums())
+    bounces = BounceAxis(
+        limit if isinstance(limit, int) else None,
+        bool(attributes[0].get("split_bounces")),
+        shards[0].header.first_bounce,
+    )
+    unsampled, zero = (
+        tuple(dict.fromkeys(text for each in attributes for text in text_list(each, name)))
+        for name in (UNSAMPLED, ZERO)
+    )
+    unknown = [bounce for each in attributes if isinstance(bounce := each.get(UNKNOWN_FROM), int)]
+    return SummedCapture(sums, bounces, unsampled, () if sums.squares else zero, min(unknown, default=None))

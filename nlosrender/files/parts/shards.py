@@ -12,8 +12,9 @@ import numpy as np
 from nlosrender.capture.part import Part, Range, Tiling
 from nlosrender.errors import FileError
 from nlosrender.files import layout
+from nlosrender.files.attributes import json_object
 from nlosrender.files.identity import PACKAGES, comparable_config, differences
-from nlosrender.files.parts.part_attributes import StoredPart, json_object
+from nlosrender.files.parts.part_attributes import StoredPart
 from nlosrender.files.reading.reader import open_capture
 from nlosrender.files.reading.stored_header import StoredHeader
 
