@@ -8,7 +8,6 @@ Mitsuba and Dr.Jit are imported only when a render starts, after the backend has
 
 from __future__ import annotations
 
-import functools
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -30,7 +29,7 @@ from nlosrender.rendering.dask_worker import Job
 from nlosrender.rendering.local_executor import render_items, resumable
 from nlosrender.rendering.outcome import missed_target, missing_light, summed_capture
 from nlosrender.rendering.process_layout import ONE_PROCESS
-from nlosrender.rendering.render_report import Progress, RenderReport, Stopwatch, Warn, Warnings, Watch
+from nlosrender.rendering.render_report import Monitor, Progress, RenderReport, Stopwatch, Warn, Warnings, Watch
 from nlosrender.rendering.render_warnings import render_warnings
 from nlosrender.rendering.stages import calibrated_budget, set_up_engine, started_backend
 
@@ -114,18 +113,13 @@ def render_capture(
             warnings.emit(partial.damage)
             earlier = len(partial.finished.items)
             items = remaining_items(plan, header.confocal, partial.finished.items)
+            shown = (lambda standing: watch(replace(standing, error=None))) if unsampled else watch
+            monitor = Monitor(stopwatch, progress, lambda text: warnings.emit([text]), shown)
             if cluster is None:
-                render = functools.partial(render_items, items, engine, budget, partial, stop)
+                render_items(items, engine, budget, partial, stop, monitor)
             else:
                 job = Job(config, selection, identity, backend.name, sharing)
-                render = functools.partial(render_on_cluster, items, job, budget, partial, stop, cluster)
-            render(
-                store_variance=output.variance,
-                stopwatch=stopwatch,
-                progress=progress,
-                warn=lambda text: warnings.emit([text]),
-                watch=(lambda standing: watch(replace(standing, error=None))) if unsampled else watch,
-            )
+                render_on_cluster(items, job, budget, partial, stop, cluster, monitor)
             summed = summed_capture(engine, unsampled, partial.finished.sums)
             missed = missed_target(config.render, summed.stated_error)
             warnings.emit([f"H is zero everywhere: {'; '.join(summed.zero_because)}."] if summed.zero_because else [])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from itertools import product
 
@@ -39,6 +39,8 @@ class Chunker:
         Description of the capture.
     compression
         ``gzip`` or ``none``.
+    has_variance
+        Whether the file has a dataset ``variance``.
 
     Raises
     ------
@@ -46,22 +48,21 @@ class Chunker:
         ``compression`` is unknown.
     """
 
-    def __init__(self, header: CaptureHeader, compression: str):
+    def __init__(self, header: CaptureHeader, compression: str, has_variance: bool = False):
         if compression not in COMPRESSIONS:
             raise ValueError(f"compression: got {compression!r}, need one of {', '.join(COMPRESSIONS)}")
-        self.header, self.compression = header, compression
+        self.header, self.compression, self.has_variance = header, compression, has_variance
 
-    def chunks(
-        self, name: str, block: NDArray[np.floating], laser_at: tuple[int, int], sensor_at: tuple[int, int]
+    def pack(
+        self, samples: Mapping[str, NDArray[np.floating]], laser_at: tuple[int, int], sensor_at: tuple[int, int]
     ) -> Iterator[PackedChunk]:
-        """Yield a block's chunks, dark ones left out; what the block does not cover of a chunk is zero in it.
+        """Yield the chunks of a block, dark ones left out; what the block does not cover of a chunk is zero in it.
 
         Parameters
         ----------
-        name
-            ``data`` or ``variance``.
-        block
-            (channel, bounce, laser_y, laser_x, sensor_y, sensor_x, bin) samples, float32 or float64.
+        samples
+            By dataset, ``data`` or ``variance``: (channel, bounce, laser_y, laser_x, sensor_y, sensor_x, bin), float32
+            or float64.
         laser_at, sensor_at
             (row, column) of the block's first laser and sensor point.
 
@@ -70,13 +71,14 @@ class Chunker:
         RenderError
             A sample is not finite (as float32).
         """
-        # one laser at a time: the copies made on the way stay small beside the block
-        for row, column in np.ndindex(block.shape[2:4]):
-            laser = (laser_at[0] + row, laser_at[1] + column)
-            with np.errstate(over="ignore"):  # what overflows float32 is found and named right below
-                histograms = block[:, :, row, column].astype(np.float32, copy=False)
-            self._refuse_non_finite(name, histograms, laser, sensor_at)
-            yield from self._chunks_of_laser(name, histograms, laser, sensor_at)
+        for name, block in samples.items():
+            # one laser at a time: the copies made on the way stay small beside the block
+            for row, column in np.ndindex(block.shape[2:4]):
+                laser = (laser_at[0] + row, laser_at[1] + column)
+                with np.errstate(over="ignore"):  # what overflows float32 is found and named right below
+                    histograms = block[:, :, row, column].astype(np.float32, copy=False)
+                self._refuse_non_finite(name, histograms, laser, sensor_at)
+                yield from self._chunks_of_laser(name, histograms, laser, sensor_at)
 
     def _chunks_of_laser(
         self, name: str, histograms: NDArray[np.float32], laser: tuple[int, int], sensor_at: tuple[int, int]

@@ -19,10 +19,10 @@ from nlosrender.errors import BackendError, IncompleteRender, InterruptedRender,
 from nlosrender.files.partial.partial_capture import PartialCapture
 from nlosrender.interruption import StopRequest
 from nlosrender.rendering.dask_cluster import Cluster
-from nlosrender.rendering.dask_worker import Job, PackedItem, RemoteError, render_remotely
+from nlosrender.rendering.dask_worker import Job, RemoteError, render_remotely
 from nlosrender.rendering.local_executor import saved_suffix, standing
-from nlosrender.rendering.render_report import Progress, Stopwatch, Warn, Watch
-from nlosrender.rendering.work_items import ItemWriter
+from nlosrender.rendering.render_report import Monitor, Warn
+from nlosrender.rendering.work_items import FinishedItem, ItemWriter
 
 if TYPE_CHECKING:
     from distributed import Future, as_completed
@@ -42,12 +42,7 @@ def render_on_cluster(
     partial: PartialCapture,
     stop: StopRequest,
     cluster: Cluster,
-    *,
-    store_variance: bool,
-    stopwatch: Stopwatch,
-    progress: Progress,
-    warn: Warn,
-    watch: Watch,
+    monitor: Monitor,
 ) -> None:
     """Render work items on a cluster and store each as it comes.
 
@@ -63,9 +58,7 @@ def render_on_cluster(
         When it comes no more work items are begun; those that are being rendered have ``STOP_SECONDS``.
     cluster
         Who renders.
-    store_variance
-        Whether the file has the variance.
-    stopwatch, progress, warn, watch
+    monitor
         Told the seconds (render and compress: summed over the workers), the share that is done, what is odd, and what
         is finished.
 
@@ -80,24 +73,26 @@ def render_on_cluster(
     """
     workers = cluster.sharing.workers
     if len(items) < workers:
-        warn(f"--workers: the capture is cut into {len(items)} units, so that some of {workers} workers have no work.")
+        monitor.warn(
+            f"--workers: the capture is cut into {len(items)} units, so that some of {workers} workers have no work."
+        )
     if budget.time_limit_s is not None and items:
         left = max(0.0, budget.time_limit_s - partial.finished.sums.seconds / workers)
         budget = replace(budget, time_limit_s=left * workers / len(items))
     total = len(partial.finished.items) + len(items)
-    flight = _Flight(items, job, budget, store_variance, cluster)
-    writer = ItemWriter(partial, stopwatch)
+    flight = _Flight(items, job, budget, cluster)
+    writer = ItemWriter(partial, monitor.stopwatch)
     done = len(partial.finished.items)
     so_far = partial.finished.sums
-    watch(standing(so_far, done, total))
+    monitor.watch(standing(so_far, done, total))
     try:
-        for arrived in flight.arrivals(stop, warn):
+        for arrived in flight.arrivals(stop, monitor.warn):
             for stage, spent in arrived.seconds.items():
-                stopwatch.seconds[stage] += spent
+                monitor.stopwatch.seconds[stage] += spent
             writer.store(arrived)
             done, so_far = done + 1, so_far + arrived.sums
-            progress(done / total)
-            watch(standing(so_far, done, total))
+            monitor.progress(done / total)
+            monitor.watch(standing(so_far, done, total))
         writer.wait()
     except (BackendError, IncompleteRender) as error:
         writer.wait()
@@ -114,15 +109,15 @@ def render_on_cluster(
 class _Flight:
     """The work items on their way to the workers and back: never more than ``PER_WORKER`` for each."""
 
-    def __init__(self, items: Sequence[WorkItem], job: Job, budget: Budget, store_variance: bool, cluster: Cluster):
+    def __init__(self, items: Sequence[WorkItem], job: Job, budget: Budget, cluster: Cluster):
         self._left, self._client = iter(items), cluster.client
-        self._arguments = (asdict(budget), store_variance, cluster.threads)
+        self._arguments = (asdict(budget), cluster.threads)
         self._job = job
         self._out: dict[Future, None] = {}  # the oldest first: the order in which they are begun
         self._recalled = False
         self._given_up_at = math.inf  # s of the monotonic clock, after a stop
 
-    def arrivals(self, stop: StopRequest, warn: Warn) -> Iterator[PackedItem]:
+    def arrivals(self, stop: StopRequest, warn: Warn) -> Iterator[FinishedItem]:
         """Yield work items as they come; after a stop only those that were begun."""
         from distributed import as_completed
 
@@ -181,11 +176,11 @@ class _Flight:
         for future in waiting:
             del self._out[future]
 
-    def _arrived(self, future: Future) -> PackedItem:
+    def _arrived(self, future: Future) -> FinishedItem:
         from distributed import KilledWorker
 
         try:
-            result: PackedItem | RemoteError = future.result()
+            result: FinishedItem | RemoteError = future.result()
         except KilledWorker as error:
             raise IncompleteRender(
                 "a unit has ended every worker process it was given to. Lower render.memory_limit if they ran out "

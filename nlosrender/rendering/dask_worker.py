@@ -8,7 +8,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 from nlosrender.capture.part import Selection
@@ -18,13 +18,12 @@ from nlosrender.config.document import Config
 from nlosrender.config.load import config_to_dict
 from nlosrender.engine.backend.start import Backend, BackendName, limit_threads, start_backend
 from nlosrender.errors import BackendError, ConfigError, NlosError, ValidationIssue
-from nlosrender.files.chunking import Chunker, PackedChunk
+from nlosrender.files.chunking import Chunker
 from nlosrender.files.identity import capture_identity, differences
-from nlosrender.files.sums import Sums
-from nlosrender.rendering.local_executor import render_timed
 from nlosrender.rendering.process_layout import ProcessLayout
 from nlosrender.rendering.render_report import Stopwatch
 from nlosrender.rendering.stages import set_up_engine
+from nlosrender.rendering.work_items import FinishedItem, render_timed
 
 if TYPE_CHECKING:
     from nlosrender.rendering.work_items import Engine
@@ -39,20 +38,6 @@ class Job:
     identity: Mapping[str, Any]  # what the worker's own view of the capture has to agree with
     backend: BackendName
     sharing: ProcessLayout
-
-
-@dataclass(frozen=True, eq=False)
-class PackedItem:
-    """A work item as it travels: chunks ready to be written."""
-
-    item: WorkItem
-    packed: tuple[PackedChunk, ...]
-    sums: Sums
-    seconds: dict[str, float]  # per stage, spent on it in the worker
-
-    def chunks(self, chunker: Chunker) -> tuple[PackedChunk, ...]:
-        """Return its chunks, packed by the worker."""
-        return self.packed
 
 
 @dataclass(frozen=True)
@@ -85,7 +70,7 @@ class _WorkerState:
             self.key, self.engine, self.chunker = "", None, None  # only one fits the memory
             _refuse_other_capture(job, backend)
             _, self.engine, header = set_up_engine(job.config, backend, job.selection, job.sharing)
-            self.chunker = Chunker(header, job.config.output.compression)
+            self.chunker = Chunker(header, job.config.output.compression, job.config.output.variance)
             self.key = key
         return self.engine, self.chunker
 
@@ -94,8 +79,8 @@ _WORKER = _WorkerState()
 
 
 def render_remotely(
-    job: Job, item: WorkItem, budget: Mapping[str, Any], store_variance: bool, threads: int | None
-) -> PackedItem | RemoteError:
+    job: Job, item: WorkItem, budget: Mapping[str, Any], threads: int | None
+) -> FinishedItem | RemoteError:
     """Render a work item in a worker process.
 
     Parameters
@@ -104,8 +89,6 @@ def render_remotely(
         What to render.
     budget
         The fields of a settled ``Budget``: the class itself would import Dr.Jit.
-    store_variance
-        Whether the file has the variance.
     threads
         Of Dr.Jit; None: as many as the dask worker has.
     """
@@ -117,15 +100,15 @@ def render_remotely(
                 limit_threads(threads or _threads_of_worker())
             from nlosrender.engine.path.engine import Budget
 
-            finished = render_timed(engine, item, Budget(**budget), store_variance, stopwatch)
+            finished = render_timed(engine, item, Budget(**budget), chunker, stopwatch)
         begun = time.perf_counter()
-        packed = tuple(finished.chunks(chunker))
+        packed = tuple(finished.chunks)
         stopwatch.seconds["compress"] += time.perf_counter() - begun
     except ConfigError as error:
         return RemoteError(ConfigError, error.issues)
     except NlosError as error:
         return RemoteError(type(error), f"{error} (on worker {_worker_name()})")
-    return PackedItem(item, packed, finished.sums, stopwatch.seconds)
+    return replace(finished, chunks=packed, seconds=stopwatch.seconds)
 
 
 def _refuse_other_capture(job: Job, backend: Backend) -> None:

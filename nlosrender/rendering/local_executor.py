@@ -9,14 +9,13 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from nlosrender.capture.plan import WorkItem
-from nlosrender.engine.launch.passes import Passes
 from nlosrender.errors import FileError, IncompleteRender, InterruptedRender, RenderError
 from nlosrender.files.partial.partial_capture import PartialCapture
 from nlosrender.files.sums import Sums
 from nlosrender.interruption import StopRequest, stop_request
 from nlosrender.rendering.item_in_flight import ItemInFlight, ItemStopped
-from nlosrender.rendering.render_report import Progress, Standing, Stopwatch, Warn, Watch
-from nlosrender.rendering.work_items import ItemWriter, RenderedItem, finished_item, render_item
+from nlosrender.rendering.render_report import Monitor, Standing
+from nlosrender.rendering.work_items import ItemWriter, render_timed
 
 if TYPE_CHECKING:
     from nlosrender.engine.path.engine import Budget
@@ -54,12 +53,7 @@ def render_items(
     budget: Budget,
     partial: PartialCapture,
     stop: StopRequest,
-    *,
-    store_variance: bool,
-    stopwatch: Stopwatch,
-    progress: Progress,
-    warn: Warn,
-    watch: Watch,
+    monitor: Monitor,
 ) -> None:
     """Render work items and store each as it is done.
 
@@ -73,9 +67,7 @@ def render_items(
         Where they go; open.
     stop
         Looked at between passes: a work item that takes long is kept as it is.
-    store_variance
-        Whether the file has the variance.
-    stopwatch, progress, warn, watch
+    monitor
         Told the seconds, the share that is done, that the user has to wait, and what is finished.
 
     Raises
@@ -89,9 +81,9 @@ def render_items(
     total = earlier + len(items)
     spent = partial.finished.sums.seconds
     begun = time.perf_counter()
-    writer = ItemWriter(partial, stopwatch)
+    writer = ItemWriter(partial, monitor.stopwatch)
     so_far = partial.finished.sums  # which the writer is a work item behind of, later on
-    watch(standing(so_far, earlier, total))
+    monitor.watch(standing(so_far, earlier, total))
     try:
         for number, item in enumerate(items):
             limit = budget.time_limit_s
@@ -99,24 +91,24 @@ def render_items(
                 limit = max(0.0, limit - spent - (time.perf_counter() - begun)) / (len(items) - number)
 
             def report_progress(share: float, done: int = earlier + number) -> None:
-                progress((done + share) / total)
+                monitor.progress((done + share) / total)
                 if stop.came:
-                    warn(
+                    monitor.warn(
                         f"{stop.signal_name}: the unit in flight is finished, or kept as it is after a few seconds; "
                         "once more stops at once."
                     )
 
             own_budget = replace(budget, time_limit_s=limit)
-            flight = ItemInFlight(partial, item, own_budget, stop, report_progress, warn)
+            flight = ItemInFlight(partial, item, own_budget, stop, report_progress, monitor.warn)
             finished = render_timed(
-                engine, item, own_budget, store_variance, stopwatch, flight.passes, flight.earlier_seconds
+                engine, item, own_budget, partial.chunker, monitor.stopwatch, flight.passes, flight.earlier_seconds
             )
             spent += flight.earlier_seconds
             so_far += finished.sums
             writer.store(finished)
             del finished, flight  # its arrays are the writer's now
             report_progress(1.0)
-            watch(standing(so_far, earlier + number + 1, total))
+            monitor.watch(standing(so_far, earlier + number + 1, total))
             if stop.came and number + 1 < len(items):
                 raise ItemStopped
         writer.wait()
@@ -127,44 +119,6 @@ def render_items(
         ) from stopped
     finally:
         writer.close()
-
-
-def render_timed(
-    engine: Engine,
-    item: WorkItem,
-    budget: Budget,
-    store_variance: bool,
-    stopwatch: Stopwatch,
-    passes: Passes | None = None,
-    earlier_seconds: float = 0.0,
-) -> RenderedItem:
-    """Render a work item; the engine's own arrays are gone when this returns.
-
-    Parameters
-    ----------
-    engine, item, budget, passes
-        As for ``render_item``.
-    store_variance
-        Whether the file has the variance.
-    stopwatch
-        Told the seconds.
-    earlier_seconds
-        Spent on the work item by an earlier render.
-
-    Raises
-    ------
-    RenderError
-        The result is not finite.
-    """
-    compiled, begun = engine.compile_seconds, time.perf_counter()
-    histogram = render_item(engine, item, budget, passes or Passes())
-    seconds = time.perf_counter() - begun
-    compiled = engine.compile_seconds - compiled
-    stopwatch.seconds["compile"] += compiled
-    stopwatch.seconds["render"] += seconds - compiled
-    confocal = engine.capture.scan_type == "confocal"
-    seconds += earlier_seconds
-    return finished_item(item, histogram, confocal=confocal, store_variance=store_variance, seconds=seconds)
 
 
 def standing(sums: Sums, done: int, total: int) -> Standing:

@@ -50,6 +50,16 @@ class Stopwatch:
         return self.seconds | {"total": time.perf_counter() - self.begun}
 
 
+@dataclass(frozen=True)
+class Monitor:
+    """Who is told what while a render runs."""
+
+    stopwatch: Stopwatch
+    progress: Progress
+    warn: Warn
+    watch: Watch
+
+
 @dataclass(frozen=True, kw_only=True)
 class RenderReport(CaptureResults):
     """What a finished render has to say for itself."""

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+import time
+from collections.abc import Iterable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Protocol
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from nlosrender.capture.plan import WorkItem
 from nlosrender.engine.launch.passes import Passes, Snapshot
@@ -105,62 +105,66 @@ def joined_histogram(item: WorkItem, pieces: list[Histogram]) -> Histogram:
 
 
 @dataclass(frozen=True, eq=False)
-class RenderedItem:
-    """A work item on its way to the file."""
+class FinishedItem:
+    """A rendered work item on its way to the file."""
 
     item: WorkItem
-    laser_at: tuple[int, int]  # row and column of its first laser in the file
-    samples: dict[str, NDArray[np.float32]]  # per dataset (channel, bounce, laser_y, laser_x, sensor_y, sensor_x, bin)
+    chunks: Iterable[PackedChunk]  # packed when they are asked for, or by the worker it came from
     sums: Sums
-
-    def chunks(self, chunker: Chunker) -> Iterator[PackedChunk]:
-        """Yield the work item's chunks, packed."""
-        for name, block in self.samples.items():
-            yield from chunker.chunks(name, block, self.laser_at, (self.item.sensors.y0, self.item.sensors.x0))
+    seconds: Mapping[str, float] = field(default_factory=dict)  # per stage, spent on it by a worker
 
 
-def finished_item(
-    item: WorkItem, histogram: Histogram, *, confocal: bool, store_variance: bool, seconds: float
-) -> RenderedItem:
-    """Sum up a work item in float64 and take what is stored of it.
+def render_timed(
+    engine: Engine,
+    item: WorkItem,
+    budget: Budget,
+    chunker: Chunker,
+    stopwatch: Stopwatch,
+    passes: Passes | None = None,
+    earlier_seconds: float = 0.0,
+) -> FinishedItem:
+    """Render a work item; the engine's own arrays are gone when this returns.
 
     Parameters
     ----------
-    item, histogram
-        The work item, and what the engine made of it.
-    confocal
-        Whether the file has no laser axes.
-    store_variance
-        Whether the file has the variance.
-    seconds
-        Spent rendering it.
+    engine, item, budget, passes
+        As for ``render_item``.
+    chunker
+        Of the capture's file.
+    stopwatch
+        Told the seconds.
+    earlier_seconds
+        Spent on the work item by an earlier render.
+
+    Raises
+    ------
+    RenderError
+        The result is not finite.
     """
-    lasers = (1, 1) if confocal else item.lasers.shape
+    compiled, begun = engine.compile_seconds, time.perf_counter()
+    histogram = render_item(engine, item, budget, passes or Passes())
+    seconds = time.perf_counter() - begun
+    compiled = engine.compile_seconds - compiled
+    stopwatch.seconds["compile"] += compiled
+    stopwatch.seconds["render"] += seconds - compiled
+    confocal = chunker.header.confocal
     channels, slots, _, _, n_bins = histogram.mean.shape
-    axes = (channels, slots, *lasers, *item.sensors.shape, n_bins)
+    axes = (channels, slots, *((1, 1) if confocal else item.lasers.shape), *item.sensors.shape, n_bins)
     # of Stokes components the intensity: the others have signs, and are no energy
     light = slice(0, 1) if layout.CHANNELS.get(channels) == layout.STOKES else slice(None)
-    mean, variance, outside = histogram.mean[light], histogram.variance[light], histogram.outside[light]
-    sums = sums_of(mean, variance, outside, histogram.samples, seconds, histogram.contrasts[:, light].sum(axis=1))
-    stored = {layout.DATA: histogram.mean} | ({layout.VARIANCE: histogram.variance} if store_variance else {})
+    sums = sums_of(
+        histogram.mean[light],
+        histogram.variance[light],
+        histogram.outside[light],
+        histogram.samples,
+        earlier_seconds + seconds,
+        histogram.contrasts[:, light].sum(axis=1),
+    )
+    stored = {layout.DATA: histogram.mean} | ({layout.VARIANCE: histogram.variance} if chunker.has_variance else {})
     with np.errstate(over="ignore"):  # what overflows float32 is refused where it is cut into chunks
         samples = {name: values.astype(np.float32).reshape(axes) for name, values in stored.items()}
-    return RenderedItem(item, (0, 0) if confocal else (item.lasers.y0, item.lasers.x0), samples, sums)
-
-
-class Storable(Protocol):
-    """A work item that can be stored, whoever packs its chunks: a ``RenderedItem``, or one that came from elsewhere."""
-
-    @property
-    def item(self) -> WorkItem:
-        """Its sensors and lasers."""
-
-    @property
-    def sums(self) -> Sums:
-        """What is summed over it."""
-
-    def chunks(self, chunker: Chunker) -> Iterable[PackedChunk]:
-        """Return its chunks, packed."""
+    laser_at = (0, 0) if confocal else (item.lasers.y0, item.lasers.x0)
+    return FinishedItem(item, chunker.pack(samples, laser_at, (item.sensors.y0, item.sensors.x0)), sums)
 
 
 class ItemWriter:
@@ -181,7 +185,7 @@ class ItemWriter:
         self._thread = ThreadPoolExecutor(max_workers=1, thread_name_prefix="writer")
         self._pending: Future[None] | None = None
 
-    def store(self, rendered: Storable) -> None:
+    def store(self, finished: FinishedItem) -> None:
         """Hand over a work item, once the one before is stored.
 
         Raises
@@ -190,7 +194,7 @@ class ItemWriter:
             The work item before could not be stored.
         """
         self.wait()
-        self._pending = self._thread.submit(self._store, rendered)
+        self._pending = self._thread.submit(self._store, finished)
 
     def wait(self) -> None:
         """Wait until everything is stored.
@@ -209,9 +213,8 @@ class ItemWriter:
         with uninterrupted():
             self._thread.shutdown(wait=True)
 
-    def _store(self, rendered: Storable) -> None:
-        chunks = rendered.chunks(self._capture.chunker)
-        item = rendered.item
-        packing, writing = self._capture.store((item.sensors, item.lasers), chunks, rendered.sums)
+    def _store(self, finished: FinishedItem) -> None:
+        key = finished.item.sensors, finished.item.lasers
+        packing, writing = self._capture.store(key, finished.chunks, finished.sums)
         self._stopwatch.seconds["compress"] += packing
         self._stopwatch.seconds["write"] += writing

@@ -223,7 +223,7 @@ def test_non_finite_samples_are_named_and_leave_no_file(
     block[0, 1, 0, 1, 2, 1, 6] = value
     message = rf"data is {word} at laser \(1, 2\), sensor \(3, 3\), bin 6, bounce 3, channel 0"
     with pytest.raises(RenderError, match=message):
-        list(Chunker(header_of(), "gzip").chunks("data", block, laser_at=(1, 1), sensor_at=(1, 2)))
+        list(Chunker(header_of(), "gzip").pack({"data": block}, laser_at=(1, 1), sensor_at=(1, 2)))
     whole = np.full((1, 2, 2, 3, 4, 5, 7), value)
     with pytest.raises(RenderError, match=f"data is {word} at laser"):
         write_samples(tmp_path / "a.hdf5", header_of(), whole)

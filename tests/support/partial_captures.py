@@ -88,11 +88,8 @@ def write_part(
                 laser = (slice(lasers.y0, lasers.y1), slice(lasers.x0, lasers.x1))
             inside = np.s_[:, :, *laser, sensors.y0 : sensors.y1, sensors.x0 : sensors.x1]
             corner = ((laser[0].start, laser[1].start), (sensors.y0, sensors.x0))
-            chunks = (
-                chunk
-                for name, values in ((layout.DATA, block), (layout.VARIANCE, variance))
-                for chunk in partial.chunker.chunks(name, values[inside], *corner)
-            )
+            samples = {layout.DATA: block[inside], layout.VARIANCE: variance[inside]}
+            chunks = partial.chunker.pack(samples, *corner)
             partial.store((sensors, lasers), chunks, sums_of_unit(block[inside], variance[inside]))
         results = SummedCapture(partial.finished.sums, BOUNCES).attributes({"render": 0.5})
         if selection != WHOLE:
@@ -117,9 +114,6 @@ def write_capture(
     everything = Tile(0, rows, 0, columns), Tile(0, header.sizes["laser_y"], 0, header.sizes["laser_x"])
     with PartialCapture.claim(path, {}, resume=False) as partial:
         partial.open(header, attributes or {}, compression, store_variance=variance is not None)
-        chunks = (
-            chunk for name, values in samples.items() for chunk in partial.chunker.chunks(name, values, (0, 0), (0, 0))
-        )
-        partial.store(everything, chunks, Sums())
+        partial.store(everything, partial.chunker.pack(samples, (0, 0), (0, 0)), Sums())
         partial.publish({})
     return path

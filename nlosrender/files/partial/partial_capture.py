@@ -133,7 +133,7 @@ class PartialCapture:
         FileError
             The disk refuses.
         """
-        self.chunker, self._header = Chunker(header, compression), header
+        self.chunker, self._header = Chunker(header, compression, store_variance), header
         create = functools.partial(
             create_capture,
             header=header,
