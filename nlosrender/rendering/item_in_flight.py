@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import asdict
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from nlosrender.capture.plan import WorkItem
 from nlosrender.engine.launch.passes import Passes, SavedStages, Snapshot
 from nlosrender.errors import FileError
+from nlosrender.files.atomic_write import explained_write
 from nlosrender.files.partial.partial_capture import PartialCapture
-from nlosrender.interruption import StopRequest
+from nlosrender.interruption import StopRequest, uninterrupted
 from nlosrender.rendering.render_report import Progress, Warn
 
 if TYPE_CHECKING:
@@ -22,7 +23,7 @@ KEEP_SECONDS = (
 )
 KEEP_COST = 0.1  # share of the time that keeping may take: states may have gigabytes
 SOON_SECONDS = 5.0  # a work item that ends so soon after a signal is finished
-OF_UNIT = "unit"  # stage of what is noted here
+OF_ITEM = "unit"  # stage of what is noted here
 
 
 class ItemStopped(Exception):
@@ -52,14 +53,14 @@ class ItemInFlight:
         warn: Warn,
     ):
         self._partial, self._stop, self._warn = partial, stop, warn
-        self._key = (item.sensors, item.lasers)
-        self._budget: Mapping[str, Any] = asdict(budget) | {"time_limit_s": budget.time_limit_s is not None}
-        kept = partial.kept_state(*self._state_of) or {}
-        if not kept and partial.has_state(self._key):
+        comparable_budget = asdict(budget) | {"time_limit_s": budget.time_limit_s is not None}
+        self._state = partial.item_state((item.sensors, item.lasers), comparable_budget)
+        kept = self._state.read() or {}
+        if not kept and self._state.path.exists():
             warn(
                 f"{partial.path}: what was kept of the unit in flight is damaged, or of another target; it begins anew."
             )
-        self.earlier_seconds = float(kept[OF_UNIT].numbers["seconds"]) if OF_UNIT in kept else 0.0
+        self.earlier_seconds = float(kept[OF_ITEM].numbers["seconds"]) if OF_ITEM in kept else 0.0
         self.passes = Passes(progress, self._look, kept)
         self._begun = self._kept_at = time.perf_counter()
         self._pause = KEEP_SECONDS
@@ -69,10 +70,6 @@ class ItemInFlight:
     def seconds(self) -> float:
         """Spent rendering the work item, by earlier runs and this one."""
         return self.earlier_seconds + time.perf_counter() - self._begun
-
-    @property
-    def _state_of(self) -> tuple[Any, Mapping[str, Any]]:
-        return self._key, self._budget
 
     def _look(self, take: Callable[[], SavedStages]) -> None:
         now = time.perf_counter()
@@ -89,7 +86,8 @@ class ItemInFlight:
     def _keep(self, kept: SavedStages) -> None:
         noted = Snapshot(numbers={"seconds": self.seconds})
         try:
-            self._partial.keep_state(*self._state_of, kept | {OF_UNIT: noted})
+            with uninterrupted(), explained_write(self._partial.path):
+                self._state.write(kept | {OF_ITEM: noted})
         except FileError as error:  # a full disk: what an earlier state holds is left
             self._warn(f"{error} What is done of the unit in flight cannot be kept.")
             self._pause *= 4

@@ -16,7 +16,7 @@ from nlosrender.capture.plan import Batch, WorkItem
 from nlosrender.capture.tile import Tile
 from nlosrender.engine.backend.start import start_backend
 from nlosrender.engine.launch.passes import Passes, SavedStages, Snapshot
-from nlosrender.files.partial.work_item_state import read_state, write_state
+from nlosrender.files.partial.work_item_state import ItemState
 from nlosrender.rendering import stages
 from nlosrender.rendering.work_items import render_item
 
@@ -55,7 +55,7 @@ def stopping(path: Path, tag: str) -> Callable[[Callable[[], SavedStages]], None
     """Return what keeps the state and ends the render after the next pass."""
 
     def look(take: Callable[[], SavedStages]) -> None:
-        write_state(path, tag, take())
+        ItemState(path, tag).write(take())
         raise StoppedError
 
     return look
@@ -103,8 +103,8 @@ def test_going_on_from_any_pass_changes_no_bit(name: str, tmp_path: Path) -> Non
     whole = render(Passes())
     for _ in range(STOPS):
         with pytest.raises(StoppedError):
-            render(Passes(look=stopping(path, name), saved=read_state(path, name)))
-    result = render(Passes(saved=read_state(path, name)))
+            render(Passes(look=stopping(path, name), saved=ItemState(path, name).read()))
+    result = render(Passes(saved=ItemState(path, name).read()))
     assert whole.samples == result.samples
     for values in ("mean", "variance", "outside"):
         np.testing.assert_array_equal(getattr(result, values), getattr(whole, values))
@@ -114,27 +114,27 @@ def test_going_on_from_any_pass_changes_no_bit(name: str, tmp_path: Path) -> Non
 def test_what_is_damaged_or_of_another_render_means_nothing(tmp_path: Path) -> None:
     """A flipped bit anywhere, a cut at any byte, a link, another tag: there is no state."""
     path, kept = tmp_path / "state", {"a": Snapshot({"sums": np.arange(5.0)}, {"done": 3})}
-    write_state(path, "tag", kept)
+    ItemState(path, "tag").write(kept)
     content = path.read_bytes()
-    whole = read_state(path, "tag")
+    whole = ItemState(path, "tag").read()
     assert whole is not None
     assert whole["a"].numbers == {"done": 3}
     np.testing.assert_array_equal(whole["a"].arrays["sums"], np.arange(5.0))
-    assert read_state(path, "other") is None
+    assert ItemState(path, "other").read() is None
     for place in range(len(content)):
         path.write_bytes(content[:place])
-        assert read_state(path, "tag") is None, place
+        assert ItemState(path, "tag").read() is None, place
         path.write_bytes(content[:place] + bytes([content[place] ^ 4]) + content[place + 1 :])
-        assert read_state(path, "tag") is None, place
+        assert ItemState(path, "tag").read() is None, place
     path.write_bytes(content)
     (tmp_path / "link").symlink_to(path)
-    assert read_state(tmp_path / "link", "tag") is None
+    assert ItemState(tmp_path / "link", "tag").read() is None
 
 
 def test_a_state_is_not_written_through_a_link(tmp_path: Path) -> None:
     """What a link of that name points to is left as it is."""
     (tmp_path / "precious").write_text("precious")
     (tmp_path / "state.new").symlink_to(tmp_path / "precious")
-    write_state(tmp_path / "state", "tag", {"a": Snapshot()})
+    ItemState(tmp_path / "state", "tag").write({"a": Snapshot()})
     assert (tmp_path / "precious").read_text() == "precious"
-    assert read_state(tmp_path / "state", "tag") is not None
+    assert ItemState(tmp_path / "state", "tag").read() is not None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import math
 import os
 import signal
@@ -15,7 +16,7 @@ from support.rendering import configured, flat_wall
 from nlosrender.config.document import Config
 from nlosrender.engine.backend.start import start_backend
 from nlosrender.errors import FileError, IncompleteRender, InterruptedRender
-from nlosrender.files.partial.partial_capture import PartialCapture
+from nlosrender.files.partial.work_item_state import ItemState
 from nlosrender.pipeline import render_capture
 from nlosrender.rendering import item_in_flight
 
@@ -135,9 +136,9 @@ def test_a_disk_that_takes_no_state_stops_all_the_same(config: Config, monkeypat
     """The signal is obeyed, and what could not be kept is said."""
 
     def refused(*arguments: object) -> None:
-        raise FileError("a.hdf5: cannot be written: No space left on device.")
+        raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr(PartialCapture, "keep_state", refused)
+    monkeypatch.setattr(ItemState, "write", refused)
     warnings: list[str] = []
     with pytest.raises((InterruptedRender, IncompleteRender), match="nothing is kept"):
         render_capture(config, at(0.1), warnings.append)

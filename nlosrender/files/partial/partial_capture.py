@@ -29,7 +29,6 @@ from typing import Any
 import h5py
 
 from nlosrender.config.canonical import tree_hash
-from nlosrender.engine.launch.passes import SavedStages
 from nlosrender.errors import FileError
 from nlosrender.files import layout
 from nlosrender.files.atomic_write import check_writable, explained_write, publish, synchronise
@@ -51,7 +50,7 @@ from nlosrender.files.partial.work_item_log import (
     item_record,
     items_of,
 )
-from nlosrender.files.partial.work_item_state import PREFIX, has_states, read_state, state_path, write_state
+from nlosrender.files.partial.work_item_state import NEW, ItemState, states_in
 from nlosrender.files.sums import Sums
 from nlosrender.interruption import uninterrupted
 
@@ -121,12 +120,7 @@ class PartialCapture:
     def open(
         self, header: CaptureHeader, attributes: Mapping[str, object], compression: str, store_variance: bool
     ) -> None:
-        """Open the samples' file: a new one, or what the earlier render has left.
-
-        Parameters
-        ----------
-        header, attributes, compression, store_variance
-            As for ``create_capture``.
+        """Open the samples' file: a new one, made by ``create_capture``, or what the earlier render has left.
 
         Raises
         ------
@@ -155,16 +149,7 @@ class PartialCapture:
             self._open_samples(create)
 
     def store(self, item: WorkItemKey, chunks: Iterable[PackedChunk], sums: Sums) -> tuple[float, float]:
-        """Write a work item and note that it is finished.
-
-        Parameters
-        ----------
-        item
-            Its sensors and lasers.
-        chunks
-            Its chunks; dark ones are left out.
-        sums
-            What is summed over the work item.
+        """Write the chunks of a work item, dark ones left out, and note that it is finished.
 
         Returns
         -------
@@ -191,44 +176,23 @@ class PartialCapture:
         self._note(item_record(self._state.generation, item, stored, sums))
         self.finished.add(item, stored, sums)
         with suppress(OSError):
-            state_path(self.folder, item).unlink(missing_ok=True)
+            ItemState.of(self.folder, item).path.unlink(missing_ok=True)
         return time.perf_counter() - begun - writing, writing
 
     @property
     def has_states(self) -> bool:
         """Whether there is a state of a work item in flight."""
-        return has_states(self.folder)
+        return any(not path.name.endswith(NEW) for path in states_in(self.folder))
 
     @property
     def is_resumable(self) -> bool:
         """Whether a later render can go on with something: finished work items, or a state of one in flight."""
         return bool(self.finished.items) or self.has_states
 
-    def keep_state(self, item: WorkItemKey, budget: Mapping[str, Any], kept: SavedStages) -> None:
-        """Write what there is of a work item in flight, instead of what was written of it before.
-
-        Parameters
-        ----------
-        item, budget
-            What is rendered, until when; plain JSON values.
-        kept
-            The state.
-
-        Raises
-        ------
-        FileError
-            The disk refuses.
-        """
-        with uninterrupted(), explained_write(self.path):
-            write_state(state_path(self.folder, item), self._tag(budget), kept)
-
-    def has_state(self, item: WorkItemKey) -> bool:
-        """Return whether something was kept of a work item in flight, usable or not."""
-        return state_path(self.folder, item).exists()
-
-    def kept_state(self, item: WorkItemKey, budget: Mapping[str, Any]) -> SavedStages | None:
-        """Return what an earlier render has kept of a work item with the same budget, if it is whole."""
-        return read_state(state_path(self.folder, item), self._tag(budget))
+    def item_state(self, item: WorkItemKey, budget: Mapping[str, Any]) -> ItemState:
+        """Return where the state of a work item with a budget (plain JSON values) is kept while it is in flight."""
+        tag = tree_hash({"identity": self._identity, "budget": dict(budget)})
+        return ItemState.of(self.folder, item, tag)
 
     def publish(self, attributes: Mapping[str, object]) -> None:
         """Complete the file with its last attributes and put it in place.
@@ -293,7 +257,7 @@ class PartialCapture:
         if not exists or resume is False:
             with explained_write(self.path):
                 self._journal.clear()
-                for leftover in (*self.folder.glob("samples.*"), *self.folder.glob(f"{PREFIX}*")):
+                for leftover in (*self.folder.glob("samples.*"), *states_in(self.folder)):
                     leftover.unlink()
             self._state = JournalState()
             if resume is False:
@@ -395,9 +359,6 @@ class PartialCapture:
                         self._note(closing_record(self._closing(stored)), durable=True)
             self._abandon()
             self._journal.close()
-
-    def _tag(self, budget: Mapping[str, Any]) -> str:
-        return tree_hash({"identity": self._identity, "budget": dict(budget)})
 
     def _note(self, record: Mapping[str, Any], *, durable: bool = False) -> None:
         with uninterrupted(), explained_write(self.path):

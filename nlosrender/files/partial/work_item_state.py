@@ -11,6 +11,7 @@ import math
 import os
 import zlib
 from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -22,22 +23,12 @@ from nlosrender.files.partial.journal import line_of, record_of
 from nlosrender.files.partial.work_item_log import WorkItemKey
 
 PREFIX, NEW = "unit.", ".new"
-MAX_HEADER_BYTES = 2**24  # bytes
+MAX_HEADER_BYTES = 2**24
 
 
-def state_path(folder: Path, item: WorkItemKey) -> Path:
-    """Return the file of a work item."""
-    corners = [f"{tile.y0}-{tile.y1}x{tile.x0}-{tile.x1}" for tile in item]
-    return folder / f"{PREFIX}{'.'.join(corners)}"
-
-
-def has_states(folder: Path) -> bool:
-    """Return whether there is a file of a work item in flight."""
-    return any(not path.name.endswith(NEW) for path in folder.glob(f"{PREFIX}*"))
-
-
-def write_state(path: Path, tag: str, kept: SavedStages) -> None:
-    """Write a state, instead of an earlier one.
+@dataclass(frozen=True)
+class ItemState:
+    """State of one work item on the disk, if there is one.
 
     Parameters
     ----------
@@ -45,50 +36,58 @@ def write_state(path: Path, tag: str, kept: SavedStages) -> None:
         Its file.
     tag
         What a reader has to know of the render.
-    kept
-        The state, by stage.
-
-    Raises
-    ------
-    OSError
-        The disk is full, or gone; the earlier state is untouched.
     """
-    stages, contents = [], []
-    for stage, snapshot in kept.items():
-        arrays = []
-        for name, values in snapshot.arrays.items():
-            content = np.ascontiguousarray(values)
-            contents.append(content)
-            arrays.append([name, content.dtype.str, list(content.shape), zlib.crc32(_bytes_of(content))])
-        stages.append([stage, arrays, dict(snapshot.numbers)])
-    new = path.with_name(path.name + NEW)
-    new.unlink(missing_ok=True)
-    try:
-        # exclusive: nothing that lies there, a link say, is written through
-        with os.fdopen(os.open(new, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666), "wb") as stream:
-            stream.write(line_of({"tag": tag, "stages": stages}))
-            for content in contents:
-                stream.write(_bytes_of(content))
-        new.replace(path)
-    except BaseException:
-        with suppress(OSError):
-            new.unlink()
-        raise
+
+    path: Path
+    tag: str
+
+    @classmethod
+    def of(cls, folder: Path, item: WorkItemKey, tag: str = "") -> ItemState:
+        """Return the state of an item in the folder of an unfinished capture."""
+        corners = [f"{tile.y0}-{tile.y1}x{tile.x0}-{tile.x1}" for tile in item]
+        return cls(folder / f"{PREFIX}{'.'.join(corners)}", tag)
+
+    def write(self, stages: SavedStages) -> None:
+        """Write a state, instead of an earlier one, which OSError leaves as it was."""
+        header, contents = [], []
+        for stage, snapshot in stages.items():
+            arrays = []
+            for name, values in snapshot.arrays.items():
+                content = np.ascontiguousarray(values)
+                contents.append(content)
+                arrays.append([name, content.dtype.str, list(content.shape), zlib.crc32(_bytes_of(content))])
+            header.append([stage, arrays, dict(snapshot.numbers)])
+        new = self.path.with_name(self.path.name + NEW)
+        new.unlink(missing_ok=True)
+        try:
+            with new.open("xb") as stream:  # exclusive: nothing that lies there, a link say, is written through
+                stream.write(line_of({"tag": self.tag, "stages": header}))
+                for content in contents:
+                    stream.write(_bytes_of(content))
+            new.replace(self.path)
+        except BaseException:
+            with suppress(OSError):
+                new.unlink()
+            raise
+
+    def read(self) -> SavedStages | None:
+        """Return a state of the same tag; None where there is none that is whole."""
+        try:
+            with os.fdopen(os.open(self.path, os.O_RDONLY | os.O_NOFOLLOW), "rb") as stream:
+                record = record_of(stream.readline(MAX_HEADER_BYTES))
+                if record is None or record.get("tag") != self.tag:
+                    return None
+                return {
+                    stage: Snapshot({name: _array(stream, *layout) for name, *layout in arrays}, numbers)
+                    for stage, arrays, numbers in record["stages"]
+                }
+        except (OSError, ValueError):
+            return None
 
 
-def read_state(path: Path, tag: str) -> SavedStages | None:
-    """Return a state that belongs to the render of ``tag``; None where there is none that is whole."""
-    try:
-        with os.fdopen(os.open(path, os.O_RDONLY | os.O_NOFOLLOW), "rb") as stream:
-            record = record_of(stream.readline(MAX_HEADER_BYTES))
-            if record is None or record.get("tag") != tag:
-                return None
-            return {
-                stage: Snapshot({name: _array(stream, *layout) for name, *layout in arrays}, numbers)
-                for stage, arrays, numbers in record["stages"]
-            }
-    except (OSError, ValueError):
-        return None
+def states_in(folder: Path) -> list[Path]:
+    """Return the files of work items in flight, complete or not."""
+    return list(folder.glob(f"{PREFIX}*"))
 
 
 def _array(stream: BinaryIO, dtype: str, shape: list[int], checksum: int) -> NDArray[Any]:
