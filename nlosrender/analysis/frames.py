@@ -12,9 +12,8 @@ from nlosrender.analysis.laser_view import lit_window
 from nlosrender.analysis.pictures import SUFFIXES, save_animation, save_exr, save_png, stokes_panels, tone_mapped
 from nlosrender.capture.bounces import LINE_OF_SIGHT
 from nlosrender.errors import FileError, OptionError
-from nlosrender.files.atomic_write import check_writable, explained_write, replacing
+from nlosrender.files.atomic_write import check_writable, explained_write, filled_folder, replacing
 from nlosrender.files.file_kinds import GIF, PICTURES
-from nlosrender.files.filled_folder import filled_folder
 from nlosrender.files.layout import STOKES
 from nlosrender.files.reading.reader import StoredCapture, open_capture
 from nlosrender.readable import readable_size

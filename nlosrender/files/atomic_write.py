@@ -1,8 +1,7 @@
-"""Files appear whole or not at all, and in place of their own kind only.
+"""Atomic writes: files appear whole or not at all, and replace nothing but files of their own kind.
 
 Every command writes through ``replacing``, or through what it is made of: a new file beside the target that nobody
-else has (``new_partial``), renamed onto it once it has reached the disk (``publish``). What is at the target and is
-none of the files that the command writes stays there.
+else has (``new_partial``), renamed onto it once it has reached the disk (``publish``).
 """
 
 from __future__ import annotations
@@ -12,19 +11,21 @@ import os
 import re
 import secrets
 import shutil
+import tempfile
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from nlosrender.errors import DiskError, FileError
-from nlosrender.files.file_kinds import FileKind
+from nlosrender.files.file_kinds import PICTURES, FileKind
 from nlosrender.interruption import uninterrupted
+from nlosrender.readable import readable_size
 
 DISK_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)
 
 
 def check_writable(path: str | Path, kind: FileKind, sources: Iterable[str | Path] = ()) -> Path:
-    """Make sure a file can be written to ``path``, before anything long is started.
+    """Make sure a file can be written, before anything long is started; return ``path`` with symbolic links resolved.
 
     Parameters
     ----------
@@ -34,11 +35,6 @@ def check_writable(path: str | Path, kind: FileKind, sources: Iterable[str | Pat
         What it will be: only a file of this kind is replaced.
     sources
         Files that are read for it, which must not be replaced.
-
-    Returns
-    -------
-    Path
-        ``path`` with symbolic links resolved.
 
     Raises
     ------
@@ -122,23 +118,14 @@ def partial_folder(target: Path) -> Path:
 
 
 def publish(path: str | Path, partial: Path, target: Path, kind: FileKind) -> None:
-    """Rename the complete ``partial`` onto ``target`` once its content has reached the disk.
-
-    Parameters
-    ----------
-    path
-        What to call the target in messages.
-    partial, target
-        The two files.
-    kind
-        As for ``check_writable``: something may have come to lie there since.
+    """Rename the complete ``partial`` onto ``target``, called ``path`` in messages, once it has reached the disk.
 
     Raises
     ------
     OSError
         The disk is full or the folder has become unusable.
     FileError
-        A file of another kind lies there.
+        A file of another kind has come to lie there.
     """
     synchronise(partial)
     kind.refuse_others(path, target)
@@ -160,6 +147,41 @@ def synchronise(path: Path) -> None:
         os.fsync(descriptor)
     finally:
         os.close(descriptor)
+
+
+@contextmanager
+def filled_folder(folder: str | Path) -> Iterator[Path]:
+    """Give the block an empty folder; the pictures it leaves there move to ``folder``, over those of the same names.
+
+    A block that fails or is interrupted leaves no file behind, nor a folder that was not there before.
+
+    Raises
+    ------
+    FileError
+        ``folder`` is a file or cannot be written to, a file of another kind has the name of a picture, or an OSError
+        left the block.
+    """
+    with explained_write(folder):
+        target = Path(os.path.realpath(folder))
+        if target.exists() and not target.is_dir():
+            raise FileError(f"{folder}: is a file. Name a folder, which may be a new one.")
+        is_new = not target.exists()
+        target.mkdir(parents=True, exist_ok=True)
+        # inside: beside it may be another disk
+        unfinished = Path(tempfile.mkdtemp(prefix=".", suffix=".partial", dir=target))
+        try:
+            yield unfinished
+            with uninterrupted():
+                files = sorted(unfinished.iterdir())
+                for file in files:  # all of them first: none is replaced where one may not be
+                    PICTURES[file.suffix].refuse_others(Path(folder) / file.name, target / file.name)
+                for file in files:
+                    os.replace(file, target / file.name)
+        finally:
+            shutil.rmtree(unfinished, ignore_errors=True)
+            if is_new:
+                with suppress(OSError):  # not empty: all went well
+                    target.rmdir()
 
 
 @contextmanager
@@ -207,5 +229,5 @@ def _disk_of(path: str | Path) -> str:
     with suppress(OSError):
         while not os.path.ismount(folder):
             folder = folder.parent
-        return f"the disk {folder} ({shutil.disk_usage(folder).free / 1e6:.3g} MB left)"
+        return f"the disk {folder} ({readable_size(shutil.disk_usage(folder).free)} left)"
     return f"the disk of {folder}"

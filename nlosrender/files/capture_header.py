@@ -149,10 +149,9 @@ class CaptureHeader:
     def _freeze_grid(self, name: str) -> None:
         positions_name, normals_name = f"{name}_positions", f"{name}_normals"
         positions = _finite(getattr(self, positions_name), positions_name)
-        _require(
-            positions.ndim == 3 and positions.shape[2] == 3 and positions.size > 0,
-            positions_name, f"shape {positions.shape}", "shape (rows, columns, 3) with at least one point",
-        )  # fmt: skip
+        usable = positions.ndim == 3 and positions.shape[2] == 3 and positions.size > 0
+        need = "shape (rows, columns, 3) with at least one point"
+        _require(usable, positions_name, f"shape {positions.shape}", need)
         normals = _finite(getattr(self, normals_name), normals_name, positions.shape)
         lengths = np.linalg.norm(normals, axis=-1)
         worst = float(lengths.flat[int(np.argmax(np.abs(lengths - 1)))])
@@ -172,54 +171,33 @@ class CaptureHeader:
             _require(same, "laser_normals", "other normals", "the sensor points' (scan type confocal)")
 
     def _check_time_axis(self) -> None:
-        _require(
-            _is_int(self.n_bins) and 1 <= self.n_bins <= INT32_MAX,
-            "n_bins",
-            self.n_bins,
-            "an integer from 1 to 2^31 - 1",
-        )
+        usable = _is_int(self.n_bins) and 1 <= self.n_bins <= INT32_MAX
+        _require(usable, "n_bins", self.n_bins, "an integer from 1 to 2^31 - 1")
         for name in ("bin_width_opl", "start_opl"):
             self._freeze(name, float(_finite(getattr(self, name), name, ())))
         # float32, because that is what loaders read: a width that underflows there would be zero for all of them
-        _require(
-            bool(np.float32(self.bin_width_opl) > 0),
-            "bin_width_opl",
-            self.bin_width_opl,
-            "a length > 0",
-        )
+        _require(bool(np.float32(self.bin_width_opl) > 0), "bin_width_opl", self.bin_width_opl, "a length > 0")
 
     def _check_bounces(self) -> None:
         need = "1 (grey), 3 (red, green, blue) or 4 (Stokes components)"
         _require(self.n_channels in (1, 3, 4), "n_channels", self.n_channels, need)
-        indices = tuple(self.bounce_indices)
-        ascending = all(a < b for a, b in pairwise(indices))
+        indices, limit = tuple(self.bounce_indices), self.max_bounces
+        ascending = len(indices) > 0 and all(a < b for a, b in pairwise(indices))
         inside = all(_is_int(index) and 0 <= index < FILE_BOUNCES for index in indices)
-        _require(
-            len(indices) > 0 and inside and ascending,
-            "bounce_indices",
-            indices,
-            f"ascending indices from 0 to {FILE_BOUNCES - 1}",
-        )
-        _require(
-            self.split_bounces or len(indices) == 1, "bounce_indices", indices, "one index when bounces are not split"
-        )
+        need = f"ascending indices from 0 to {FILE_BOUNCES - 1}"
+        _require(ascending and inside, "bounce_indices", indices, need)
+        is_sum = self.split_bounces or len(indices) == 1
+        _require(is_sum, "bounce_indices", indices, "one index when bounces are not split")
         self._freeze("bounce_indices", indices)
-        limit = self.max_bounces
-        _require(
-            limit is None or (_is_int(limit) and limit >= self.first_bounce),
-            "max_bounces",
-            limit,
-            f"None or an integer >= {self.first_bounce}",
-        )
+        usable = limit is None or (_is_int(limit) and limit >= self.first_bounce)
+        _require(usable, "max_bounces", limit, f"None or an integer >= {self.first_bounce}")
 
     def _check_hidden_bounds(self) -> None:
-        if self.hidden_bounds is None:
-            return
-        low, high = (_finite(corner, "hidden_bounds", (3,)) for corner in self.hidden_bounds)
-        _require(
-            bool((low <= high).all()), "hidden_bounds", (low.tolist(), high.tolist()), "lowest corner <= highest corner"
-        )
-        self._freeze("hidden_bounds", (low, high))
+        if self.hidden_bounds is not None:
+            low, high = (_finite(corner, "hidden_bounds", (3,)) for corner in self.hidden_bounds)
+            got = (low.tolist(), high.tolist())
+            _require(bool((low <= high).all()), "hidden_bounds", got, "lowest corner <= highest corner")
+            self._freeze("hidden_bounds", (low, high))
 
 
 def _require(condition: bool, name: str, got: object, need: str) -> None:
@@ -236,8 +214,6 @@ def _finite(values: ArrayLike, name: str, shape: tuple[int, ...] | None = None) 
     if shape is not None:
         _require(array.shape == shape, name, f"shape {array.shape}", f"shape {shape}")
     _require(bool(np.isfinite(array).all()), name, "a value that is not finite", "finite numbers")
-    # what is finite in float64 may not be in the file's float32
-    _require(
-        bool((np.abs(array) <= np.finfo(np.float32).max).all()), name, "a value beyond float32", "numbers below 3.4e38"
-    )
+    fits = bool((np.abs(array) <= np.finfo(np.float32).max).all())  # of the file
+    _require(fits, name, "a value beyond float32", "numbers below 3.4e38")
     return array

@@ -1,4 +1,4 @@
-"""Kinds of files that commands write, told by their content: a file of another kind is never replaced.
+"""Kinds of files that commands write, recognised by content: a file of another kind is never replaced.
 
 The name says nothing: ``render -o thesis.tex`` must not end a thesis. An empty file may always be replaced.
 """
@@ -17,12 +17,11 @@ from nlosrender.capture.part import WHOLE
 from nlosrender.errors import FileError
 from nlosrender.files import layout
 from nlosrender.files.attributes import get_attributes, json_object
-from nlosrender.files.identity import SELECTION, comparable_config, differences
+from nlosrender.files.identity import SELECTION, comparable_config, differences, listed
 from nlosrender.files.parts.part_attributes import PART
 from nlosrender.files.reading.reader import open_hdf5
 
 START_BYTES = 16_384  # of a file, that tell what it is
-MAX_DIFFERENCES = 4  # that are listed
 
 
 @dataclass(frozen=True)
@@ -32,14 +31,7 @@ class FileKind:
     objection: Callable[[Path], str | None]  # a sentence after the file's name and a colon; None: it is one of them
 
     def refuse_others(self, path: str | Path, target: Path) -> None:
-        """Make sure that the file at ``target``, if there is one, may be replaced.
-
-        Parameters
-        ----------
-        path
-            What to call it in messages.
-        target
-            The same, symbolic links resolved.
+        """Make sure that the file at ``target``, called ``path`` in messages, may be replaced, if there is one.
 
         Raises
         ------
@@ -150,8 +142,7 @@ def same_capture(capture_hash: str, selection: str, config: Mapping[str, Any]) -
         found = [f"{key}: {old} there, {new} now" for key, old, new in differences(theirs, ours)]
         if part != selection:
             found.append(f"{part} there, {selection} now")
-        listed = "; ".join(found[:MAX_DIFFERENCES] or ["a mesh or texture has changed"])
-        more = f"; and {len(found) - MAX_DIFFERENCES} more" if len(found) > MAX_DIFFERENCES else ""
-        return f"holds another capture ({listed}{more}). Use --overwrite to replace it, or name another output."
+        reason = listed(found or ["a mesh or texture has changed"])
+        return f"holds another capture ({reason}). Use --overwrite to replace it, or name another output."
 
     return FileKind(objection)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +20,7 @@ NOT_THE_CAPTURE = (("output", "path"), ("render", "memory_limit"), ("render", "b
 PACKAGES = ("nlosrender", "mitsuba", "drjit")  # whose versions the samples depend on
 FILE_KEY = "filename"  # of meshes, textures, spectra
 SCENE_KEY = "mitsuba"  # of a whole scene, which names files of its own
+MAX_LISTED = 6  # differences in one message
 SELECTION = "part_selection"  # attribute of a file that holds a part: the option that selected it
 
 
@@ -37,56 +38,37 @@ def capture_identity(resolved_config: Mapping[str, Any], part: str, variant: str
     replicas
         Independent estimates behind each sensor point; for small grids the number of processors decides.
     """
-    config = comparable_config(resolved_config)
-    versions = rendering_versions()
-    return {"config": config, "versions": versions, "variant": variant, "replicas": replicas, "part": part}
+    installed = package_versions()
+    return {
+        "config": comparable_config(resolved_config),
+        "versions": {package: installed[package] for package in PACKAGES} | {"file layout": str(FORMAT_VERSION)},
+        "variant": variant,
+        "replicas": replicas,
+        "part": part,
+    }
 
 
 def identity_attributes(identity: Mapping[str, Any]) -> dict[str, object]:
     """Return the attributes by which a file tells the capture it is, or is a part of."""
-    told = {name: identity[name] for name in ("variant", "replicas")}
-    if identity["part"] != str(WHOLE):
-        told[SELECTION] = identity["part"]
-    return {"capture_hash": tree_hash(identity["config"])} | told
+    selected = {} if identity["part"] == str(WHOLE) else {SELECTION: identity["part"]}
+    own = {name: identity[name] for name in ("variant", "replicas")}
+    return {"capture_hash": tree_hash(identity["config"])} | own | selected
 
 
 def comparable_config(resolved_config: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a configuration without what does not change the samples, and with the content of files for their names.
-
-    Parameters
-    ----------
-    resolved_config
-        The configuration with all defaults filled in, plain and JSON-able.
-    """
+    """Return a resolved configuration without what does not change the samples, and with digests for names of files."""
     kept: dict[str, Any] = {
-        section: {
-            key: value
-            for key, value in (content.items() if isinstance(content, Mapping) else ())
-            if (section, key) not in NOT_THE_CAPTURE
-        }
+        section: {key: value for key, value in content.items() if (section, key) not in NOT_THE_CAPTURE}
         if isinstance(content, Mapping)
         else content
         for section, content in resolved_config.items()
     }
-    with_content: dict[str, Any] = _with_content(kept)
-    return with_content
+    return {section: _with_digests(section, content) for section, content in kept.items()}
 
 
 def capture_hash(resolved_config: Mapping[str, Any]) -> str:
-    """Return the hash by which files of the same capture are known: their attribute ``capture_hash``.
-
-    Parameters
-    ----------
-    resolved_config
-        The configuration with all defaults filled in, plain and JSON-able.
-    """
+    """Return the hash by which files of the same capture are known: their attribute ``capture_hash``."""
     return tree_hash(comparable_config(resolved_config))
-
-
-def rendering_versions() -> dict[str, str]:
-    """Return the versions that have to agree: of the packages behind the samples, and of the file layout."""
-    installed = package_versions()
-    return {package: installed[package] for package in PACKAGES} | {"file layout": str(FORMAT_VERSION)}
 
 
 def differences(one: Any, other: Any, key: str = "") -> Iterator[tuple[str, str, str]]:
@@ -103,23 +85,25 @@ def differences(one: Any, other: Any, key: str = "") -> Iterator[tuple[str, str,
         yield key, _shown(one), _shown(other)
 
 
+def listed(texts: Sequence[str]) -> str:
+    """Return the first few of many differences, and how many more there are."""
+    more = f"; and {len(texts) - MAX_LISTED} more" if len(texts) > MAX_LISTED else ""
+    return "; ".join(texts[:MAX_LISTED]) + more
+
+
 def _shown(value: Any) -> str:
     text = json.dumps(value)
     return text if len(text) <= 40 else f"{text[:40]}..."
 
 
-def _with_content(tree: Any) -> Any:
-    if isinstance(tree, Mapping):
-        return {key: _value_with_content(key, value) for key, value in tree.items()}
-    return [_with_content(item) for item in tree] if isinstance(tree, (list, tuple)) else tree
-
-
-def _value_with_content(key: str, value: Any) -> Any:
+def _with_digests(key: str, value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {name: _with_digests(name, item) for name, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_with_digests("", item) for item in value]
     if isinstance(value, str) and key == FILE_KEY:
-        return _content(value)
-    if isinstance(value, str) and key == SCENE_KEY:
-        return _content_of_scene(value)
-    return _with_content(value)
+        return _digest(value)
+    return _scene_digests(value) if isinstance(value, str) and key == SCENE_KEY else value
 
 
 def files_read(resolved_config: Any) -> Iterator[str]:
@@ -135,16 +119,16 @@ def files_read(resolved_config: Any) -> Iterator[str]:
             yield from files_read(item)
 
 
-def _content_of_scene(name: str) -> str | list[str]:
+def _scene_digests(name: str) -> str | list[str]:
     """Return the digest of a Mitsuba scene, and those of the files it names, which may change while it does not."""
     try:
         root, _ = read_mitsuba_xml(Path(name))
     except ValueError:  # the renderer says so, with its place in the YAML
-        return _content(name)
-    return [_content(name), *(_content(str(file)) for file in named_files(root))]
+        return _digest(name)
+    return [_digest(name), *(_digest(str(file)) for file in named_files(root))]
 
 
-def _content(name: str) -> str:
+def _digest(name: str) -> str:
     """Return a digest of a file: the same mesh may lie elsewhere on another machine, or be another one by now."""
     try:
         with Path(name).open("rb") as stream:

@@ -1,4 +1,4 @@
-"""Where a capture comes from, as attributes: enough to render it again and to judge it."""
+"""Provenance of a capture as attributes: enough to render it again and to judge it."""
 
 from __future__ import annotations
 
@@ -29,14 +29,11 @@ def provenance_attributes(
 
     Parameters
     ----------
-    resolved_config
-        The configuration with all defaults filled in, plain and JSON-able.
-    config_hash
-        Its hash.
-    engine
-        Name of the engine that rendered. Stored as ``render_engine``: ``engine`` names the program.
-    seed
-        Seed of the random numbers.
+    resolved_config, config_hash
+        The configuration with all defaults filled in, plain and JSON-able; its hash.
+    engine, seed
+        Name of the engine that rendered, stored as ``render_engine`` (``engine`` names the program); seed of the random
+        numbers.
     meshes
         What was read of mesh files.
     created

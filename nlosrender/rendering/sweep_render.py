@@ -10,7 +10,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from nlosrender.capture.part import WHOLE
-from nlosrender.config.canonical import tree_hash
 from nlosrender.config.document import Config
 from nlosrender.config.load import config_to_dict
 from nlosrender.config.sweep_load import Sweep
@@ -18,7 +17,7 @@ from nlosrender.errors import ConfigError, FileError, InterruptedRender, OptionE
 from nlosrender.files.atomic_write import explained_write, partial_folder
 from nlosrender.files.dataset_index import IndexEntry, relative_name, stored_entry, write_index
 from nlosrender.files.file_kinds import CAPTURE, same_capture
-from nlosrender.files.identity import comparable_config
+from nlosrender.files.identity import capture_hash
 from nlosrender.files.reading.reader import read_header
 from nlosrender.interruption import StopRequest, stop_request
 from nlosrender.rendering.render_report import Progress, RenderReport, Standing, Warn, Watch
@@ -62,7 +61,7 @@ class _Dataset:
     def look(self, index: int) -> IndexEntry:
         """Note and return what there is of a capture."""
         sweep = self.sweep
-        expected = tree_hash(comparable_config(config_to_dict(sweep.config(index))))
+        expected = capture_hash(config_to_dict(sweep.config(index)))
         entry = stored_entry(index, sweep.paths[index], self.folder, sweep.values(index), expected)
         self.entries[index] = entry
         return entry

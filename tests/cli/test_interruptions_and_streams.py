@@ -20,8 +20,8 @@ from nlosrender.capture.part import Selection
 from nlosrender.cli.progress import reporting
 from nlosrender.engine.backend import start as backend
 from nlosrender.errors import EXIT_BAD_INPUT, EXIT_FAILURE, EXIT_INTERRUPTED, EXIT_OK, FileError
+from nlosrender.files.atomic_write import filled_folder
 from nlosrender.files.export.export import export_capture
-from nlosrender.files.filled_folder import filled_folder
 
 PNG_START = b"\x89PNG\r\n\x1a\n"
 MAIN = "import sys; from nlosrender.cli.app import app, main; sys.argv = ['nlosrender', *sys.argv[1:]]\n"

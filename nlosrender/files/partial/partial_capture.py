@@ -37,7 +37,7 @@ from nlosrender.files.chunking import Chunker, PackedChunk
 from nlosrender.files.file_kinds import CAPTURE, FileKind, same_capture
 from nlosrender.files.hdf5_writer import HDF5Writer
 from nlosrender.files.header_writer import add_attributes, create_capture
-from nlosrender.files.identity import differences
+from nlosrender.files.identity import differences, listed
 from nlosrender.files.partial.journal import Journal, claimed_journal
 from nlosrender.files.partial.stored_chunks import StoredChunks, stored_chunks
 from nlosrender.files.partial.work_item_log import (
@@ -53,8 +53,6 @@ from nlosrender.files.partial.work_item_log import (
 from nlosrender.files.partial.work_item_state import NEW, ItemState, states_in
 from nlosrender.files.sums import Sums
 from nlosrender.interruption import uninterrupted
-
-MAX_DIFFERENCES = 6  # that are listed
 
 
 class PartialCapture:
@@ -272,12 +270,11 @@ class PartialCapture:
         return same_capture(tree_hash(config), str(self._identity["part"]), config)
 
     def _refuse_other(self, identity: dict[str, Any]) -> None:
-        found = list(differences(self._state.first.get("identity", {}), identity))
-        if found:
-            listed = "; ".join(f"{key}: {old} then, {new} now" for key, old, new in found[:MAX_DIFFERENCES])
-            more = f"; and {len(found) - MAX_DIFFERENCES} more" if len(found) > MAX_DIFFERENCES else ""
+        found = differences(self._state.first.get("identity", {}), identity)
+        texts = [f"{key}: {old} then, {new} now" for key, old, new in found]
+        if texts:
             raise FileError(
-                f"{self.path}: there is an unfinished render of something else ({listed}{more}). "
+                f"{self.path}: there is an unfinished render of something else ({listed(texts)}). "
                 "Use --overwrite to throw it away and start anew, or name another output."
             )
 

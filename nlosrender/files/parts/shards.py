@@ -1,4 +1,4 @@
-"""Parts of one capture in files of their own: read, told from strangers, and checked to cover it exactly once."""
+"""Reads shard files, rejects those of other captures, and checks that they tile the capture exactly once."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from nlosrender.capture.part import Part, Range, Tiling
 from nlosrender.errors import FileError
 from nlosrender.files import layout
 from nlosrender.files.attributes import json_object
-from nlosrender.files.identity import PACKAGES, comparable_config, differences
+from nlosrender.files.identity import PACKAGES, comparable_config, differences, listed
 from nlosrender.files.parts.part_attributes import StoredPart
 from nlosrender.files.reading.reader import open_capture
 from nlosrender.files.reading.stored_header import StoredHeader
 
-MAX_LISTED = 8  # problems, differences or gaps in one message
+MAX_PROBLEMS = 8  # in one message
 SAME = ("capture_hash", "variant", "replicas", "nlosrender_format_version")  # attributes that have to agree
 
 
@@ -74,8 +74,8 @@ def read_shards(paths: Sequence[Path]) -> list[Shard]:
         if not problems:
             problems += _misfits(shards)
     if problems:
-        more = [f"and {len(problems) - MAX_LISTED} more"] if len(problems) > MAX_LISTED else []
-        raise FileError("\n".join(problems[:MAX_LISTED] + more))
+        more = [f"and {len(problems) - MAX_PROBLEMS} more"] if len(problems) > MAX_PROBLEMS else []
+        raise FileError("\n".join(problems[:MAX_PROBLEMS] + more))
     return sorted(shards, key=lambda shard: (shard.part.lasers, shard.part.strips))
 
 
@@ -110,14 +110,14 @@ def _strangeness(first: Shard, other: Shard) -> Iterator[str]:
         return
     differing = list(differences(_config(theirs), _config(ours)))
     if differing:
-        listed = "; ".join(f"{key}: {b}, there {a}" for key, b, a in differing[:MAX_LISTED])
-        yield f"belongs to another capture than {first.path} ({listed})"
+        texts = [f"{key}: {b}, there {a}" for key, b, a in differing]
+        yield f"belongs to another capture than {first.path} ({listed(texts)})"
         return
     if [name for name, _, _ in found] == ["capture_hash"]:
         yield f"belongs to another capture than {first.path} (a mesh or texture that both name has changed)"
         return
-    listed = "; ".join(f"{name}: {b}, there {a}" for name, a, b in found if name != "capture_hash")
-    yield f"was rendered otherwise than {first.path} ({listed})"
+    texts = [f"{name}: {b}, there {a}" for name, a, b in found if name != "capture_hash"]
+    yield f"was rendered otherwise than {first.path} ({listed(texts)})"
 
 
 def _misfits(shards: Sequence[Shard]) -> Iterator[str]:
