@@ -6,7 +6,7 @@ import json
 import math
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -60,12 +60,9 @@ def stored_entry(index: int, path: Path, folder: Path, values: Mapping[str, Any]
     if attributes.get("capture_hash") != capture_hash or PART in attributes:
         return entry
     error, stored = attributes.get("error_estimate"), attributes.get("config_hash")
-    return IndexEntry(
-        index,
-        entry.file,
-        values,
-        "done",
-        capture_hash,
+    return replace(
+        entry,
+        status="done",
         config_hash=stored if isinstance(stored, str) else None,
         energy=json_object(attributes.get("energy")),
         error_estimate=error if isinstance(error, float) and math.isfinite(error) else None,
@@ -80,12 +77,10 @@ def relative_name(path: Path, folder: Path) -> str:
 
 
 def write_index(path: Path, source: str, keys: Sequence[str], entries: Sequence[IndexEntry]) -> None:
-    """Write an index; it appears whole or not at all.
+    """Write the index at ``path``; it appears whole or not at all.
 
     Parameters
     ----------
-    path
-        The index.
     source
         What the captures were made from.
     keys

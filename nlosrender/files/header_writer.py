@@ -24,6 +24,10 @@ _VIEW_TEXT = {
     "rows ascend upwards in the picture, columns to the right; cameraPosition is the camera's",
     "laser_points": "none: emitters in the scene flash at t = 0; the laser's datasets mean nothing",
 }
+_VIEW_QUANTITY = (
+    "of a pixel's steady radiance the share that arrives in the bin: the sum over bins, and what falls outside the "
+    "time window, is the steady picture"
+)
 _STOKES_TEXT = (
     "I, Q, U, V of the light that reaches camera or sensor, as Mitsuba's stokes integrator defines them; reference: "
     "to the right in the picture (ray direction x camera's up), or ray from the sensor x relay wall's y axis"
@@ -157,39 +161,28 @@ def root_attributes(header: CaptureHeader) -> dict[str, object]:
 
 def sample_attributes(header: CaptureHeader) -> dict[str, object]:
     """Return the attributes of ``data`` (and of ``variance``): axes, bounces, unit."""
-    if header.scan_type == LINE_OF_SIGHT:
-        return _view_sample_attributes(header)
-    if not header.split_bounces:
-        bounces = f"the sum of all bounces is in index {header.bounce_indices[0]}"
-    else:
-        bounces = f"index k of the bounce axis holds bounce k + {FIRST_BOUNCE}"
-        if header.max_bounces is None or header.max_bounces > LAST_FILE_BOUNCE:
-            last = LAST_FILE_BOUNCE - FIRST_BOUNCE
-            bounces += f"; bounces above {LAST_FILE_BOUNCE} are added into index {last}"
-    return {
-        "third_bounce": np.int32(THIRD_BOUNCE - FIRST_BOUNCE),
-        "bounces": bounces,
-        "bounce_indices": np.asarray(header.bounce_indices, dtype=np.int32),
-        "axes": " ".join(layout.file_axes(header.confocal)),
-        "unit": layout.DATA_UNIT,
-    }
-
-
-def _view_sample_attributes(header: CaptureHeader) -> dict[str, object]:
-    if not header.split_bounces:
-        bounces = f"the sum of all paths is in index {header.bounce_indices[0]}"
-    else:
-        last = FILE_BOUNCES - 1
-        bounces = "index k of the bounce axis holds the paths with k surface interactions (0: an emitter seen directly)"
-        bounces += f"; those with more than {last} are added into index {last}"
-    return {
-        "bounces": bounces,
+    is_view = header.scan_type == LINE_OF_SIGHT
+    attributes: dict[str, object] = {
+        "bounces": _bounces_text(header, is_view),
         "bounce_indices": np.asarray(header.bounce_indices, dtype=np.int32),
         "axes": " ".join(layout.file_axes(header.confocal)),
         "unit": layout.data_unit(header.scan_type),
-        "quantity": "of a pixel's steady radiance the share that arrives in the bin: the sum over bins, and what falls "
-        "outside the time window, is the steady picture",
     }
+    if is_view:
+        return attributes | {"quantity": _VIEW_QUANTITY}
+    return attributes | {"third_bounce": np.int32(THIRD_BOUNCE - FIRST_BOUNCE)}
+
+
+def _bounces_text(header: CaptureHeader, is_view: bool) -> str:
+    if not header.split_bounces:
+        return f"the sum of all {'paths' if is_view else 'bounces'} is in index {header.bounce_indices[0]}"
+    last = FILE_BOUNCES - 1
+    if is_view:
+        meaning = "index k of the bounce axis holds the paths with k surface interactions (0: an emitter seen directly)"
+        return f"{meaning}; those with more than {last} are added into index {last}"
+    more = header.max_bounces is None or header.max_bounces > LAST_FILE_BOUNCE
+    meaning = f"index k of the bounce axis holds bounce k + {FIRST_BOUNCE}"
+    return meaning + (f"; bounces above {LAST_FILE_BOUNCE} are added into index {last}" if more else "")
 
 
 def _hidden_volume(header: CaptureHeader) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

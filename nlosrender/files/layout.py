@@ -140,14 +140,12 @@ class FileFrame:
 
 
 def file_frame(frame: str, pose: Pose) -> FileFrame:
-    """Return the conversion from the local frame (wall in z = 0, normal +z) to the file's frame.
+    """Return the conversion from the local frame (wall in z = 0, normal +z), posed in the scene, to the file's frame.
 
     Parameters
     ----------
     frame
         ``znlos``: wall in Y = 0 with normal (0, -1, 0), Z up; ``scene``: the scene's own coordinates.
-    pose
-        Pose of the local frame in the scene.
 
     Raises
     ------

@@ -46,17 +46,13 @@ def forecast_size(
 
     Parameters
     ----------
-    sizes
-        Length of every in-memory axis, as ``CaptureHeader.sizes``.
-    confocal
-        Whether the file has no laser axes.
+    sizes, confocal
+        Length of every in-memory axis, as ``CaptureHeader.sizes``; whether the file has no laser axes.
     filled
         For each bounce slot that is rendered, the share of the bins that hold light; chunks of a slot with 0 are
         never written.
-    compression
-        ``gzip`` or ``none``.
-    variance
-        Whether the variance is stored beside the samples.
+    compression, variance
+        ``gzip`` or ``none``; whether the variance is stored beside the samples.
     line_of_sight
         Whether a camera sees the light: no bounce is known better than from the pilot.
     """
