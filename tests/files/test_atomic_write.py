@@ -272,7 +272,7 @@ def test_a_full_disk_is_a_failure_with_its_name(tmp_path: Path) -> None:
     out = tmp_path / "a.ply"
     write_ply(out, np.zeros((3, 3)), np.array([[0, 1, 2]]))
     before = out.read_bytes()
-    message = r"a.ply: cannot be written: No space left on device\. Free some space on the disk /.* MB left\)"
+    message = r"a.ply: cannot be written: No space left on device\. Free some space on the disk /.* [kMGT]?B left\)"
     with pytest.raises(DiskError, match=message) as caught, replacing(out, PLY):
         raise OSError(errno.ENOSPC, "No space left on device")
     assert caught.value.exit_code == EXIT_FAILURE
