@@ -225,6 +225,16 @@ def _virtual_lights() -> dict[str, Item]:
             bins=(1.0, 0.07, 80),
             max_bounces=6,
         ),
+        "exhaustive-near-wall": nlos(STANDING, SLANTED, scan="exhaustive", bins=(0.0, 0.06, 80), target_error=0.1),
+        "exhaustive-rough-third-only": nlos(
+            plate((0.15, -0.1, 0.6), (0.2, -0.1, -1.0), (0.8, 0.6), ROUGH),
+            scan="exhaustive",
+            max_bounces=3,
+            **by_name,
+        ),
+        "single-near-laser": nlos(
+            plate((0.301, -0.2, 0.2), (-1.0, 0.0, 0.0), (0.4, 0.4), 0.8), SLANTED, target_error=0.2, **by_name
+        ),
         "exhaustive-three-balls": nlos(*BALLS, scan="exhaustive", sensors=(3, 2), lasers=(2, 3)),
         "exhaustive-reciprocal": nlos(
             SLANTED,
@@ -262,12 +272,15 @@ def _paths() -> dict[str, Item]:
     """Captures of the path engine: every technique, and what only paths can carry."""
     by_name = {"engine": "path", "spp": 128}
     two = (SLANTED, SIDE)
+    small = plate((0.1, 0.05, 0.9), (0.1, 0.0, -1.0), (0.25, 0.2))  # hidden geometry sampling alone serves best
     glass = plate((0.0, 0, 0.4), (0, 0, -1), (0.3, 0.4), {"type": "thindielectric", "int_ior": 1.5})
     mask = plate((0.1, 0, 0.4), (0, 0, -1), (0.6, 1.0), {"type": "mask", "opacity": 0.5, "a": diffuse(0.5)})
     solid_glass = {"type": "sphere", "center": [0.1, 0, 0.5], "radius": 0.2, "bsdf": {"type": "dielectric"}}
     blend = {"type": "blendbsdf", "weight": 0.4, "a": diffuse(0.6), "b": MIRROR}
     return {
         "single": nlos(*two, **by_name),
+        "single-small-far-plate": nlos(small, max_bounces=6, **by_name),
+        "single-small-far-ball": nlos(ball((0.1, 0.05, 0.9), 0.1), max_bounces=6, **by_name),
         "single-seed-7": nlos(*two, seed=7, **by_name),
         "single-target-error": nlos(*two, engine="path", target_error=0.3),
         "single-third-target-error": nlos(*two, engine="path", target_error=0.2, max_bounces=3),
@@ -382,11 +395,19 @@ def _line_of_sight() -> dict[str, Item]:
     red = plate((-1.2, 0.0, 0.0), (1.0, 0.0, 0.0), (2.0, 2.0), [0.8, 0.2, 0.1])
     spot = {"type": "spot", "position": [0.5, 1.2, 1.5], "look_at": [0, 0, -1], "intensity": 5.0, "cutoff_deg": 30}
     bulb = ball((0.7, 0.8, 0.2), 0.15, 0.0) | {"radiance": 4.0}
+    from_file: Item = {
+        "capture": {"scan_type": "line_of_sight"},
+        "time_axis": {"bin_width_opl": 0.1, "n_bins": "auto"},
+        "render": {"max_bounces": 5, "spp": 64},
+    }
     textured = plate((0.0, 0.0, -1.0), (0.0, 0.0, 1.0), (3.0, 2.4), diffuse(COLOURS))
     return {
         "area-lamp": seen(FLOOR, BACK, TURNED_BOX, emitters=[LAMP]),
         "point-and-spot": seen(FLOOR, BACK, emitters=[POINT, spot]),
         "bulb-glass-metal": seen(FLOOR, BACK, glass, metal, emitters=[bulb], max_bounces=7),
+        "rough-glass": seen(
+            FLOOR, BACK, plate((0, 0, 0.5), (0, 0, 1), (1.0, 1.0), {"type": "roughdielectric"}), emitters=[LAMP]
+        ),
         "colour-texture": seen(FLOOR, red, textured, emitters=[LAMP]),
         "polarised": seen(FLOOR, BACK, metal, glass, emitters=[LAMP], polarized=True),
         "target-error": seen(FLOOR, BACK, emitters=[POINT], target_error=0.2),
@@ -396,12 +417,8 @@ def _line_of_sight() -> dict[str, Item]:
         ),
         "emission-only": seen(BACK, emitters=[bulb], max_bounces=0, bins=(0.0, 0.1, "auto")),
         "no-roulette": seen(FLOOR, BACK, emitters=[LAMP], russian_roulette=False, seed=3),
-        "mitsuba-xml": {
-            "scene": {"mitsuba": "scene.xml"},
-            "capture": {"scan_type": "line_of_sight"},
-            "time_axis": {"bin_width_opl": 0.1, "n_bins": "auto"},
-            "render": {"max_bounces": 5, "spp": 64},
-        },
+        "mitsuba-xml": {"scene": {"mitsuba": "scene.xml"}, **from_file},
+        "mitsuba-xml-sky": {"scene": {"mitsuba": "sky.xml"}, **from_file},
     }
 
 
@@ -438,6 +455,9 @@ def _ways_of_rendering() -> list[CaptureCase]:
         "virtual_lights": ("vl", lights, ("shards", "lasers", "kill", "stop", "dask")),
         "line_of_sight": ("los", view, ("shards", "dask")),
     }
+    reciprocal = _virtual_lights()["exhaustive-reciprocal"]
+    cut = {**reciprocal, "render": {**reciprocal["render"], "memory_limit": "401MB"}}
+    cases.append(CaptureCase("cut-reciprocal", "virtual_lights", cut, same_as="vl-exhaustive-reciprocal"))
     for engine, (short, config, modes) in ways.items():
         whole = f"whole-{short}"
         # three processes share the limit, and each takes the 400 MB for itself
@@ -491,6 +511,7 @@ def write_files(folder: Path) -> None:
     Image.fromarray(rng.integers(0, 256, (5, 7)).astype(np.uint8)).save(folder / "grey.png")
     Image.fromarray(rng.integers(0, 256, (5, 7, 3)).astype(np.uint8)).save(folder / "colours.png")
     (folder / "scene.xml").write_text(XML)
+    (folder / "sky.xml").write_text(XML.replace("</scene>", '<emitter type="constant"/></scene>'))
     waves, normals = _sheet(0.8, 0.6, 6, 5, lambda x, y: 0.05 * np.sin(9 * x))
     _write_obj(folder / "waves.obj", waves, normals, _faces(6, 5)[:, ::-1])
     fine, _ = _sheet(0.8, 0.6, 90, 70, lambda x, y: 0.02 * np.sin(25 * x) * np.cos(19 * y))
