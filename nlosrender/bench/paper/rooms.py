@@ -23,10 +23,7 @@ class Room:
     write: Callable[[Path, int], None]
 
 
-ROOMS = (
-    Room("room-statue", 500_000, write_statue),
-    Room("room-furniture", 1_200_000, write_furniture),
-)
+ROOMS = (Room("room-statue", 500_000, write_statue), Room("room-furniture", 1_200_000, write_furniture))
 
 
 def closed_rooms(study: Study) -> PaperFigure:
