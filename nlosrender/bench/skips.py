@@ -82,7 +82,7 @@ def of_gather(loaded: LoadedScene) -> Iterator[Saving]:
     if not engine.settings.needs_visibility:
         yield _saving("rays where nothing can lie between", loaded, gather, _tracing_all(engine, gather))
     elif engine.third.shadow_ray_targets(plan.batches[0], patch_scale).mask.any():
-        yield _saving("rays that nothing can stop", loaded, gather, _without_clearances(gather))
+        yield _saving("rays that nothing can stop", loaded, gather, _without_masks(engine, gather))
 
 
 def _tracing_all(engine: VirtualLightEngine, gather: Callable[[], Float64]) -> Callable[[], Float64]:
@@ -92,23 +92,25 @@ def _tracing_all(engine: VirtualLightEngine, gather: Callable[[], Float64]) -> C
         third = engine.third
         known, third.settings = third.settings, replace(third.settings, needs_visibility=True)
         try:
-            return _without_clearances(gather)()
+            return _without_masks(engine, gather)()
         finally:
             third.settings = known
 
     return traced
 
 
-def _without_clearances(gather: Callable[[], Float64]) -> Callable[[], Float64]:
-    """Return ``gather`` with rays all the way to every patch that faces a sensor point."""
-    from nlosrender.engine.virtual_lights.visibility import masks as clearance
+def _without_masks(engine: VirtualLightEngine, gather: Callable[[], Float64]) -> Callable[[], Float64]:
+    """Return ``gather`` with rays to every patch that faces a sensor point, without visibility masks."""
+    from nlosrender.engine.virtual_lights.visibility.masks import VisibilityMasks
 
     def traced() -> Float64:
-        known, clearance.LEAST_POINTS = clearance.LEAST_POINTS, NEVER
+        third = engine.third
+        known = third.masks
+        third.masks = VisibilityMasks(engine.built, replace(known.tuning, min_mask_sensors=NEVER))
         try:
             return gather()
         finally:
-            clearance.LEAST_POINTS = known
+            third.masks = known
 
     return traced
 

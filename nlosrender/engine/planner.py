@@ -55,7 +55,7 @@ def choose_engine(
     if engine.tessellator.nearest_round < TOUCHING:
         reason = "a round surface, which is cut into patches of one size, touches a laser or sensor point"
         return PathEngine(built, capture, time_axis, options, reason=reason)
-    if engine.tessellator.n_round_cells > MAX_PATCHES:
+    if engine.tessellator.n_round_elements > MAX_PATCHES:
         reason = "a round surface is so narrow that it would be cut into millions of patches"
         return PathEngine(built, capture, time_axis, options, reason=reason)
     if render.engine == "virtual_lights":

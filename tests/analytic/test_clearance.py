@@ -1,4 +1,4 @@
-"""Clearances: where nothing is said to hide a point, nothing does, whatever lies around it.
+"""Visibility masks: where nothing is said to hide a point, nothing does, whatever lies around it.
 
 Brute force in float64: every triangle against every segment from the wall to the point. What is said holds up to what
 rays know: what lies in a plane with the point within RISE does not count.
@@ -23,7 +23,7 @@ Array = NDArray[np.float64]
 RECTANGLE = np.array([[-0.5, -0.4, 0.0], [0.5, 0.45, 0.0]])
 ROW = np.array([[-0.5, 0.1, 0.0], [0.5, 0.1, 0.0]])
 POINT = np.array([[0.1, -0.2, 0.0]])
-MANY = 10**6  # points look: worth while
+MANY = 10**6  # sensor points share a mask
 N_POINTS = 80
 SPREAD, AIMED = 24, 48  # wall points per point: anywhere, and behind points of triangles
 
@@ -110,8 +110,10 @@ def vectors(kind: Any, values: Array) -> Any:
     return kind(np.ascontiguousarray(np.asarray(values, np.float32).T))
 
 
-def cleared(triangles: Array, points: Array, normals: Array, others: Array, outlook: Any, planar: bool = True) -> Any:
-    """Return the clearances (n,) of points."""
+def masks_of(
+    triangles: Array, points: Array, normals: Array, others: Array, wall_tiles: Any, planar: bool = True
+) -> Any:
+    """Return the masks (n,) of points."""
     import drjit as dr
     import mitsuba as mi
 
@@ -121,7 +123,7 @@ def cleared(triangles: Array, points: Array, normals: Array, others: Array, outl
     surface = Surface(vectors(mi.Point3f, points), vectors(mi.Vector3f, normals), vectors(mi.Vector3f, others))
     count = len(points)
     where, active = dr.zeros(mi.UInt32, count), dr.full(mi.Bool, True, count)
-    return np.array(VisibilityMasks(built).of(surface, outlook, where, active))
+    return np.array(VisibilityMasks(built).of(surface, wall_tiles, where, active))
 
 
 def wall_points(rectangle: Array, points: Array, triangles: Array, random: np.random.Generator) -> Array:
@@ -144,25 +146,25 @@ def assert_sound(
     triangles: Array,
     points: Array,
     normals: Array,
-    clearance: NDArray[np.uint64],
+    masks: NDArray[np.uint64],
     ends: Array,
     bits: NDArray[np.uint64],
 ) -> tuple[int, int]:
-    """Check what clearances (n,) say of the ways from ``ends`` (n, m, 3), whose tiles have ``bits``, to the points.
+    """Check what masks (n,) say of the ways from ``ends`` (n, m, 3), whose tiles have ``bits``, to the points.
 
     Returns
     -------
     tuple
         How many of these ways are not free, and how many are said to be.
     """
-    from nlosrender.engine.virtual_lights.visibility.masks import MOST_RISE, RISE
+    from nlosrender.engine.virtual_lights.visibility.masks import MAX_RISE, RISE
 
     planes, n_hidden, n_open = unit_normals(triangles), 0, 0
     for k, point in enumerate(points):
         is_before = (ends[k] - point) @ normals[k] > 0
-        start, is_open = ends[k][is_before], (clearance[k] & bits[k][is_before]) > 0
+        start, is_open = ends[k][is_before], (masks[k] & bits[k][is_before]) > 0
         met = 1 - hits(start, np.broadcast_to(point, start.shape), triangles)
-        rise = min(RISE * point[2], MOST_RISE)
+        rise = min(RISE * point[2], MAX_RISE)
         is_near = met * ((start - point) @ normals[k])[:, None] <= rise
         in_plane = np.abs(np.einsum("tx,tx->t", point - triangles[:, 0], planes)) <= rise
         hides = ~np.isnan(met) & ~is_near & ~in_plane
@@ -191,14 +193,14 @@ def test_nothing_hides_a_point_from_where_it_is_said_to_be_open(name: str, recta
     points, own = on_and_behind(triangles, random)
     turned = own + 0.4 * random.normal(size=own.shape)
     turned = (turned / np.linalg.norm(turned, axis=1)[:, None]).astype(np.float32).astype(np.float64)
-    outlook = WallTiles.around([rectangle], MANY)
+    wall_tiles = WallTiles.around([rectangle], MANY)
     n_hidden, n_open = 0, 0
     for normals, others in ((own, own), (own, turned), (turned, own)):  # flat, with shading normals, a cluster
         ends = wall_points(rectangle, points, triangles, random)
-        clearance = cleared(triangles, points, normals, others, outlook)
+        masks = masks_of(triangles, points, normals, others, wall_tiles)
         index = dr.zeros(mi.UInt32, ends[..., 0].size)
-        bits = np.array(outlook.tile_bit(index, vectors(mi.Point3f, ends.reshape(-1, 3)))).reshape(ends.shape[:2])
-        hidden, open_ = assert_sound(triangles, points, normals, clearance, ends, bits)
+        bits = np.array(wall_tiles.tile_bit(index, vectors(mi.Point3f, ends.reshape(-1, 3)))).reshape(ends.shape[:2])
+        hidden, open_ = assert_sound(triangles, points, normals, masks, ends, bits)
         n_hidden, n_open = n_hidden + hidden, n_open + open_
     assert n_hidden > 100
     assert n_open > 50
@@ -213,18 +215,11 @@ LETTER = {"type": "letters", "text": "E", "height": 0.7, "center": [0.1, 0, 0.9]
 }
 
 
-@pytest.fixture
-def eager(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Look for clearances however few sensor points there are."""
-    from nlosrender.engine.virtual_lights.visibility import masks as clearance
-
-    monkeypatch.setattr(clearance, "LEAST_POINTS", 0)
-
-
 def stage_of(*hidden: dict[str, Any], scan: str = "single", **more: Any) -> Stage:
-    """Return a scene's engine, and the batch of all its points."""
+    """Return a scene's engine, with masks however few sensor points there are, and the batch of all its points."""
     sensors = {"sensors": (7, 5)}
-    return Stage.of(flat_wall(*hidden, scan=scan, engine="virtual_lights", spp=None, **(sensors | more)))
+    stage = Stage.of(flat_wall(*hidden, scan=scan, engine="virtual_lights", spp=None, **(sensors | more)))
+    return stage.tuned(min_mask_sensors=0)
 
 
 def shadow_ray_targets(stage: Stage) -> Any:
@@ -238,7 +233,6 @@ def sensor_points(stage: Stage) -> Array:
     return points.astype(np.float32).astype(np.float64)
 
 
-@pytest.mark.usefixtures("eager")
 @pytest.mark.parametrize("hidden", [(LETTER,), (FRONT, BEHIND)], ids=["letter", "two plates"])
 def test_what_an_engine_says_of_its_patches_is_so(hidden: tuple[dict[str, Any], ...]) -> None:
     """The same of the patches of a scene and the sensor points' own tiles, in the gather's order."""
@@ -254,12 +248,11 @@ def test_what_an_engine_says_of_its_patches_is_so(hidden: tuple[dict[str, Any], 
 
 def is_open(lit: Any) -> NDArray[np.bool_]:
     """Return which patches are open to all tiles."""
-    from nlosrender.engine.virtual_lights.visibility.masks import OF_ALL
+    from nlosrender.engine.virtual_lights.visibility.masks import ALL_TILES
 
-    return lit.mask == OF_ALL
+    return lit.mask == ALL_TILES
 
 
-@pytest.mark.usefixtures("eager")
 def test_the_foremost_plate_is_open_and_the_hidden_one_is_not() -> None:
     """Of two plates one behind the other."""
     stage = stage_of(FRONT, BEHIND | {"center": [0.3, 0, 1.0]}, scan="confocal")
@@ -269,7 +262,6 @@ def test_the_foremost_plate_is_open_and_the_hidden_one_is_not() -> None:
     assert not is_open(lit)[~is_front].any()
 
 
-@pytest.mark.usefixtures("eager")
 def test_a_two_sided_plate_is_open_in_front() -> None:
     """What lies behind its plane is no matter to wall points before it."""
     two_sided = {"type": "twosided", "nested": {"type": "diffuse"}}
@@ -280,7 +272,6 @@ def test_a_two_sided_plate_is_open_in_front() -> None:
     assert is_open(lit)[is_front].all()
 
 
-@pytest.mark.usefixtures("eager")
 def test_a_convex_body_is_open_where_no_other_is_in_the_way() -> None:
     """The faces of two boxes beside one another that look at the wall; not all of those that look at each other."""
     box = {"type": "box", "size": [0.3, 0.4, 0.8], "bsdf": ROUGH}
@@ -293,7 +284,6 @@ def test_a_convex_body_is_open_where_no_other_is_in_the_way() -> None:
     assert not is_open(lit)[inner].all()
 
 
-@pytest.mark.usefixtures("eager")
 def test_a_sphere_counts_by_its_box() -> None:
     """A plate before a sphere is open; behind a box that reaches over its plane it is not, and nor is the sphere."""
     for z, expected in ((1.2, True), (0.75, False)):
@@ -305,30 +295,31 @@ def test_a_sphere_counts_by_its_box() -> None:
         assert is_open(lit)[plate].all() == expected
 
 
-@pytest.mark.usefixtures("eager")
 def test_a_screen_leaves_the_tiles_beside_its_shadow_open() -> None:
     """A screen over the left half of the way hides the point from the left tiles of the wall only."""
-    from nlosrender.engine.virtual_lights.visibility.masks import OF_COLUMN, TILES, WallTiles
+    from nlosrender.engine.virtual_lights.visibility.masks import COLUMN_TILES, TILES, WallTiles
 
     # from (0, 0, 1) the screen at half the height, from x = -0.3 to -0.02, hides x from -0.6 to -0.04
     screen = np.array([[[-0.3, -0.5, 0.5], [-0.02, -0.5, 0.5], [-0.02, 0.5, 0.5]]])
     screen = np.concatenate([screen, [[[-0.3, -0.5, 0.5], [-0.02, 0.5, 0.5], [-0.3, 0.5, 0.5]]]])
     down = np.array([[0.0, 0, -1]])
-    outlook = WallTiles.around([np.array([[-0.5, -0.4, 0], [0.5, 0.4, 0]])], MANY)
-    beside = sum(OF_COLUMN << column for column in range(TILES // 2, TILES))
-    assert cleared(screen, np.array([[0.0, 0, 1]]), down, down, outlook)[0] == beside
+    wall_tiles = WallTiles.around([np.array([[-0.5, -0.4, 0], [0.5, 0.4, 0]])], MANY)
+    beside = sum(COLUMN_TILES << column for column in range(TILES // 2, TILES))
+    assert masks_of(screen, np.array([[0.0, 0, 1]]), down, down, wall_tiles)[0] == beside
 
 
 def test_before_a_curved_wall_and_to_few_points_nothing_is_known() -> None:
     """All rays are traced, all the way."""
-    from nlosrender.engine.virtual_lights.visibility.masks import LEAST_POINTS, OF_ALL, WallTiles
+    from nlosrender.engine.virtual_lights.tuning import DEFAULT_TUNING
+    from nlosrender.engine.virtual_lights.visibility.masks import ALL_TILES, WallTiles
 
     point, down = np.array([[0.0, 0, 0.5]]), np.array([[0.0, 0, -1]])
     far = flat(0.9)
-    many, few = (WallTiles.around([RECTANGLE], count) for count in (LEAST_POINTS, LEAST_POINTS - 1))
-    assert cleared(far, point, down, down, many)[0] == OF_ALL
-    assert not cleared(far, point, down, down, many, planar=False).any()
-    assert not cleared(far, point, down, down, few).any()
+    least = DEFAULT_TUNING.min_mask_sensors
+    many, few = (WallTiles.around([RECTANGLE], count) for count in (least, least - 1))
+    assert masks_of(far, point, down, down, many)[0] == ALL_TILES
+    assert not masks_of(far, point, down, down, many, planar=False).any()
+    assert not masks_of(far, point, down, down, few).any()
 
 
 def test_nothing_is_known_of_points_behind_the_wall_or_in_it() -> None:
@@ -336,4 +327,4 @@ def test_nothing_is_known_of_points_behind_the_wall_or_in_it() -> None:
     from nlosrender.engine.virtual_lights.visibility.masks import WallTiles
 
     points, down = np.array([[0.0, 0, -0.1], [0, 0, 0]]), np.array([[0.0, 0, -1], [0, 0, -1]])
-    assert not cleared(flat(0.9), points, down, down, WallTiles.around([RECTANGLE], MANY)).any()
+    assert not masks_of(flat(0.9), points, down, down, WallTiles.around([RECTANGLE], MANY)).any()

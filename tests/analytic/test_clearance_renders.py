@@ -1,4 +1,4 @@
-"""Rays that clearances leave out, or shorten, change nothing in what is rendered.
+"""Rays that visibility masks leave out change nothing in what is rendered.
 
 A ray that grazes the plane of its own patch may differ by its last bits, and so may be hidden or not: it carries next
 to nothing. Rays that pass an edge of another surface by less than float32 tells would count, but no scene here is made
@@ -67,13 +67,11 @@ def sheet(folder: Path, n: int, height: float, waves: float, **place: Any) -> It
     return {"type": "mesh", "filename": "sheet.ply", "face_normals": True, "bsdf": DIFFUSE} | place
 
 
-def both(stage: Stage, monkeypatch: pytest.MonkeyPatch, patch_scale: float) -> list[NDArray[np.float64]]:
-    """Return the third bounce with clearances, and with rays all the way to every patch."""
-    from nlosrender.engine.virtual_lights.visibility import masks as clearance
-
+def both(stage: Stage, patch_scale: float) -> list[NDArray[np.float64]]:
+    """Return the third bounce with visibility masks, and with rays to every patch."""
     results, third = [], stage.engine.third
     for least in (0, NEVER):
-        monkeypatch.setattr(clearance, "LEAST_POINTS", least)
+        stage.tuned(min_mask_sensors=least)
         third.forget()
         results.append(third.gather(stage.batch, patch_scale).values)
         known = third.shadow_ray_targets(stage.batch, patch_scale).mask
@@ -81,10 +79,10 @@ def both(stage: Stage, monkeypatch: pytest.MonkeyPatch, patch_scale: float) -> l
     return results
 
 
-def assert_same(stage: Stage, monkeypatch: pytest.MonkeyPatch, patch_scale: float = 0.6) -> None:
-    """Check that clearances change nothing."""
+def assert_same(stage: Stage, patch_scale: float = 0.6) -> None:
+    """Check that masks change nothing."""
     assert stage.engine.settings.needs_visibility
-    cleared, full = both(stage, monkeypatch, patch_scale)
+    cleared, full = both(stage, patch_scale)
     assert full.sum() > 0
     assert relative_l2(cleared - full, full) <= SAME
 
@@ -103,27 +101,27 @@ def stage_of(*hidden: Item, scan: str, folder: Path | None = None, **more: Any) 
         for scan in SCANS
     ],
 )
-def test_clearances_change_nothing(monkeypatch: pytest.MonkeyPatch, name: str, scan: str) -> None:
+def test_masks_change_nothing(name: str, scan: str) -> None:
     """Of scenes that hide parts of themselves, each from some of the wall."""
-    assert_same(stage_of(*SCENES[name], scan=scan), monkeypatch)
+    assert_same(stage_of(*SCENES[name], scan=scan))
 
 
-def test_nor_before_a_turned_wall(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_nor_before_a_turned_wall() -> None:
     """Rectangles and tiles are the wall's own."""
     wall = {"normal": [1, 0.1, 0.2], "up": [0, 0.3, 1]}
     letter = LETTER | {"center": [0.9, 0.1, 0.3], "normal": [-1, 0.2, -0.1]}
     plate = PLATE | {"center": [1.2, 0.2, 0], "normal": [-1, 0, 0]}
-    assert_same(stage_of(letter, plate, scan="confocal", wall=wall), monkeypatch)
+    assert_same(stage_of(letter, plate, scan="confocal", wall=wall))
 
 
 @pytest.mark.parametrize("sensors", [pytest.param((1, 1), marks=pytest.mark.slow), (33, 1)], ids=["point", "row"])
-def test_nor_seen_from_rectangles_without_area(monkeypatch: pytest.MonkeyPatch, sensors: tuple[int, int]) -> None:
+def test_nor_seen_from_rectangles_without_area(sensors: tuple[int, int]) -> None:
     """One sensor point, or one row."""
-    assert_same(stage_of(FRONT, BEHIND, LETTER, scan="single", sensors=sensors), monkeypatch)
+    assert_same(stage_of(FRONT, BEHIND, LETTER, scan="single", sensors=sensors))
 
 
 @pytest.mark.parametrize("scale", [1e-3, pytest.param(1e3, marks=pytest.mark.slow)])
-def test_nor_at_other_scales(monkeypatch: pytest.MonkeyPatch, scale: float) -> None:
+def test_nor_at_other_scales(scale: float) -> None:
     """A wall of 2 mm, or of 2 km."""
     lengths = ("width", "height", "thickness")
     hidden = [
@@ -134,21 +132,19 @@ def test_nor_at_other_scales(monkeypatch: pytest.MonkeyPatch, scale: float) -> N
     wall = {"width": 2 * scale, "height": 1.6 * scale}
     config = flat_wall(*hidden, scan="confocal", sensors=(9, 7), wall=wall, bins=(0, 0.02 * scale, 300))
     config["render"] |= {"engine": "virtual_lights", "spp": None}
-    assert_same(Stage.of(config), monkeypatch)
+    assert_same(Stage.of(config))
 
 
 @pytest.mark.parametrize("face_normals", [pytest.param(True, marks=pytest.mark.slow), False])
-def test_nor_of_meshes_with_or_without_smooth_normals(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, face_normals: bool
-) -> None:
+def test_nor_of_meshes_with_or_without_smooth_normals(tmp_path: Path, face_normals: bool) -> None:
     """A sheet that hides its own valleys."""
     mesh = sheet(tmp_path, 12, 0.15, 15.0, translate=[0.1, 0, 0.6], face_normals=face_normals)
-    assert_same(stage_of(mesh, scan="exhaustive", folder=tmp_path), monkeypatch)
+    assert_same(stage_of(mesh, scan="exhaustive", folder=tmp_path))
 
 
 @pytest.mark.parametrize("angle", [0, 80])
 @pytest.mark.parametrize("scan", [pytest.param("confocal", marks=pytest.mark.slow), "exhaustive"])
-def test_nor_of_clusters(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, scan: str, angle: float) -> None:
+def test_nor_of_clusters(tmp_path: Path, scan: str, angle: float) -> None:
     """A cluster has the normal of all its members, and is looked at where one of them lies: often not in one plane.
 
     Standing across the wall, it is seen from wall points that lie before the plane through the middle, and behind that
@@ -157,30 +153,26 @@ def test_nor_of_clusters(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, scan: 
     mesh = sheet(tmp_path, 120, 0.05, 60.0, translate=[0, 0.2, 0.48], rotate_deg=[angle, 0, 0])
     stage = stage_of(mesh, scan=scan, folder=tmp_path, sensors=(19, 17))
     assert stage.engine.tessellator.patches(1.0).is_cluster.mean() > 0.5
-    assert_same(stage, monkeypatch, patch_scale=1.0)
+    assert_same(stage, patch_scale=1.0)
 
 
 @pytest.mark.parametrize("scan", ["single", pytest.param("confocal", marks=pytest.mark.slow)])
-def test_nor_of_regions(monkeypatch: pytest.MonkeyPatch, scan: str) -> None:
+def test_nor_of_regions(scan: str) -> None:
     """Each region of the sensor grid looks out of a rectangle of its own."""
-    from nlosrender.engine.virtual_lights.elements import sensor_regions as regions
-
-    monkeypatch.setattr(regions, "LEAST_POINTS", 16)
-    monkeypatch.setattr(regions, "POINTS_PER_PATCH", 1)
     stage = stage_of(ROOM, TOUCHING, scan=scan, sensors=(26, 22))
+    stage.tuned(min_region_sensors=16, sensors_per_patch_cost=1)
     assert stage.engine.tessellator.regions is not None
-    assert_same(stage, monkeypatch, patch_scale=1.0)
+    assert_same(stage, patch_scale=1.0)
 
 
-def test_nor_of_further_bounces(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Sites of walks are looked at past the same surfaces: from one seed the same impulses arrive."""
+def test_nor_of_further_bounces() -> None:
+    """VPLs are seen past the same surfaces: from one seed the same contributions arrive."""
     from nlosrender.engine.path.engine import Budget
-    from nlosrender.engine.virtual_lights.visibility import masks as clearance
 
     results = []
     for least in (0, NEVER):
-        monkeypatch.setattr(clearance, "LEAST_POINTS", least)
         stage = stage_of(FRONT, BEHIND, LETTER, scan="single", max_bounces=5, split_bounces=True)
+        stage.tuned(min_mask_sensors=least)
         assert stage.engine.further is not None
         results.append(stage.engine.render(stage.batch, Budget(patch_scale=1.0, rounds=2)).mean[:, -2:])
     assert results[1].sum() > 0

@@ -35,9 +35,10 @@ BATCHES = {
 }
 
 
-def gather_of(scan: str) -> Any:
+def gather_of(scan: str, **tuning: Any) -> Any:
     """Return the gather of a new engine before a plate and a screen that hides a part of it."""
-    return Stage.of(flat_wall(BACK, SCREEN, scan=scan, engine="virtual_lights", spp=None, **GRIDS)).engine.third
+    stage = Stage.of(flat_wall(BACK, SCREEN, scan=scan, engine="virtual_lights", spp=None, **GRIDS))
+    return stage.tuned(**tuning).engine.third
 
 
 @pytest.fixture
@@ -101,17 +102,15 @@ def test_many_patches_are_not_kept(monkeypatch: pytest.MonkeyPatch, lighting: li
     assert min(lighting) > 10
 
 
-def test_what_was_lit_for_a_few_points_is_cleared_for_many(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A pilot asks rays for everything; the capture after it leaves out those that it would leave out by itself."""
+def test_what_was_lit_for_a_few_points_is_cleared_for_many() -> None:
+    """A pilot traces all rays; the capture after it leaves out those that it would leave out by itself."""
     start_backend("llvm")
     from nlosrender.engine.launch.pilot_points import pilot_of
-    from nlosrender.engine.virtual_lights.visibility import masks as clearance
 
-    monkeypatch.setattr(clearance, "LEAST_POINTS", 20)
-    third, batch = gather_of("single"), BATCHES["single"][0]
+    third, batch = gather_of("single", min_mask_sensors=20), BATCHES["single"][0]
     pilot = pilot_of(third.paths.capture, 3)
     third.gather(pilot, 0.5)
     assert not third.shadow_ray_targets(pilot, 0.5).mask.any()
     known = third.shadow_ray_targets(batch, 0.5).mask
-    np.testing.assert_array_equal(known, gather_of("single").shadow_ray_targets(batch, 0.5).mask)
+    np.testing.assert_array_equal(known, gather_of("single", min_mask_sensors=20).shadow_ray_targets(batch, 0.5).mask)
     assert known.any()

@@ -46,18 +46,20 @@ def second_moments(triangles: Array, areas: Array) -> Array:
 def test_clusters_lie_where_their_members_do(tmp_path: Path, patch_scale: float) -> None:
     """Area, middle and second moments of a flat sheet are those of its parallelograms, coarse or fine."""
     tessellator = tessellated(sheet(tmp_path, N_FINE, waves=0.0), folder=tmp_path)
-    cells, patches = tessellator.elements, tessellator.patches(patch_scale)
+    elements, patches = tessellator.elements, tessellator.patches(patch_scale)
     assert patches.is_cluster.all()
-    assert len(patches) < len(cells.sizes) / 4
+    assert len(patches) < len(elements.sizes) / 4
     a, b, c = (patches.corners[:, k] for k in range(3))
     halves = np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, a + c - b], axis=1)])
     total = tessellator.shared.areas.sum()
     assert patches.areas.sum() == pytest.approx(total, rel=1e-9)  # flat: one normal
     middle = np.einsum("n,nx->x", patches.areas, patches.centres)
-    assert middle == pytest.approx(np.einsum("n,nx->x", tessellator.shared.areas, cells.corners.mean(axis=1)), rel=1e-9)
+    assert middle == pytest.approx(
+        np.einsum("n,nx->x", tessellator.shared.areas, elements.corners.mean(axis=1)), rel=1e-9
+    )
     found = second_moments(halves, np.tile(patches.areas / 2, 2))
     assert found == pytest.approx(
-        second_moments(cells.corners, tessellator.shared.areas), rel=1e-5
+        second_moments(elements.corners, tessellator.shared.areas), rel=1e-5
     )  # the planes' ridge
 
 
@@ -73,12 +75,12 @@ def test_clusters_send_on_the_light_of_their_members(
     from nlosrender.engine.virtual_lights.elements.clusters import Merger
 
     tessellator = tessellated(sheet(tmp_path, N_FINE) | {"face_normals": face_normals}, folder=tmp_path)
-    cells, normals, areas = tessellator.elements, tessellator.shared.normals, tessellator.shared.areas
-    assert np.allclose(cells.shading_normals, normals, atol=1e-6) == face_normals
+    elements, normals, areas = tessellator.elements, tessellator.shared.normals, tessellator.shared.areas
+    assert np.allclose(elements.shading_normals, normals, atol=1e-6) == face_normals
     to_light = np.array([0.2, -0.1, -1.0]) / np.linalg.norm([0.2, -0.1, -1.0])
-    merger = Merger(cells, normals, areas, tessellator.shared.allowed, 1e9 * to_light)
+    merger = Merger(elements, normals, areas, tessellator.shared.allowed, 1e9 * to_light, tessellator.tuning)
     patches = merger.clusters(np.ones(len(areas), bool), 2.0)
-    expected = np.einsum("n,n,n->", areas, cells.shading_normals @ to_light, normals @ np.array(to_sensor))
+    expected = np.einsum("n,n,n->", areas, elements.shading_normals @ to_light, normals @ np.array(to_sensor))
     found = np.einsum("n,n,n->", patches.areas, patches.normals @ to_light, patches.normals @ np.array(to_sensor))
     # 1e9 units away directions differ by 1e-9; nothing is steeper than 60 degrees to the laser. A cluster's area is no
     # more than its members', which binds where it is flat and its shading normals lie off by their float32 rounding.
@@ -107,12 +109,12 @@ def test_no_cluster_lies_between_two_sheets(tmp_path: Path, patch_scale: float) 
 
 
 def test_what_a_cluster_is_made_of_does_not_matter(tmp_path: Path) -> None:
-    """Cells merged in two steps have the sums of cells merged in one, and a member of each cluster lies in it."""
+    """Elements merged in two steps have the sums of elements merged in one, and a member of each cluster lies in it."""
     tessellator = tessellated(sheet(tmp_path, N_FINE), folder=tmp_path)
-    generator = np.random.default_rng(0)
+    generator, tuning = np.random.default_rng(0), tessellator.tuning
     finest = tessellator.shared.merger._element_moments
-    coarse = finest.merged(1.0, generator)
-    twice = finest.merged(0.25, generator).merged(1.0, generator)
+    coarse = finest.merged(1.0, generator, tuning)
+    twice = finest.merged(0.25, generator, tuning).merged(1.0, generator, tuning)
     assert len(twice) < 1.1 * len(coarse) < 0.1 * len(finest)
     for merged in (coarse, twice):
         assert merged.places.sum(axis=0) == pytest.approx(finest.places.sum(axis=0), rel=1e-9)
@@ -132,9 +134,7 @@ def test_the_number_of_patches_follows_the_accuracy_not_the_triangles(tmp_path: 
         assert many.count(patch_scale) == pytest.approx(len(many.patches(patch_scale)), rel=0.5)
 
 
-def rendered(
-    config: dict[str, Any], folder: Path, target: float, monkeypatch: pytest.MonkeyPatch
-) -> tuple[Array, float, Array, int]:
+def rendered(config: dict[str, Any], folder: Path, target: float) -> tuple[Array, float, Array, int]:
     """Return H (laser, sensor, bin), the error stated, H with no triangles merged, and the number of patches."""
     from nlosrender.engine.path.engine import Budget
 
@@ -144,23 +144,20 @@ def rendered(
     result = engine.render(stage.batch, budget)
     stated = float(np.sqrt(result.variance.sum() / (result.mean**2).sum()))
     used = len(engine.tessellator.patches(budget.patch_scale))
-    engine.tessellator._saved.cache_clear()
-    monkeypatch.setattr("nlosrender.engine.virtual_lights.elements.size_field.MERGED", 0.0)
-    truth = (
-        engine.third.gather(stage.batch, min(budget.patch_scale, 1.0) / 2).values[0, 0, ..., :-1] * engine.paths.scale
-    )
+    unmerged, scale = stage.tuned(merge_ratio=0.0).engine, min(budget.patch_scale, 1.0) / 2
+    truth = unmerged.third.gather(stage.batch, scale).values[0, 0, ..., :-1] * unmerged.paths.scale
     return result.mean[0, stage.bounces.slot(3)], stated, truth, used
 
 
 @pytest.mark.parametrize("scan", ["single", "confocal", "exhaustive"])
-def test_a_merged_mesh_has_the_error_it_states(tmp_path: Path, scan: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_merged_mesh_has_the_error_it_states(tmp_path: Path, scan: str) -> None:
     """A fine wavy sheet before and behind which others lie: within twice what is stated, which is what was asked."""
     behind = sheet(tmp_path, N_FINE, 0.02, "behind.ply") | {"translate": [0.3, 0.2, 1.15]}
     keys: dict[str, Any] = {"lasers": (2, 3)} if scan == "exhaustive" else {}
     config = flat_wall(
         sheet(tmp_path, N_FINE), behind, scan=scan, bins=(0.6, 0.02, 200), spp=None, engine="virtual_lights", **keys
     )
-    result, stated, truth, used = rendered(config, tmp_path, 0.05, monkeypatch)
+    result, stated, truth, used = rendered(config, tmp_path, 0.05)
     assert used < 2 * 2 * N_FINE * (N_FINE + 1) / 2
     assert stated <= 0.05
     assert relative_l2(result - truth, truth) <= 2 * stated
@@ -196,15 +193,13 @@ HARD = {
 @pytest.mark.parametrize("scan", ["single", "confocal", "exhaustive"])
 @pytest.mark.parametrize("target", [0.1, 0.03, 0.01])
 @pytest.mark.parametrize("name", HARD)
-def test_merged_meshes_have_the_errors_they_state(
-    tmp_path: Path, name: str, target: float, scan: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_merged_meshes_have_the_errors_they_state(tmp_path: Path, name: str, target: float, scan: str) -> None:
     """The same for meshes that are hard on clusters, at targets that merge much, little and hardly."""
     keys: dict[str, Any] = {"lasers": (2, 3)} if scan == "exhaustive" else {}
     config = flat_wall(
         *HARD[name](tmp_path), scan=scan, bins=(0.3, 0.01, 300), spp=None, engine="virtual_lights", **keys
     )
-    result, stated, truth, used = rendered(config, tmp_path, target, monkeypatch)
+    result, stated, truth, used = rendered(config, tmp_path, target)
     ratio = relative_l2(result - truth, truth) / stated
     print(f"{ratio:.2f}  stated {stated:.4f}  patches {used}  target {target}  {name}, {scan}")
     assert ratio <= 2

@@ -96,12 +96,18 @@ def test_how_a_capture_is_cut_does_not_show(hidden: tuple[dict, ...]) -> None:
         np.testing.assert_array_equal(part, expected)
 
 
-def test_large_captures_gather_all_pairs(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_large_captures_gather_all_pairs() -> None:
     """Captures of many batches would gain nothing: each has few of the other halves of its pairs."""
     start_backend("llvm")
-    monkeypatch.setattr("nlosrender.engine.virtual_lights.reciprocity.MOST_SUMS", 15 * 15 * 300 - 1)
+    from nlosrender.engine.virtual_lights.reciprocity import is_reciprocal
+    from nlosrender.engine.virtual_lights.tuning import VirtualLightTuning
+
     engine, _ = engine_of(PLATE)
-    assert not engine.third.is_reciprocal
+    n_bins, n_points = engine.time_axis.n_bins, engine.capture.n_sensors
+    for max_sums in (n_points**2 * n_bins, n_points**2 * n_bins - 1):
+        tuning = VirtualLightTuning(max_reciprocal_sums=max_sums)
+        found = is_reciprocal(engine.built, engine.capture, n_bins, is_lambertian=True, tuning=tuning)
+        assert found == (max_sums == n_points**2 * n_bins)
 
 
 def test_legs_that_are_the_same_may_count() -> None:

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from support.rendering import configured, flat_wall
+from support.rendering import flat_wall
+from support.varied_scenes import Stage
 
 from nlosrender.capture.plan import Batch, Tile
-from nlosrender.engine.backend.start import start_backend
-from nlosrender.rendering import stages
 
 ROOM = {"type": "room", "size": [2.0, 1.6, 1.2], "bsdf": {"type": "diffuse", "reflectance": 0.5}}
 PLATE = {"type": "rectangle", "width": 0.8, "height": 0.6, "center": [0, 0, 1.0], "normal": [0, 0, -1]}
@@ -18,37 +17,21 @@ SENSORS = (26, 22)
 
 def engine_of(*hidden: dict, scan: str = "single", sensors: tuple[int, int] = SENSORS, **more):
     """Return the virtual-light engine of a scene."""
-    config = configured(flat_wall(*hidden, scan=scan, sensors=sensors, engine="virtual_lights", spp=None, **more))
-    backend = start_backend("llvm")
-    built = stages.load_scene(config)
-    capture, time_axis = stages.describe_capture(config, built.wall, built)
-    return stages.prepare(config, backend, built, capture, time_axis)[1]
+    return Stage.of(flat_wall(*hidden, scan=scan, sensors=sensors, engine="virtual_lights", spp=None, **more)).engine
 
 
-@pytest.fixture
-def eager(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Make regions of few sensor points, at no price: a test has no time for grids where they pay."""
-    start_backend("llvm")
-    from nlosrender.engine.virtual_lights.elements import sensor_regions as regions
-
-    monkeypatch.setattr(regions, "LEAST_POINTS", 16)
-    monkeypatch.setattr(regions, "POINTS_PER_PATCH", 1)
+def eager(*hidden: dict, **more):
+    """Return an engine that makes regions of few sensor points, at no price: grids where they pay take too long."""
+    config = flat_wall(*hidden, **({"sensors": SENSORS} | more), engine="virtual_lights", spp=None)
+    return Stage.of(config).tuned(min_region_sensors=16, sensors_per_patch_cost=1).engine
 
 
-@pytest.fixture
-def undivided(monkeypatch: pytest.MonkeyPatch):
-    """Return a function that makes an engine as ``engine_of``, without regions."""
-    start_backend("llvm")
-    from nlosrender.engine.virtual_lights.elements import tessellator
-
-    def make(*hidden: dict, **more):
-        with monkeypatch.context() as patch:
-            patch.setattr(tessellator, "regions_of", lambda *arguments: None)
-            engine = engine_of(*hidden, **more)
-        assert engine.tessellator.regions is None
-        return engine
-
-    return make
+def undivided(*hidden: dict, **more):
+    """Return an engine without regions."""
+    config = flat_wall(*hidden, **({"sensors": SENSORS} | more), engine="virtual_lights", spp=None)
+    engine = Stage.of(config).tuned(region_blocks=()).engine
+    assert engine.tessellator.regions is None
+    return engine
 
 
 def whole(engine) -> Batch:
@@ -58,10 +41,9 @@ def whole(engine) -> Batch:
     return Batch(tile, tile if engine.capture.scan_type == "confocal" else Tile(0, 1, 0, 1))
 
 
-@pytest.mark.usefixtures("eager")
 @pytest.mark.parametrize("scan", ["single", "confocal"])
 @pytest.mark.parametrize("hidden", [(ROOM,), (ROOM, TOUCHING)], ids=["room", "room and plate"])
-def test_regions_agree_with_one_set_of_patches(undivided, hidden: tuple[dict, ...], scan: str) -> None:
+def test_regions_agree_with_one_set_of_patches(hidden: tuple[dict, ...], scan: str) -> None:
     """Both err by what they state; together by no more than the root of the sum of the squares, times two.
 
     Two is what a stated error is held to. Light is not lost: the energies, whose errors of patches here and there
@@ -69,7 +51,7 @@ def test_regions_agree_with_one_set_of_patches(undivided, hidden: tuple[dict, ..
     """
     from nlosrender.engine.virtual_lights.third_bounce import estimated_error
 
-    divided, one = engine_of(*hidden, scan=scan), undivided(*hidden, scan=scan)
+    divided, one = eager(*hidden, scan=scan), undivided(*hidden, scan=scan)
     assert divided.tessellator.regions is not None
     assert divided.tessellator.count(0.5) < 0.5 * one.tessellator.count(0.5)
     pairs = [engine.third.pair(whole(engine), 0.5) for engine in (divided, one)]
@@ -80,10 +62,9 @@ def test_regions_agree_with_one_set_of_patches(undivided, hidden: tuple[dict, ..
     assert values.sum() == pytest.approx(reference.sum(), rel=0.2 * stated)
 
 
-@pytest.mark.usefixtures("eager")
 def test_every_region_covers_every_surface_once() -> None:
     """Shared patches and those of a region add up to the areas of all surfaces, whatever the resolution."""
-    engine = engine_of(ROOM)
+    engine = eager(ROOM)
     area = (2 * 2.0 * 1.2 + 2 * 1.6 * 1.2 + 2.0 * 1.6) / engine.built.unit**2
     count = len(engine.tessellator.regions.near)
     for patch_scale in (1.0, 0.4):
@@ -97,24 +78,23 @@ def test_every_region_covers_every_surface_once() -> None:
         assert found == pytest.approx([area] * len(found), rel=1e-6)
 
 
-@pytest.mark.usefixtures("eager")
-def test_cells_are_no_longer_than_their_distance_from_the_region() -> None:
+def test_elements_are_no_longer_than_their_distance_from_the_region() -> None:
     """What a region sees is cut as finely as its own sensor points need, and no finer than its neighbour needs."""
-    engine = engine_of(ROOM)
+    engine = eager(ROOM)
     grid, unit = engine.capture.sensor_grid, engine.built.unit
     regions = engine.tessellator.regions
     points = grid.positions.reshape(-1, 3) / unit
     laser = engine.capture.laser_grid.positions.reshape(-1, 3) / unit
     for label, near in enumerate(regions.near):
         own = np.concatenate([points[regions.labels == label], laser])
-        for cells in (near.elements, regions.shared.elements):
-            centres = cells.corners.mean(axis=1)
+        for elements in (near.elements, regions.shared.elements):
+            centres = elements.corners.mean(axis=1)
             distances = np.linalg.norm(centres[:, None] - own, axis=2).min(axis=1)
-            assert (cells.sizes <= np.maximum(distances, 1e-3) * (1 + 1e-6)).all()
+            assert (elements.sizes <= np.maximum(distances, 1e-3) * (1 + 1e-6)).all()
 
 
-def test_cells_that_are_small_enough_are_quartered_by_nobody() -> None:
-    """Parted first and quartered then, cells are those quartered at once: as many, of the same sizes and distances."""
+def test_elements_that_are_small_enough_are_quartered_by_nobody() -> None:
+    """Partitioned first, then quartered: as many elements, of the same sizes and distances, as quartered at once."""
     engine = engine_of(ROOM, PLATE)
     from nlosrender.engine.virtual_lights.elements.subdivision import (
         Elements,
@@ -131,16 +111,15 @@ def test_cells_that_are_small_enough_are_quartered_by_nobody() -> None:
     assert len(small.sizes) > 0 < len(large.sizes)
     assert (small.sizes <= small.distances).all()
     for least in (0.0, 0.2):
-        whole_cells = subdivide(once, distance, None, least)
+        all_elements = subdivide(once, distance, None, least)
         joined = Elements.joined([small, subdivide(large, distance, None, least)])
-        for found, expected in ((joined.sizes, whole_cells.sizes), (joined.distances, whole_cells.distances)):
+        for found, expected in ((joined.sizes, all_elements.sizes), (joined.distances, all_elements.distances)):
             np.testing.assert_array_equal(np.sort(found), np.sort(expected))
 
 
-@pytest.mark.usefixtures("eager")
 def test_a_batch_says_what_the_whole_capture_says() -> None:
     """Regions belong to the capture: a part of its sensor points gathers the same bits alone."""
-    engine = engine_of(ROOM)
+    engine = eager(ROOM)
     part = Batch(Tile(3, 17, 5, 22), Tile(0, 1, 0, 1))
     all_values = engine.third.gather(whole(engine), 0.6).values
     columns = engine.capture.sensor_grid.nx
@@ -149,7 +128,6 @@ def test_a_batch_says_what_the_whole_capture_says() -> None:
     assert all_values.any()
 
 
-@pytest.mark.usefixtures("eager")
 @pytest.mark.parametrize(
     ("hidden", "scan", "sensors"),
     [
@@ -162,7 +140,7 @@ def test_one_set_of_patches_where_regions_save_nothing(
     hidden: tuple[dict, ...], scan: str, sensors: tuple[int, int]
 ) -> None:
     """Regions cost patches: there are none where a set for all does as well."""
-    assert engine_of(*hidden, scan=scan, sensors=sensors).tessellator.regions is None
+    assert eager(*hidden, scan=scan, sensors=sensors).tessellator.regions is None
 
 
 def test_regions_have_a_price() -> None:

@@ -103,6 +103,21 @@ class Stage:
         more = (engine.lanes,) if engine.name == "virtual_lights" else ()
         return type(engine)(engine.built, engine.capture, engine.time_axis, replace(engine.options, seed=seed), *more)
 
+    def tuned(self, **changes: Any) -> Stage:
+        """Return the stage with other numbers of ``VirtualLightTuning``."""
+        from nlosrender.engine.virtual_lights.elements.tessellator import Tessellator
+        from nlosrender.engine.virtual_lights.visibility.masks import VisibilityMasks
+
+        engine = self.engine
+        tuning = replace(engine.tessellator.tuning, **changes)
+        bin_width = engine.time_axis.bin_width_opl / engine.built.unit
+        engine.tessellator = Tessellator(engine.built, engine.capture, bin_width, tuning=tuning)
+        for part in (engine.third, *([engine.further] if engine.further else [])):
+            part.tessellator = engine.tessellator
+            part.masks = VisibilityMasks(engine.built, tuning) if part.masks is not None else None
+        engine.third.forget()
+        return self
+
     def repeated(self, budget: Any, seeds: Sequence[int]) -> Repeated:
         """Render the capture once per seed."""
         results = [self.seeded(seed).render(self.batch, budget) for seed in seeds]

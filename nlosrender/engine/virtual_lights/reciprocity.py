@@ -1,20 +1,26 @@
-"""Whether light takes as much energy from a laser point to a sensor point as the other way."""
+"""Helmholtz reciprocity: whether H(l, s) = H(s, l), so that half of an exhaustive capture says all."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from nlosrender.capture.grids import Capture
+from nlosrender.engine.virtual_lights.tuning import DEFAULT_TUNING, VirtualLightTuning
 from nlosrender.scene.build import BuiltScene
 
-MOST_SUMS = 2**27  # of a capture that gains: a larger one is cut into batches with few of the other halves
 
+def is_reciprocal(
+    built: BuiltScene,
+    capture: Capture,
+    n_bins: int,
+    *,
+    is_lambertian: bool,
+    tuning: VirtualLightTuning = DEFAULT_TUNING,
+) -> bool:
+    """Return whether an exhaustive capture that fits one batch is the same with laser and sensor points exchanged.
 
-def is_reciprocal(built: BuiltScene, capture: Capture, n_bins: int, *, is_lambertian: bool) -> bool:
-    """Return whether H(l, s) = H(s, l) in an exhaustive capture that fits one batch, so that half of it says all.
-
-    The grids have to be the same, and so have the legs; a Lambertian surface looks the same from both sides as long as
-    its shading normals are its own: interpolated ones are used towards the lasers only.
+    The grids have to be the same, and so have the legs. Lambertian surfaces are reciprocal unless their shading normals
+    are interpolated: those are used towards the lasers only.
 
     Parameters
     ----------
@@ -24,11 +30,13 @@ def is_reciprocal(built: BuiltScene, capture: Capture, n_bins: int, *, is_lamber
         Of each of them.
     is_lambertian
         Whether wall and hidden surfaces are.
+    tuning
+        How large a capture may be.
     """
     if capture.scan_type != "exhaustive" or not is_lambertian:
         return False
-    # whatever the batches of this render: how a capture is cut must not show in it
-    if capture.n_sensors * capture.n_lasers * n_bins > MOST_SUMS:
+    # of the capture, not of the batches it is cut into: these must not change results
+    if capture.n_sensors * capture.n_lasers * n_bins > tuning.max_reciprocal_sums:
         return False
     if not np.array_equal(capture.laser_grid.positions, capture.sensor_grid.positions):
         return False

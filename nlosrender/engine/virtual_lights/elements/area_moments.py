@@ -1,25 +1,26 @@
-"""Cells summed up box by box: what clusters are made of, and what coarser clusters are made of in less time."""
+"""Area moments: elements summed up box by box, which clusters, and coarser moments, are made of.
+
+docs/virtual-lights.md, 4.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import coo_matrix, csr_matrix
 
-from nlosrender.engine.virtual_lights.elements.subdivision import Elements, middles
+from nlosrender.engine.virtual_lights.elements.struct_of_arrays import StructOfArrays
+from nlosrender.engine.virtual_lights.elements.subdivision import Elements, centroids
+from nlosrender.engine.virtual_lights.tuning import VirtualLightTuning
 from nlosrender.scene.pose import Float64
 
-GRID = 0.8  # edge of a box per size allowed
-TALL = 5.0  # height of a box per edge: a surface at 45 degrees to both sides rises by two
-SLOPES = 3.0  # width of the classes that slopes within a box are sorted into where it is rough, at coarseness 1
-RIDGE = 1e-6  # of the squared extent: keeps planes through points on a line defined
-SLIVER = 0.3  # of a box: less than that joins the box beside it
+RIDGE = 1e-6  # of the squared extent, ridge regression: keeps planes through points on a line defined
 PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))  # axes of the second moments
 PLACE = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])  # in PAIRS
 
-# what a step in each of the keys of a box adds to its code; any odd numbers without a pattern do
+# Multiplicative hashing: one step in each key of a box adds this to its code; odd numbers without a pattern.
 STEPS = np.array(
     [
         0xFAE9076D258CBCB7,
@@ -40,93 +41,92 @@ UInt64 = NDArray[np.uint64]
 
 
 @dataclass(frozen=True, eq=False)
-class AreaMoments:
-    """Cells, or groups of neighbouring ones that face along the same axis, as sums over their members.
+class AreaMoments(StructOfArrays):
+    """Elements, or groups of neighbouring ones that face along the same axis, as sums over their members.
 
-    A box stands upright on the axis its members' normals are nearest to: a tilted or bent surface is cut along the
-    two others only, into parallelograms.
+    A box stands upright on the axis that its members' normals are nearest to: a tilted or bent surface is cut along
+    the two other axes only, into parallelograms.
     """
 
     shapes: NDArray[np.uint32]  # (n,) index into the scene's shapes
-    scales: Int64  # (n,) binary logarithm of the size allowed, rounded down: that of boxes, so that they grow with it
-    levels: Float64  # (n,) how far off its plane the surface of a box may go at coarseness 1 [engine units]
+    scales: Int64  # (n,) binary logarithm of the size allowed, rounded down: that of the boxes
+    levels: Float64  # (n,) how far off its plane the surface of a box may go at scale 1 [engine units]
     facing: Int64  # (n,) twice the axis, + 1 where normals go along it
-    in_box: Float64  # (n, 3) middles [engine units]: across the box in two directions, and upright
+    in_box: Float64  # (n, 3) centres [engine units]: across the box in two directions, and upright
     places: Float64  # (n, 10) area, area times position, and times the products of its components, as ``PAIRS``
     slopes: Float64  # (n, 2) mean normals: their components across per that upright
     light: Float64  # (n, 9) area times geometric normal times shading normal, transposed
-    boxes: Float64  # (n,) how many boxes of coarseness 1 they cover
+    boxes: Float64  # (n,) how many boxes of scale 1 they cover
     representative: Int64  # (n,) a member, drawn by area
 
     @classmethod
-    def of(cls, elements: Elements, normals: Float64, areas: Float64, allowed: Float64) -> AreaMoments:
-        """Return cells as they are; parameters as for ``Merger``."""
-        centres, rows = middles(elements.corners), np.arange(len(areas))
-        scales = _scales(allowed)
+    def of(
+        cls, elements: Elements, normals: Float64, areas: Float64, allowed: Float64, tuning: VirtualLightTuning
+    ) -> AreaMoments:
+        """Return every element as a group of its own; parameters as for ``Merger``."""
+        centres, index = centroids(elements.corners), np.arange(len(areas))
         upright = np.abs(normals).argmax(axis=1)
-        along = normals[rows, upright]
-        light = (areas[:, None, None] * normals[:, :, None] * elements.shading_normals[:, None, :]).reshape(-1, 9)
+        light = areas[:, None, None] * normals[:, :, None] * elements.shading_normals[:, None, :]
         return cls(
-            elements.shapes,
-            scales,
+            shapes=elements.shapes,
+            scales=_scales(allowed),
             # a patch of this size at distance d is up to a quarter of this off a linear delay, for all its members
-            allowed**2 / elements.distances,
-            2 * upright + (along > 0),
-            _in_box(centres, upright),
-            _place_moments(elements.corners, centres, areas),
-            _slopes(normals, upright),
-            light,
-            covered_boxes(normals, areas, allowed),
-            rows,
+            levels=allowed**2 / elements.distances,
+            facing=2 * upright + (normals[index, upright] > 0),
+            in_box=_in_box(centres, upright),
+            places=_place_moments(elements.corners, centres, areas),
+            slopes=_slopes(normals, upright),
+            light=light.reshape(-1, 9),
+            boxes=covered_boxes(normals, areas, allowed, tuning),
+            representative=index,
         )
-
-    def __len__(self) -> int:
-        return len(self.representative)
 
     @property
     def areas(self) -> Float64:
         """Areas (n,) [engine units squared]."""
         return self.places[:, 0]
 
-    def at(self, chosen: NDArray[np.integer | np.bool_]) -> AreaMoments:
-        """Return the grains that are ``chosen``."""
-        return AreaMoments(*(getattr(self, field.name)[chosen] for field in fields(AreaMoments)))
+    @property
+    def upright(self) -> Int64:
+        """Axes (n,) that the boxes stand on."""
+        return self.facing // 2
 
-    def merged(self, patch_scale: float, generator: np.random.Generator) -> AreaMoments:
-        """Return one grain per box, of the sizes allowed times ``patch_scale``; ``generator`` draws its member."""
-        members = self._members(patch_scale)
+    def merged(self, patch_scale: float, generator: np.random.Generator, tuning: VirtualLightTuning) -> AreaMoments:
+        """Return one group per box, of the sizes allowed times ``patch_scale``; ``generator`` draws representatives."""
+        members = self._members(patch_scale, tuning)
         first = members.indices[members.indptr[:-1]]
-        places, light, facing = members @ self.places, members @ self.light, self.facing[first]
-        upright = facing // 2
+        places, light, upright = members @ self.places, members @ self.light, self.upright[first]
         normals = light.reshape(-1, 3, 3)[np.arange(len(first)), :, upright]  # weighted by their upright components
         return AreaMoments(
-            self.shapes[first],
-            self.scales[first],
-            self.levels[first],
-            facing,
-            _in_box(places[:, 1:4] / places[:, :1], upright),
-            places,
-            _slopes(normals, upright),
-            light,
-            members @ self.boxes,
-            self.representative[_drawn(members, self.areas, generator)],
+            shapes=self.shapes[first],
+            scales=self.scales[first],
+            levels=self.levels[first],
+            facing=self.facing[first],
+            in_box=_in_box(places[:, 1:4] / places[:, :1], upright),
+            places=places,
+            slopes=_slopes(normals, upright),
+            light=light,
+            boxes=members @ self.boxes,
+            representative=self.representative[_drawn(members, self.areas, generator)],
         )
 
-    def _members(self, patch_scale: float) -> csr_matrix:
-        """Return which of n grains are in which of m boxes: ones in a matrix (m, n)."""
-        across, other, height = self.in_box.T / (patch_scale * GRID * 2.0**self.scales)
-        keys = [np.floor(across), np.floor(other), np.floor(height / TALL), self.shapes, self.scales, self.facing]
+    def _members(self, patch_scale: float, tuning: VirtualLightTuning) -> csr_matrix:
+        """Return which of n groups are in which of m boxes: ones in a sparse matrix (m, n)."""
+        across, other, height = self.in_box.T / (patch_scale * tuning.cluster_box * 2.0**self.scales)
+        height = np.floor(height / tuning.cluster_box_height)
+        keys = [np.floor(across), np.floor(other), height, self.shapes, self.scales, self.facing]
         codes, number = _numbered(keys)
-        is_rough = self._slope_variance(number) > (SLOPES * patch_scale) ** 2 / 6  # of two axes, uniform in a class
+        slope_class = tuning.slope_class * patch_scale
+        is_rough = self._slope_variance(number) > slope_class**2 / 6  # of two axes, uniform in a class
         if is_rough.any():  # there one normal does for some directions of lasers and sensor points only
-            keys += [np.where(is_rough[number], np.rint(slope / (SLOPES * patch_scale)), 0) for slope in self.slopes.T]
+            keys += [np.where(is_rough[number], np.rint(slope / slope_class), 0) for slope in self.slopes.T]
             codes, number = _numbered(keys)
         off, level = self._off_plane(number), patch_scale * self.levels
         is_uneven = np.bincount(number, self.areas * off**2) > np.bincount(number, self.areas * level**2) / 12
         if is_uneven.any():  # surfaces above one another: between them there is no light, nor at one time for both
             keys.append(np.where(is_uneven[number], np.rint(off / level), 0))
             codes, number = _numbered(keys)
-        is_sliver = np.bincount(number, self.boxes) < SLIVER * patch_scale**2
+        is_sliver = np.bincount(number, self.boxes) < tuning.min_box_fill * patch_scale**2
         total = np.bincount(number, self.areas)
         offsets = [np.bincount(number, self.areas * (place % 1)) / total - 0.5 for place in (across, other)]
         number = _without_slivers(codes, is_sliver, np.array(offsets))[number]
@@ -134,16 +134,16 @@ class AreaMoments:
         return coo_matrix((np.ones(len(self)), (number, np.arange(len(self)))), shape=shape).tocsr()
 
     def _off_plane(self, number: Int64) -> Float64:
-        """Return the heights (n,) of grains over the best plane through all in the box that ``number`` (n,) names."""
+        """Return the heights (n,) of groups over the best plane through all in the box that ``number`` (n,) names."""
         places: Float64 = np.stack([np.bincount(number, column) for column in self.places.T], axis=1)
         upright = np.empty(len(places), np.int64)
-        upright[number] = self.facing // 2
+        upright[number] = self.upright
         plane = BoxPlane.of(places, upright)
         u, v, height = (self.in_box - plane.mean[number]).T
         return height - u * plane.slopes[number, 0] - v * plane.slopes[number, 1]
 
     def _slope_variance(self, number: Int64) -> Float64:
-        """Return the variance (m,) of the slopes, by area, of the grains in each box that ``number`` (n,) names."""
+        """Return the variance (m,) of the slopes, by area, of the groups in each box that ``number`` (n,) names."""
         total = np.bincount(number, self.areas)
         squares = np.bincount(number, self.areas * np.square(self.slopes).sum(axis=1)) / total
         return squares - sum(np.square(np.bincount(number, self.areas * slope) / total) for slope in self.slopes.T)
@@ -151,22 +151,22 @@ class AreaMoments:
 
 @dataclass(frozen=True, eq=False)
 class BoxPlane:
-    """The best planes through what lies in boxes, as far as it reaches, and its second moments."""
+    """Least-squares planes through what lies in boxes, and its second moments on them."""
 
-    mean: Float64  # (n, 3) middles: across in two directions, and upright
+    mean: Float64  # (n, 3) centres: across in two directions, and upright
     slopes: Float64  # (n, 2) along these two directions
-    moments: Float64  # (n, 3) about the middles: of the first direction, mixed, of the second
+    moments: Float64  # (n, 3) about the centres: of the first direction, mixed, of the second
 
     @classmethod
     def of(cls, places: Float64, upright: Int64) -> BoxPlane:
         """Return the planes of sums (n, 10) as ``AreaMoments.places``, with the axes (n,) that the boxes stand on."""
-        sums, rows = places[:, 1:] / np.maximum(places[:, :1], 1e-300), np.arange(len(places))
+        sums, index = places[:, 1:] / np.maximum(places[:, :1], 1e-300), np.arange(len(places))
         axes = [(upright + 1) % 3, (upright + 2) % 3, upright]
-        mean = np.stack([sums[rows, axis] for axis in axes], axis=1)
+        mean = np.stack([sums[index, axis] for axis in axes], axis=1)
 
         def moment(one: int, other: int) -> Float64:
-            """Return the second moments along two axes about the middles."""
-            return sums[rows, 3 + PLACE[axes[one], axes[other]]] - mean[:, one] * mean[:, other]
+            """Return the second moments along two axes about the centres."""
+            return sums[index, 3 + PLACE[axes[one], axes[other]]] - mean[:, one] * mean[:, other]
 
         uu, uv, vv, uh, vh = moment(0, 0), moment(0, 1), moment(1, 1), moment(0, 2), moment(1, 2)
         ridge = RIDGE * (uu + vv) + 1e-100
@@ -175,9 +175,9 @@ class BoxPlane:
         return cls(mean, np.stack(slopes, axis=1), np.stack([uu, uv, vv], axis=1))
 
 
-def covered_boxes(normals: Float64, areas: Float64, allowed: Float64) -> Float64:
-    """Return how many boxes of coarseness 1 cells (n,) cover; parameters as for ``Merger``."""
-    return areas * np.abs(normals).max(axis=1) / (GRID * 2.0 ** _scales(allowed)) ** 2
+def covered_boxes(normals: Float64, areas: Float64, allowed: Float64, tuning: VirtualLightTuning) -> Float64:
+    """Return how many boxes of scale 1 elements (n,) cover; parameters as for ``Merger``."""
+    return areas * np.abs(normals).max(axis=1) / (tuning.cluster_box * 2.0 ** _scales(allowed)) ** 2
 
 
 def _scales(allowed: Float64) -> Int64:
@@ -186,21 +186,20 @@ def _scales(allowed: Float64) -> Int64:
 
 def _in_box(vectors: Float64, upright: Int64) -> Float64:
     """Return the components (n, 3) of vectors along the two axes after ``upright``, and along it."""
-    rows = np.arange(len(upright))
-    return np.stack([vectors[rows, (upright + phase) % 3] for phase in (1, 2, 0)], axis=1)
+    return np.take_along_axis(vectors, (upright[:, None] + np.array([1, 2, 0])) % 3, axis=1)
 
 
 def _slopes(normals: Float64, upright: Int64) -> Float64:
     """Return the components (n, 2) of normals along the two axes after ``upright``, per that along it."""
-    across, along = _in_box(normals, upright)[:, :2], np.take_along_axis(normals, upright[:, None], axis=1)
-    return across / np.where(np.abs(along) > 1e-300, along, 1.0)
+    one, other, along = _in_box(normals, upright).T
+    return np.stack([one, other], axis=1) / np.where(np.abs(along) > 1e-300, along, 1.0)[:, None]
 
 
 def _place_moments(corners: Float64, centres: Float64, areas: Float64) -> Float64:
     """Return area, and area times centre and times second moments, of triangles (n, 10).
 
     The second moments of a triangle about the origin: the sum of v v^T over its corners and of 9 c c^T for its
-    centre c, / 12.
+    centroid c, / 12.
     """
     result = np.empty((len(areas), 10))
     result[:, 0], result[:, 1:4] = areas, areas[:, None] * centres
@@ -211,10 +210,9 @@ def _place_moments(corners: Float64, centres: Float64, areas: Float64) -> Float6
 
 
 def _numbered(keys: list[NDArray]) -> tuple[UInt64, Int64]:
-    """Return the sorted codes (m,) of all combinations of whole keys, and the index among them (n,).
+    """Return the sorted hash codes (m,) of all combinations of whole keys, and the index among them (n,).
 
-    A step of one in the k-th key is one of ``STEPS[k]`` in the code, modulo 2^64. Codes of different combinations
-    are as good as random to each other: among a million one pair is the same with probability 3e-8.
+    Codes of different combinations are as good as random: among a million one pair is the same with probability 3e-8.
     """
     codes = np.zeros(len(keys[0]), np.uint64)
     for key, step in zip(keys, STEPS[: len(keys)], strict=True):
@@ -223,7 +221,7 @@ def _numbered(keys: list[NDArray]) -> tuple[UInt64, Int64]:
 
 
 def _without_slivers(codes: UInt64, is_sliver: NDArray[np.bool_], offsets: Float64) -> Int64:
-    """Return the number (m,) of each box's grain when slivers join the box across the side that they lie along.
+    """Return the number (m,) of each box's group when slivers join the box across the side that they lie along.
 
     Parameters
     ----------
@@ -232,7 +230,7 @@ def _without_slivers(codes: UInt64, is_sliver: NDArray[np.bool_], offsets: Float
     is_sliver
         (m,) which boxes are nearly empty.
     offsets
-        (2, m) of the middles of what is in the boxes from theirs, in the two directions across.
+        (2, m) of the centre of what is in a box from the box's own, in the two directions across.
     """
     slivers = np.flatnonzero(is_sliver)
     offsets = offsets[:, slivers]
@@ -241,14 +239,14 @@ def _without_slivers(codes: UInt64, is_sliver: NDArray[np.bool_], offsets: Float
     neighbours = codes[slivers] + np.where(offsets[side, np.arange(len(slivers))] > 0, steps, -steps)
     beside = np.minimum(np.searchsorted(codes, neighbours), len(codes) - 1)
     joins = (codes[beside] == neighbours) & ~is_sliver[beside]
-    row_of_lane = np.arange(len(codes))
-    row_of_lane[slivers[joins]] = beside[joins]
-    return np.unique(row_of_lane, return_inverse=True)[1]
+    box = np.arange(len(codes))
+    box[slivers[joins]] = beside[joins]
+    return np.unique(box, return_inverse=True)[1]
 
 
 def _drawn(members: csr_matrix, areas: Float64, generator: np.random.Generator) -> Int64:
     """Draw one member of every box with probability in proportion to its area."""
     starts, ends = members.indptr[:-1], members.indptr[1:]
     cumulative = np.append(0.0, np.cumsum(areas[members.indices]))
-    at = cumulative[starts] + generator.random(len(starts)) * (cumulative[ends] - cumulative[starts])
-    return members.indices[np.clip(np.searchsorted(cumulative, at, side="right") - 1, starts, ends - 1)]
+    position = cumulative[starts] + generator.random(len(starts)) * (cumulative[ends] - cumulative[starts])
+    return members.indices[np.clip(np.searchsorted(cumulative, position, side="right") - 1, starts, ends - 1)]

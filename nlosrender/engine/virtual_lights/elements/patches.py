@@ -1,80 +1,107 @@
-"""Patches: pieces of the hidden surfaces small enough to be gathered as one light each."""
+"""Patches: parts of the hidden surfaces small enough to be gathered as one light each. docs/virtual-lights.md, 2."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from nlosrender.engine.virtual_lights.elements.subdivision import Elements
+from nlosrender.engine.virtual_lights.elements.struct_of_arrays import StructOfArrays
+from nlosrender.engine.virtual_lights.elements.subdivision import Elements, normals_and_areas
 from nlosrender.scene.pose import Float64
 
 
 @dataclass(frozen=True, eq=False)
-class Patches:
-    """Triangular patches of the hidden geometry [engine units].
+class SurfacePoints(StructOfArrays):
+    """Points of the hidden geometry [engine units]."""
+
+    positions: Float64  # (n, 3)
+    normals: Float64  # (n, 3) geometric, unit
+    shapes: NDArray[np.uint32]  # (n,) index into the scene's shapes
+    primitives: NDArray[np.uint32]  # (n,) triangle of a mesh, 0 on analytic shapes
+    barycentric: Float64  # (n, 2) within that triangle
+
+
+@dataclass(frozen=True, eq=False)
+class Patches(StructOfArrays):
+    """Triangular patches, and parallelograms of clusters [engine units].
 
     ``areas``, ``centres`` and ``normals`` are those of the true surface where it is curved; ``corners`` are raised to
     its mean height over them.
     """
 
-    corners: Float64  # (n, 3, 3); of clusters three in a row of a parallelogram's four
+    corners: Float64  # (n, 3, 3) of clusters three successive ones of a parallelogram's four
     areas: Float64  # (n,)
     centres: Float64  # (n, 3)
     normals: Float64  # (n, 3) geometric, unit
     shapes: NDArray[np.uint32]  # (n,) index into the scene's shapes
     primitives: NDArray[np.uint32]  # (n,) triangle of a mesh, 0 on analytic shapes
-    barycentric: Float64  # (n, 2) the centre within that triangle
-    corner_barycentric: Float64  # (n, 3, 2) the corners within that triangle; of clusters, and off meshes, the centre
+    barycentric: Float64  # (n, 2) of the centre within that triangle
+    corner_barycentric: Float64  # (n, 3, 2) of the corners; of clusters, and off meshes, the centre's
     members: Float64  # (n, 3) where shadow rays of a cluster end; elsewhere the centre
     member_normals: Float64  # (n, 3) geometric, there
     is_cluster: NDArray[np.bool_]  # (n,)
 
-    def __len__(self) -> int:
-        return len(self.areas)
+    @classmethod
+    def none(cls) -> Patches:
+        """Return no patches."""
+        none = np.zeros((0, 3))
+        return cls.triangles(np.zeros((0, 3, 3)), np.zeros(0), none, none, np.zeros(0, np.uint32))
 
-    def at(self, index: NDArray[np.integer]) -> Patches:
-        """Return the patches at ``index``."""
-        return Patches(*(getattr(self, field.name)[index] for field in fields(Patches)))
+    def points(self, positions: Float64, barycentric: Float64) -> SurfacePoints:
+        """Return one point per patch; parameters (n, 3) and (n, 2)."""
+        return SurfacePoints(positions, self.normals, self.shapes, self.primitives, barycentric)
 
     @classmethod
-    def joined(cls, parts: list[Patches]) -> Patches:
-        """Return the patches of all parts."""
-        if not parts:
-            none, index = np.zeros((0, 3)), np.zeros(0, np.uint32)
-            corners, numbers, pairs = np.zeros((0, 3, 3)), np.zeros(0), np.zeros((0, 2))
-            places = np.zeros((0, 3, 2))
-            return cls(corners, numbers, none, none, index, index, pairs, places, none, none, index.astype(bool))
-        names = [field.name for field in fields(cls)]
-        return cls(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
+    def triangles(
+        cls,
+        corners: Float64,
+        areas: Float64,
+        centres: Float64,
+        normals: Float64,
+        shapes: NDArray[np.uint32],
+        primitives: NDArray[np.uint32] | None = None,
+        corner_barycentric: Float64 | None = None,
+    ) -> Patches:
+        """Return patches that are no clusters; without the last two, of analytic shapes."""
+        count = len(areas)
+        if primitives is None or corner_barycentric is None:
+            primitives, corner_barycentric = np.zeros(count, np.uint32), np.zeros((count, 3, 2))
+        return cls(
+            corners=corners,
+            areas=areas,
+            centres=centres,
+            normals=normals,
+            shapes=shapes,
+            primitives=primitives,
+            barycentric=corner_barycentric.mean(axis=1),
+            corner_barycentric=corner_barycentric,
+            members=centres,
+            member_normals=normals,
+            is_cluster=np.zeros(count, bool),
+        )
 
 
-def split_cells(elements: Elements, splits: NDArray[np.int64]) -> Patches:
-    """Cut every cell into ``splits`` squared similar triangles."""
-    normals = np.cross(elements.corners[:, 1] - elements.corners[:, 0], elements.corners[:, 2] - elements.corners[:, 0])
-    lengths = np.linalg.norm(normals, axis=1)
-    parts = []
+def split_elements(elements: Elements, splits: NDArray[np.int64]) -> Patches:
+    """Cut every element into ``splits`` (n,) squared similar triangles."""
+    normals, areas = normals_and_areas(elements.corners)
+    parts = [Patches.none()]
     for n in np.unique(splits):
-        row_points = np.flatnonzero(splits == n)
-        weights = split_weights(int(n))  # (n^2, 3 corners, 3 barycentric)
-        corners = np.einsum("pkb,tbx->tpkx", weights, elements.corners[row_points]).reshape(-1, 3, 3)
-        barycentric = np.einsum("pkb,tbx->tpkx", weights, elements.weights[row_points])[..., 1:].reshape(-1, 3, 2)
-        repeated = np.repeat(row_points, n * n)
-        units = normals[repeated] / lengths[repeated, None]
+        index = np.flatnonzero(splits == n)
+        weights = split_weights(int(n))
+        corners = np.einsum("pkb,tbx->tpkx", weights, elements.corners[index]).reshape(-1, 3, 3)
+        barycentric = np.einsum("pkb,tbx->tpkx", weights, elements.weights[index])[..., 1:].reshape(-1, 3, 2)
+        index = np.repeat(index, n * n)
         parts.append(
-            Patches(
+            Patches.triangles(
                 corners,
-                lengths[repeated] / (2 * n * n),
+                areas[index] / (n * n),
                 corners.mean(axis=1),
-                units,
-                elements.shapes[repeated],
-                elements.primitives[repeated],
-                barycentric.mean(axis=1),
+                normals[index],
+                elements.shapes[index],
+                elements.primitives[index],
                 barycentric,
-                corners.mean(axis=1),
-                units,
-                np.zeros(len(repeated), bool),
             )
         )
     return Patches.joined(parts)

@@ -1,8 +1,9 @@
-"""Spheres and cylinders as patches with the true areas and normals, and points of their cells brought onto them."""
+"""Spheres and cylinders as patches with the true areas and normals, and points of their elements brought onto them."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from itertools import combinations
 
 import mitsuba as mi
 import numpy as np
@@ -12,8 +13,9 @@ from nlosrender.engine.virtual_lights.elements.subdivision import WallDistance
 from nlosrender.scene.loading.round_surfaces import RoundSurface
 from nlosrender.scene.pose import Float64
 
-FEWEST_AROUND = 6  # parts of a cylinder's circumference
-EDGE = 1.052  # of the icosahedron in its unit sphere
+ICOSAHEDRON_EDGE = 1.052  # in the unit sphere: 4 / sqrt(10 + 2 sqrt(5)), rounded up
+# Of a cylinder's circumference. With fewer, the normals over one patch differ by more than 60 degrees.
+MIN_SEGMENTS = 6
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,21 +66,22 @@ class RoundShape:
         return replace(patches, corners=patches.corners + outward[:, None])
 
     def _splits(self, allowed: float) -> int:
-        return int(np.ceil(EDGE * abs(self.radius) / allowed))
+        return int(np.ceil(ICOSAHEDRON_EDGE * abs(self.radius) / allowed))
 
     def _rings(self, across: float, along: float) -> tuple[int, int]:
         # a square's diagonal is the size of its triangles
-        n_around = max(int(np.ceil(np.sqrt(2) * 2 * np.pi * abs(self.radius) / across)), FEWEST_AROUND)
-        return n_around, max(int(np.ceil(np.sqrt(2) * np.linalg.norm(self.axis) / along)), 1)
+        n_around = int(np.ceil(np.sqrt(2) * 2 * np.pi * abs(self.radius) / across))
+        n_along = int(np.ceil(np.sqrt(2) * np.linalg.norm(self.axis) / along))
+        return max(n_around, MIN_SEGMENTS), max(n_along, 1)
 
 
 def onto_round_shapes(positions: Float64, normals: Float64, rows: Float64) -> tuple[Float64, Float64, Float64]:
-    """Bring points of cells onto the round shapes they belong to.
+    """Bring points of elements onto the round shapes they belong to.
 
     Parameters
     ----------
     positions, normals
-        (n, 3) points of flat cells and the cells' unit normals.
+        (n, 3) points of flat elements and the elements' unit normals.
     rows
         (n, 7) ``RoundShape.row`` of the shape each belongs to; zeros on flat surfaces.
 
@@ -123,22 +126,15 @@ def _sphere(shape: RoundShape, n: int) -> tuple[Patches, Float64]:
     solid_angle = 2 * np.arctan2(triple, denominator)
     direction = unit.mean(axis=1)
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
-    centre, radius, outside = shape.centre, abs(shape.radius), np.sign(shape.radius)
-    count = len(unit)
-    squares = np.square(unit - np.roll(unit, 1, axis=1)).sum(axis=(1, 2))
-    patches = Patches(
+    centre, radius = shape.centre, abs(shape.radius)
+    patches = Patches.triangles(
         centre + radius * unit,
         radius**2 * solid_angle,
         centre + radius * direction,
-        outside * direction,
-        np.full(count, shape.index, np.uint32),
-        np.zeros(count, np.uint32),
-        np.zeros((count, 2)),
-        np.zeros((count, 3, 2)),
-        centre + radius * direction,
-        outside * direction,
-        np.zeros(count, bool),
+        np.sign(shape.radius) * direction,
+        np.full(len(unit), shape.index, np.uint32),
     )
+    squares = np.square(unit - np.roll(unit, 1, axis=1)).sum(axis=(1, 2))
     return patches, radius * squares / 24
 
 
@@ -151,7 +147,7 @@ def _cylinder(shape: RoundShape, around: int, along: int) -> tuple[Patches, Floa
         As of ``_sphere``: a chord s lies s^2 / (12 R) below its arc on average.
     """
     length = float(np.linalg.norm(shape.axis))
-    axis, radius, outside = shape.axis / length, abs(shape.radius), np.sign(shape.radius)
+    axis, radius = shape.axis / length, abs(shape.radius)
     first = np.cross(axis, np.eye(3)[np.abs(axis).argmin()])
     first /= np.linalg.norm(first)
     second = np.cross(axis, first)
@@ -170,18 +166,12 @@ def _cylinder(shape: RoundShape, around: int, along: int) -> tuple[Patches, Floa
     radial = centres - shape.centre
     radial -= (radial @ axis)[:, None] * axis
     count = len(corners)
-    patches = Patches(
+    patches = Patches.triangles(
         corners,
         np.full(count, 2 * np.pi * radius * length / count),
         centres,
-        outside * radial / radius,
+        np.sign(shape.radius) * radial / radius,
         np.full(count, shape.index, np.uint32),
-        np.zeros(count, np.uint32),
-        np.zeros((count, 2)),
-        np.zeros((count, 3, 2)),
-        centres,
-        outside * radial / radius,
-        np.zeros(count, bool),
     )
     return patches, np.full(count, radius * (2 * np.sin(np.pi / around)) ** 2 / 12)
 
@@ -195,10 +185,8 @@ def _icosahedron() -> Float64:
     edge = 2 / np.sqrt(1 + golden**2)
     near = np.abs(np.linalg.norm(vertices[:, None] - vertices[None], axis=-1) - edge) < 1e-9
     faces = []
-    for i in range(12):
-        for j in range(i + 1, 12):
-            for k in range(j + 1, 12):
-                if near[i, j] and near[j, k] and near[i, k]:
-                    a, b, c = vertices[i], vertices[j], vertices[k]
-                    faces.append((a, b, c) if np.dot(a, np.cross(b, c)) > 0 else (a, c, b))
+    for i, j, k in combinations(range(12), 3):
+        if near[i, j] and near[j, k] and near[i, k]:
+            a, b, c = vertices[[i, j, k]]
+            faces.append((a, b, c) if np.dot(a, np.cross(b, c)) > 0 else (a, c, b))
     return np.array(faces)

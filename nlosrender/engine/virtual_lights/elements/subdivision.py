@@ -1,4 +1,7 @@
-"""Triangles, quartered where a laser or sensor point is near: the units that patches and sites are made of."""
+"""Elements: triangles, quartered until none is longer than its distance from the nearest laser or sensor point.
+
+docs/virtual-lights.md, 3. Patches and VPLs are made of them.
+"""
 
 from __future__ import annotations
 
@@ -12,53 +15,41 @@ from scipy.spatial import cKDTree
 
 from nlosrender.capture.grids import Capture, PointGrid
 from nlosrender.engine.launch.surface_sampler import facing_triangles
+from nlosrender.engine.virtual_lights.elements.struct_of_arrays import StructOfArrays
 from nlosrender.scene.build import BuiltScene
 from nlosrender.scene.pose import Float64
 
-NEAREST = 1e-3  # engine units: nothing is cut finer where the nearest laser or sensor point is in its plane
-LEAST = 1e-8  # engine units: nothing is cut any finer elsewhere
-ROUNDED = 1e-7  # engine units: float32 knows the height of a point over a tilted plane no better
-ROUNDING = 1e-9  # engine units: points that lie so near to those of a regular grid are that grid
-NEIGHBOURS = 8  # points asked for the nearest that is not in the plane of a cell
-IN_PLANE = 1e-5  # cosine below which a cell of the wall is in the plane of a point, and neither lights nor sees it
+# Engine units, and what follows from float32.
+MIN_IN_PLANE_DISTANCE = 1e-3  # where the nearest point lies in the element's plane: they exchange no light
+MIN_DISTANCE = 1e-8  # elsewhere: float32 points on a wall of size 1 are 6e-8 apart
+HEIGHT_ROUNDING = 1e-7  # of a float32 point over a tilted plane
+GRID_TOLERANCE = 1e-9  # float64 points this close to those of a regular grid are that grid
+N_NEIGHBOURS = 8  # of a point of a mesh wall: more than share one of its triangles are searched for in vain
+MIN_COSINE = 1e-5  # below it an element of the wall lies in the plane of a wall point: no light goes between them
 
 
 @dataclass(frozen=True, eq=False)
-class Elements:
-    """Triangles, or quarters of quarters of them, no longer than their distance from any laser or sensor point."""
+class Elements(StructOfArrays):
+    """Triangles, or quarters of quarters of them [engine units]."""
 
-    corners: Float64  # (n, 3, 3) [engine units]
+    corners: Float64  # (n, 3, 3)
     weights: Float64  # (n, 3, 3) barycentric coordinates of the corners in the mesh's triangle
     shading: Float64  # (n, 3, 3) shading normals at the corners, as the mesh interpolates them
     shapes: NDArray[np.uint32]  # (n,) index into the scene's shapes
     primitives: NDArray[np.uint32]  # (n,) triangle of the mesh
     sizes: Float64  # (n,) longest edge
-    distances: Float64  # (n,) of the centre from the nearest laser or sensor point, at least LEAST
+    distances: Float64  # (n,) of the centroid from the nearest laser or sensor point, at least MIN_DISTANCE
 
-    def at(self, chosen: NDArray[np.bool_]) -> Elements:
-        """Return the cells that are ``chosen``."""
-        if chosen.all():
-            return self
-        return Elements(*(values[chosen] for values in self._arrays()))
+    @classmethod
+    def none(cls) -> Elements:
+        """Return no elements."""
+        none, index, numbers = np.zeros((0, 3, 3)), np.zeros(0, np.uint32), np.zeros(0)
+        return cls(none, none, none, index, index, numbers, numbers)
 
     @property
     def shading_normals(self) -> Float64:
-        """Unit shading normals (n, 3) at the middles."""
-        normals = middles(self.shading)
-        return normals / np.maximum(np.linalg.norm(normals, axis=1), 1e-300)[:, None]
-
-    @classmethod
-    def joined(cls, parts: list[Elements]) -> Elements:
-        """Return the cells of all parts."""
-        if len(parts) == 1:
-            return parts[0]
-        if not parts:
-            none, index = np.zeros((0, 3, 3)), np.zeros(0, np.uint32)
-            return cls(none, none, none, index, index, np.zeros(0), np.zeros(0))
-        return cls(*(np.concatenate(values) for values in zip(*(part._arrays() for part in parts), strict=True)))
-
-    def _arrays(self) -> tuple[NDArray, ...]:
-        return self.corners, self.weights, self.shading, self.shapes, self.primitives, self.sizes, self.distances
+        """Unit shading normals (n, 3) at the centroids."""
+        return unit_vectors(centroids(self.shading))
 
 
 @dataclass(frozen=True)
@@ -97,16 +88,16 @@ class WallDistance:
     """
 
     def __init__(self, capture: Capture, unit: float):
-        grids = {id(grid): grid for grid in (capture.sensor_grid, capture.laser_grid)}
-        points = np.concatenate([grid.positions.reshape(-1, 3) / unit for grid in grids.values()])
+        grids = {id(grid): grid for grid in (capture.sensor_grid, capture.laser_grid)}.values()
+        points = np.concatenate([grid.positions.reshape(-1, 3) / unit for grid in grids])
         self._points = points.astype(np.float32).astype(np.float64)  # as the device knows them: it matters close by
-        self._normals = np.concatenate([grid.normals.reshape(-1, 3) for grid in grids.values()])
+        self._normals = np.concatenate([grid.normals.reshape(-1, 3) for grid in grids])
         self._regular: list[RegularPoints] = []
         self._trees: list[cKDTree] = []
-        for grid in grids.values():
+        for grid in grids:
             regular = RegularPoints.of(grid, unit)
             positions = grid.positions.reshape(-1, 3) / unit
-            if regular.squared_distance(positions).max() < ROUNDING**2:
+            if regular.squared_distance(positions).max() < GRID_TOLERANCE**2:
                 self._regular.append(regular)
             else:
                 self._trees.append(cKDTree(positions))
@@ -122,78 +113,83 @@ class WallDistance:
         return np.sqrt(np.min(squares, axis=0))
 
     def of_planes(self, points: Float64, normals: Float64) -> Float64:
-        """Return the distance (n,) of planes, given by points and normals (n, 3), close to the wall.
+        """Return the distance (n,) of planes close to the wall, given by points and normals (n, 3).
 
-        At least ``NEAREST`` where the nearest laser or sensor point is in the plane as far as float32 knows: heights
-        over a plane that is parallel to a planar wall it knows exactly.
+        At least ``MIN_IN_PLANE_DISTANCE`` where the nearest laser or sensor point is in the plane as far as float32
+        knows. Heights over a plane that is parallel to a planar wall are exact in float32.
         """
         distances, nearest = self._tree.query(points)
         heights = np.abs(np.einsum("nx,nx->n", points - self._points[nearest], normals))
         tilts = np.linalg.norm(np.cross(normals, self._normals[nearest]), axis=1)
-        return np.maximum(distances, np.where(heights > LEAST + ROUNDED * tilts, LEAST, NEAREST))
+        is_off_plane = heights > MIN_DISTANCE + HEIGHT_ROUNDING * tilts
+        return np.maximum(distances, np.where(is_off_plane, MIN_DISTANCE, MIN_IN_PLANE_DISTANCE))
 
     def out_of_plane(self, points: Float64) -> Float64:
         """Return the distance (n,) of points of the wall (n, 3) from the nearest one whose plane they are not in.
 
-        Where there is none among ``NEIGHBOURS``, the distance of the last of them: no other is nearer.
+        If all ``N_NEIGHBOURS`` nearest ones are in their planes, the distance of the last: no other one is nearer.
         """
-        count = min(NEIGHBOURS, len(self._points))
+        count = min(N_NEIGHBOURS, len(self._points))
         distances, index = self._tree.query(points, k=np.arange(1, count + 1))
         heights = np.einsum("nkx,nkx->nk", points[:, None] - self._points[index], self._normals[index])
-        apart = np.abs(heights) > IN_PLANE * distances
+        apart = np.abs(heights) > MIN_COSINE * distances
         apart[:, -1] = True
         return distances[np.arange(len(points)), apart.argmax(axis=1)]
 
 
 def elements_of_mesh(built: BuiltScene, index: int, mesh: mi.Mesh) -> Elements:
-    """Return the triangles of shape ``index`` that the wall may see lit, one cell each, at no distance yet."""
+    """Return the triangles of shape ``index`` that the wall may see lit, with distances still to be found."""
     corners, primitives = facing_triangles(built, mesh)
     count = len(corners)
-    weights = np.broadcast_to(np.eye(3), corners.shape)
-    shapes = np.full(count, index, np.uint32)
-    shading = _shading_normals(mesh, corners, primitives)
-    return Elements(corners, weights, shading, shapes, primitives, longest_edges(corners), np.zeros(count))
+    return Elements(
+        corners=corners,
+        weights=np.broadcast_to(np.eye(3), corners.shape),
+        shading=_shading_normals(mesh, corners, primitives),
+        shapes=np.full(count, index, np.uint32),
+        primitives=primitives,
+        sizes=longest_edges(corners),
+        distances=np.zeros(count),
+    )
 
 
 def partition_by_size(
-    elements: Elements, distance: WallDistance, wall_index: int | None, least: float = 0.0
+    elements: Elements, distance: WallDistance, wall_index: int | None, min_size: float = 0.0
 ) -> tuple[Elements, Elements]:
-    """Return the cells that ``subdivide`` leaves as they are, with their distances, and those that it quarters."""
+    """Return the elements that ``subdivide`` leaves as they are, with their distances, and those that it quarters."""
     distances = _distances(elements, distance, wall_index)
-    large = elements.sizes > np.maximum(distances, least)
-    return replace(elements, distances=distances).at(~large), elements.at(large)
+    large = elements.sizes > np.maximum(distances, min_size)
+    return replace(elements, distances=distances).select(~large), elements.select(large)
 
 
-def subdivide(elements: Elements, distance: WallDistance, wall_index: int | None, least: float = 0.0) -> Elements:
-    """Quarter cells until none is longer than its distance from the nearest point.
+def subdivide(elements: Elements, distance: WallDistance, wall_index: int | None, min_size: float = 0.0) -> Elements:
+    """Quarter elements until none is longer than its distance from the nearest point.
 
     Parameters
     ----------
     elements
-        Triangles or parts of them; their distances are not looked at.
+        Triangles or parts of them; their distances are found anew.
     distance
-        Tells them.
+        From the laser and sensor points.
     wall_index
-        Of the wall among the scene's shapes. The points lie on those of the wall: there only points in the planes of
-        other triangles count.
-    least
-        No cell is quartered that is not longer than this [engine units].
+        Of the wall among the scene's shapes. On it, only points in the planes of other triangles count.
+    min_size
+        Elements up to this size are not quartered [engine units].
     """
     done: list[Elements] = []
-    while len(elements.sizes):
-        small, large = partition_by_size(elements, distance, wall_index, least)
+    while True:
+        small, large = partition_by_size(elements, distance, wall_index, min_size)
         done.append(small)
-        if not len(large.sizes):
+        if not len(large):
             break
         corners = _similar_quarters(large.corners)
         elements = Elements(
-            corners,
-            _similar_quarters(large.weights),
-            _similar_quarters(large.shading),
-            np.tile(large.shapes, 4),
-            np.tile(large.primitives, 4),
-            longest_edges(corners),
-            np.zeros(len(corners)),
+            corners=corners,
+            weights=_similar_quarters(large.weights),
+            shading=_similar_quarters(large.shading),
+            shapes=np.tile(large.shapes, 4),
+            primitives=np.tile(large.primitives, 4),
+            sizes=longest_edges(corners),
+            distances=np.zeros(len(corners)),
         )
     return Elements.joined(done)
 
@@ -208,15 +204,20 @@ def _shading_normals(mesh: mi.Mesh, corners: Float64, primitives: NDArray[np.uin
 
 
 def _distances(elements: Elements, distance: WallDistance, wall_index: int | None) -> Float64:
-    centres = middles(elements.corners)
+    centres = centroids(elements.corners)
     distances = np.empty(len(centres))
     on_wall = elements.shapes == (-1 if wall_index is None else wall_index)
-    distances[on_wall] = np.maximum(distance.out_of_plane(centres[on_wall]), NEAREST)
+    distances[on_wall] = np.maximum(distance.out_of_plane(centres[on_wall]), MIN_IN_PLANE_DISTANCE)
     hidden = np.flatnonzero(~on_wall)
     distances[hidden] = distance(centres[hidden])
-    close = hidden[distances[hidden] < NEAREST]
+    close = hidden[distances[hidden] < MIN_IN_PLANE_DISTANCE]
     distances[close] = distance.of_planes(centres[close], normals_and_areas(elements.corners[close])[0])
     return distances
+
+
+def unit_vectors(vectors: Float64) -> Float64:
+    """Return vectors (n, 3) at unit length; zero stays zero."""
+    return vectors / np.maximum(np.linalg.norm(vectors, axis=1), 1e-300)[:, None]
 
 
 def normals_and_areas(triangles: Float64) -> tuple[Float64, Float64]:
@@ -229,10 +230,10 @@ def normals_and_areas(triangles: Float64) -> tuple[Float64, Float64]:
 def longest_edges(triangles: Float64) -> Float64:
     """Return the length (n,) of the longest edge of triangles (n, 3, 3)."""
     squares = [np.square(triangles[:, k] - triangles[:, k - 1]).sum(axis=1) for k in range(3)]
-    return np.sqrt(np.maximum(np.maximum(*squares[:2]), squares[2]))
+    return np.sqrt(np.maximum.reduce(squares))
 
 
-def middles(triangles: Float64) -> Float64:
+def centroids(triangles: Float64) -> Float64:
     """Return the means (n, m) of the corners of triangles (n, 3, m); numpy's own mean takes five times as long."""
     return (triangles[:, 0] + triangles[:, 1] + triangles[:, 2]) / 3
 

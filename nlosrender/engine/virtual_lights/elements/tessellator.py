@@ -1,8 +1,9 @@
 """Hidden surfaces, and a wall that sees itself -> patches, as fine as asked.
 
 A patch of size h at distance d from the nearest laser or sensor point has an error of order (h/d)^2 in its geometry
-and of h^2/(4 d w) bins in its delay, with w the bin width: within a triangle the delay is taken as linear. One number,
-``patch_scale``, scales the size allowed by both, so that the error falls with its square.
+and of h^2/(4 d w) bins in its delay, with w the bin width: within a triangle the delay is taken as linear
+(docs/virtual-lights.md, 2 and 3). One number, ``patch_scale``, scales the size allowed by both, so that the error falls
+with its square.
 """
 
 from __future__ import annotations
@@ -20,20 +21,19 @@ from nlosrender.engine.virtual_lights.elements.round_shapes import RoundShape
 from nlosrender.engine.virtual_lights.elements.sensor_regions import regions_of
 from nlosrender.engine.virtual_lights.elements.size_field import SizedElements, SizeField
 from nlosrender.engine.virtual_lights.elements.subdivision import Elements, WallDistance, elements_of_mesh, subdivide
+from nlosrender.engine.virtual_lights.tuning import DEFAULT_TUNING, VirtualLightTuning
 from nlosrender.scene.build import BuiltScene
 from nlosrender.scene.loading.mitsuba_shapes import WALL_ID
 from nlosrender.scene.loading.round_surfaces import ROUND_PLUGINS
 
-MAX_PATCHES = 2_000_000  # of one gather; beyond it the path engine is the better choice
-MOST_KEPT = 200_000  # patches of one resolution that are kept for the next call
-MOST_AT_ONCE = 500_000  # patches of regions that are made together
+MAX_PATCHES, MOST_KEPT = DEFAULT_TUNING.max_patches, DEFAULT_TUNING.max_kept_patches
 
 
 class Tessellator:
     """Cuts the hidden geometry of one scene, and a wall that sees itself, into patches, as fine as asked.
 
-    Triangles are first quartered until none is longer than its distance from the nearest laser or sensor point
-    (the *cells*), then cut into equal parts, or merged where they are far smaller than need be.
+    Triangles are quartered until none is longer than its distance from the nearest laser or sensor point (*elements*),
+    then cut into equal parts, or merged where they are far smaller than need be.
 
     Parameters
     ----------
@@ -44,11 +44,21 @@ class Tessellator:
     bin_width
         Bin width [engine units].
     may_divide
-        Whether parts of the sensor grid may have patches of their own, where that is cheaper.
+        Whether regions of the sensor grid may have patches of their own, where that is cheaper.
+    tuning
+        Sizes and limits.
     """
 
-    def __init__(self, built: BuiltScene, capture: Capture, bin_width: float, *, may_divide: bool = True):
-        self.built, self.capture = built, capture
+    def __init__(
+        self,
+        built: BuiltScene,
+        capture: Capture,
+        bin_width: float,
+        *,
+        may_divide: bool = True,
+        tuning: VirtualLightTuning = DEFAULT_TUNING,
+    ):
+        self.built, self.capture, self.tuning = built, capture, tuning
         self.distance = WallDistance(capture, built.unit)
         self.reach = max(capture.sensor_grid.size) / (2 * built.unit)  # half the sensor grid's extent [engine units]
         triangles: list[Elements] = []
@@ -64,8 +74,8 @@ class Tessellator:
             else:
                 self.round_shapes.append(RoundShape.of(index, shape))
         light = capture.laser_grid.positions.reshape(-1, 3).mean(axis=0) / built.unit
-        self.size_field = SizeField(bin_width, self.wall_index, light)
-        joined = Elements.joined(triangles)
+        self.size_field = SizeField(bin_width, self.wall_index, light, tuning)
+        joined = Elements.joined(triangles or [Elements.none()])
         self.elements = subdivide(joined, self.distance, self.wall_index)
         whole = SizedElements(self.elements, self.size_field)
         self.regions = regions_of(capture, built.unit, self.distance, joined, whole) if may_divide else None
@@ -74,7 +84,7 @@ class Tessellator:
         self._saved = lru_cache(maxsize=2)(self._make)
 
     def set_up(self) -> None:
-        """Sum up the cells that are merged at any resolution, if there are any."""
+        """Sum up the elements that are merged at any scale, if there are any."""
         for elements in (self.shared, *(self.regions.near if self.regions else ())):
             elements.set_up()
 
@@ -83,7 +93,7 @@ class Tessellator:
 
         Where there are regions, these are the patches that all of them share.
         """
-        if sum(self.shared.counts(patch_scale)) > MOST_KEPT:
+        if sum(self.shared.counts(patch_scale)) > self.tuning.max_kept_patches:
             return self._make(patch_scale)
         return self._saved(patch_scale)
 
@@ -94,8 +104,8 @@ class Tessellator:
         labels: list[int] = []
         parts: list[Patches] = []
         for label in wanted:
-            patches = Patches.joined(self.regions.near[label].patches(patch_scale))
-            if parts and sum(map(len, parts)) + len(patches) > MOST_AT_ONCE:
+            patches = self.regions.near[label].patches(patch_scale)
+            if parts and sum(map(len, parts)) + len(patches) > self.tuning.max_regional_patches:
                 yield labels, parts
                 labels, parts = [], []
             labels.append(label)
@@ -105,10 +115,10 @@ class Tessellator:
 
     def _make(self, patch_scale: float) -> Patches:
         on_round = [shape.patches(*self._allowed_on(shape, patch_scale)) for shape in self.round_shapes]
-        return Patches.joined([*self.shared.patches(patch_scale), *on_round])
+        return Patches.joined([self.shared.patches(patch_scale), *on_round])
 
     def count(self, patch_scale: float) -> int:
-        """Return about how many patches a sensor point would gather, on average; exactly where none merge."""
+        """Return about how many patches a sensor point would gather, on average; exact where none merge."""
         return sum(self.counts(patch_scale))
 
     def counts(self, patch_scale: float) -> tuple[int, ...]:
@@ -118,7 +128,7 @@ class Tessellator:
 
     @property
     def nearest(self) -> float:
-        """Distance from the points to the nearest hidden cell's centre, or round shape [engine units]."""
+        """Distance from the points to the nearest hidden element's centroid, or round shape [engine units]."""
         return min([float(self.elements.distances[self._is_hidden].min(initial=np.inf)), self.nearest_round])
 
     @property
@@ -129,19 +139,19 @@ class Tessellator:
 
     @cached_property
     def nearest_to_laser(self) -> float:
-        """Distance from the laser points to the nearest hidden cell's centre, or round shape [engine units]."""
+        """Distance from the laser points to the nearest hidden element's centroid, or round shape [engine units]."""
         lasers = WallDistance(replace(self.capture, sensor_grid=self.capture.laser_grid), self.built.unit)
         on_round = [shape.nearest(lasers) for shape in self.round_shapes if shape.index != self.wall_index]
         centres = self.elements.corners[self._is_hidden].mean(axis=1)
         return min([float(lasers(centres).min(initial=np.inf)) if len(centres) else math.inf, *on_round])
 
     @property
-    def n_round_cells(self) -> int:
-        """Cells of all round shapes: a needle has as many as it is longer than it is wide."""
+    def n_round_elements(self) -> int:
+        """Elements of all round shapes: a needle has as many as it is longer than it is wide."""
         return sum(shape.count(*self._allowed_on(shape, 1.0)) for shape in self.round_shapes)
 
-    def round_cells(self) -> list[tuple[RoundShape, Patches]]:
-        """Return every round shape, and its cells, whose corners lie on it."""
+    def round_elements(self) -> list[tuple[RoundShape, Patches]]:
+        """Return every round shape, and its elements, whose corners lie on it."""
         return [(shape, shape.patches(*self._allowed_on(shape, 1.0), raised=False)) for shape in self.round_shapes]
 
     def _allowed_on(self, shape: RoundShape, patch_scale: float) -> tuple[float, float]:
@@ -150,6 +160,7 @@ class Tessellator:
             # cos cos / r^2 varies over the radius only, however near: 1 / (4 radius^2) between points of a sphere
             nearest = abs(shape.radius)
         else:
+            # at most 20 * 9^2 patches of a ball at scale 1, however near
             nearest = max(shape.nearest(self.distance), abs(shape.radius) / 8)
         straight = float(self.size_field.allowed_size(np.array([nearest]))[0])
         return patch_scale * min(straight, abs(shape.radius)), patch_scale * straight

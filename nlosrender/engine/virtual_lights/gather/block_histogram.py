@@ -1,6 +1,6 @@
-"""The gather's histogram: rows of blocks of bins, so that one access to memory adds a patch's light to eight bins.
+"""Histogram of the gather: rows of blocks of bins, so that one memory access adds a patch's light to eight bins.
 
-Dr.Jit adds single values lane by lane, looking for lanes that meet in one place, for every bin anew. A block of
+Dr.Jit adds single values lane by lane and looks for lanes that meet in one place, for every bin anew. A block of
 neighbouring bins per lane is one aligned load, addition and store, and a patch covers few blocks.
 """
 
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from nlosrender.engine.launch.device_arrays import on_device
 from nlosrender.engine.launch.histogram import HistogramShape
 
-BLOCK = 8  # bins: 64 bytes of float64, a line of the cache
+BLOCK = 8  # bins: 64 bytes of float64, a cache line; 4 and 16 were slower
 
 
 class BlockHistogram:
@@ -23,8 +23,8 @@ class BlockHistogram:
     Parameters
     ----------
     shape
-        Sizes; it has one bounce slot. A row is a whole number of blocks here, and what falls outside the time window
-        lies in an array of its own.
+        Sizes, with one bounce slot. A row is a whole number of blocks here; what falls outside the time window is in an
+        array of its own.
     order
         (sensors,) the sensor point of each lane of a replica, numbered as in the batch.
     """
@@ -48,14 +48,14 @@ class BlockHistogram:
         lane: mi.UInt32,
         laser: mi.UInt32,
         block: mi.Int32,
-        shares: list[mi.Float],
+        fractions: list[mi.Float],
         value: mi.Spectrum,
         active: mi.Bool,
     ) -> None:
-        """Add ``value`` times the ``shares`` of its bins to a block of a row; the block has to exist."""
+        """Add ``value`` times the ``fractions`` of its bins to an existing block of a row."""
         for channel in range(self.shape.channels):
             index = self._row(lane, laser, channel) * self.n_blocks + mi.UInt32(block)
-            values = mi.ArrayXf64([mi.Float64(value[channel] * share) for share in shares])
+            values = mi.ArrayXf64([mi.Float64(value[channel] * fraction) for fraction in fractions])
             dr.scatter_add(self.sums, values, index, active, dr.ReduceMode.NoConflicts)
 
     def deposit_outside(self, lane: mi.UInt32, laser: mi.UInt32, value: mi.Spectrum, active: mi.Bool) -> None:
@@ -85,11 +85,11 @@ class BlockHistogram:
         lane = dr.gather(mi.UInt32, on_device(mi.UInt32, places), sensor)
         total = mi.Float64(0)
         for _ in range(shape.replicas):
-            row = (lane * shape.lasers + laser) * shape.channels + channel
+            row = self._row(lane, laser, channel)
             total += dr.gather(mi.Float64, self.sums, row * (self.n_blocks * BLOCK) + entry, inside)
             total += dr.gather(mi.Float64, self.outside, row, ~inside)
             lane += shape.sensors
         return np.asarray(total.numpy()).reshape(shape.channels, 1, shape.lasers, shape.sensors, shape.row)
 
-    def _row(self, lane: mi.UInt32, laser: mi.UInt32, channel: int) -> mi.UInt32:
+    def _row(self, lane: mi.UInt32, laser: mi.UInt32, channel: mi.UInt32 | int) -> mi.UInt32:
         return (lane * self.shape.lasers + laser) * self.shape.channels + channel

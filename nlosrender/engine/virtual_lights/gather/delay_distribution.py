@@ -1,15 +1,15 @@
-"""A patch's light over the bins it covers: no noise, exact for a delay that is linear over the patch.
+"""Distribution of a patch's light over the bins it covers: no noise, exact for a delay that is linear over the patch.
 
-The light per delay over a triangle rises and then falls, linearly; over a parallelogram it is constant in between. Let
-the delays (in bins) at which it begins, is at its height, leaves it and ends be t0 <= t1 <= t2 <= t3. The part of the
-area with a delay below t is
+The density of delays over a triangle rises and then falls, linearly; over a parallelogram it is constant in between.
+Let the delays (in bins) at which it begins, reaches its height, leaves it and ends be t0 <= t1 <= t2 <= t3. Its
+cumulative distribution function (CDF), the part of the area with a delay below t, is
 
     (t - t0)^2 / ((t1 - t0) s)                 for t0 <= t <= t1
     (2 t - t0 - t1) / s                        for t1 <= t <= t2
     1 - (t3 - t)^2 / ((t3 - t2) s)             for t2 <= t <= t3
 
-with s = t3 + t2 - t1 - t0, and the share of a bin is the difference of this function at the bin's edges. Cf.
-Iseringhausen & Hullin 2020; Tsai et al. 2019.
+with s = t3 + t2 - t1 - t0, and a bin's fraction is the difference of the CDF at its edges: docs/virtual-lights.md, 2.
+Cf. Iseringhausen & Hullin 2020; Tsai et al. 2019.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ import mitsuba as mi
 
 from nlosrender.engine.virtual_lights.gather.block_histogram import BLOCK, BlockHistogram
 
-NARROWEST = 1e-3  # bins: below it a patch's delay counts as one number
-LEAST = 1e-6  # bins, of the rise and the fall: keeps quotients finite
+MIN_WIDTH = 1e-3  # bins: below it the patch's delay counts as one number; float32 delays of 4096 bins are good to 2e-4
+MIN_RAMP = 1e-6  # bins, of the rise and the fall: guards quotients
 
 
 @dataclass(eq=False)  # not frozen: the state of a loop
 class Delays:
-    """The delays that a patch covers [bins], ascending."""
+    """Corners of the density of a patch's delays [bins], ascending."""
 
     t0: mi.Float
     t1: mi.Float
@@ -37,13 +37,13 @@ class Delays:
 
     @classmethod
     def of_triangle(cls, a: mi.Float, b: mi.Float, c: mi.Float) -> Delays:
-        """Return what a triangle covers; parameters are the delays of its corners."""
+        """Return the density's corners of a triangle; parameters are the delays of its corners."""
         middle = dr.maximum(dr.minimum(a, b), dr.minimum(dr.maximum(a, b), c))
         return cls(dr.minimum(a, dr.minimum(b, c)), middle, None, dr.maximum(a, dr.maximum(b, c)))
 
     @classmethod
     def of_parallelogram(cls, a: mi.Float, b: mi.Float, c: mi.Float, d: mi.Float) -> Delays:
-        """Return what a parallelogram covers; parameters are the delays of its corners, one after the other.
+        """Return the density's corners of a parallelogram; parameters are the delays of its successive corners.
 
         The best linear function through four corners is their mean in the middle.
         """
@@ -54,7 +54,7 @@ class Delays:
 
     @classmethod
     def of_either(cls, is_parallelogram: mi.Bool, delays: mi.Vector4f) -> Delays:
-        """Return what parallelograms cover, and the triangles of the first three corners where patches are none."""
+        """Return those of parallelograms, elsewhere of the triangles of the first three corners."""
         a, b, c, d = delays
         triangle, whole = cls.of_triangle(a, b, c), cls.of_parallelogram(a, b, c, d)
         return cls(
@@ -71,18 +71,17 @@ class Delays:
 
 
 class _DelayCdf:
-    """Shares of the bins that a patch covers."""
+    """The CDF at the top of the module."""
 
     def __init__(self, delays: Delays):
         t0, t1, t3 = delays.t0, delays.t1, delays.t3
         t2 = t1 if delays.t2 is None else delays.t2
         self.delays = delays
-        self.height = dr.rcp(dr.maximum((t3 - t0) + (t2 - t1), NARROWEST))
-        self.rising = self.height * dr.rcp(dr.maximum(t1 - t0, LEAST))
-        self.falling = self.height * dr.rcp(dr.maximum(t3 - t2, LEAST))
+        self.height = dr.rcp(dr.maximum((t3 - t0) + (t2 - t1), MIN_WIDTH))
+        self.rising = self.height * dr.rcp(dr.maximum(t1 - t0, MIN_RAMP))
+        self.falling = self.height * dr.rcp(dr.maximum(t3 - t2, MIN_RAMP))
 
-    def below(self, delay: mi.Float | int) -> mi.Float:
-        """Return the share of the area with a smaller delay."""
+    def __call__(self, delay: mi.Float | int) -> mi.Float:
         t0, t1, t2, t3 = self.delays.t0, self.delays.t1, self.delays.t2, self.delays.t3
         up = dr.square(dr.maximum(delay - t0, 0)) * self.rising
         down = 1 - dr.square(dr.maximum(t3 - delay, 0)) * self.falling
@@ -91,8 +90,8 @@ class _DelayCdf:
         return dr.select(delay < t1, up, down)
 
     def bin_fractions(self, below: mi.Float) -> tuple[list[mi.Float], mi.Float]:
-        """Return the shares of the bins of a block that begins at 0, and of all up to its end; ``below`` lie before."""
-        edges = [below, *(self.below(edge) for edge in range(1, BLOCK + 1))]
+        """Return the fractions of the bins of a block that begins at 0, and the CDF at its end; ``below``: at 0."""
+        edges = [below, *(self(edge) for edge in range(1, BLOCK + 1))]
         return [right - left for left, right in pairwise(edges)], edges[-1]
 
 
@@ -113,7 +112,7 @@ def deposit_patch(
     histogram, lane, laser
         Which row.
     delays, whole
-        Delays that it covers [bins], and whole bins to add to all of them.
+        Delays of the patch [bins], and whole bins to add to all of them.
     value, active
         What is deposited, and where anything is.
     """
@@ -123,19 +122,19 @@ def deposit_patch(
     block = dr.maximum(first, 0) // BLOCK
     # delays are counted from the block's left edge
     covered = delays.later(mi.Float(first - block * BLOCK) - base)
-    below = mi.Float(0)  # share of the area with a delay below the block
+    below = mi.Float(0)  # CDF at the block's left edge
     early, late = first < 0, last >= histogram.shape.n_bins
     spilled = active & (early | late)
     if dr.hint(spilled, exclude=[histogram, value, lane, laser]):
-        shares = _DelayCdf(covered)
+        cdf = _DelayCdf(covered)
         end = mi.Float(histogram.shape.n_bins - block * BLOCK)
-        below = dr.select(early, shares.below(mi.Float(0)), 0)
-        beyond = dr.select(late, 1 - shares.below(end), 0)
+        below = dr.select(early, cdf(mi.Float(0)), 0)
+        beyond = dr.select(late, 1 - cdf(end), 0)
         histogram.deposit_outside(lane, laser, value * (below + beyond), spilled)
     more = active & (last >= 0) & (block < histogram.n_blocks)
     while dr.hint(more, exclude=[histogram, value, lane, laser]):
-        of_bins, below = _DelayCdf(covered).bin_fractions(below)
-        histogram.deposit(lane, laser, block, of_bins, value, more)
+        fractions, below = _DelayCdf(covered).bin_fractions(below)
+        histogram.deposit(lane, laser, block, fractions, value, more)
         block += 1
         more = (covered.t3 > BLOCK) & (block < histogram.n_blocks)
         covered = covered.later(-BLOCK)

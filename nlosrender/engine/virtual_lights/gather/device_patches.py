@@ -1,4 +1,4 @@
-"""Patches on the device: where they are, what they reflect, and the points that stand for them."""
+"""Patches on the device: where they are, what they reflect, and the points where their shadow rays end."""
 
 from __future__ import annotations
 
@@ -15,37 +15,34 @@ from nlosrender.engine.launch.morton import morton_order
 from nlosrender.engine.launch.plain_diffuse import is_uniform_diffuse
 from nlosrender.engine.launch.recurrence import recurrence_steps
 from nlosrender.engine.path.laser_connections import off_the_surface
-from nlosrender.engine.virtual_lights.elements.patches import Patches, split_weights
+from nlosrender.engine.virtual_lights.elements.patches import Patches, SurfacePoints, split_weights
 from nlosrender.engine.virtual_lights.elements.round_shapes import RoundShape
+from nlosrender.engine.virtual_lights.tuning import DEFAULT_TUNING, VirtualLightTuning
 from nlosrender.engine.virtual_lights.visibility.masks import Surface
 from nlosrender.scene.build import BuiltScene
 from nlosrender.scene.loading.round_surfaces import ROUND_PLUGINS
 from nlosrender.scene.pose import Float64
 from nlosrender.scene.triangle_point import triangle_weights
 
-# A textured patch is cut into this many squared parts, a random point of each is looked up: 16 of many, 144 of few.
-TEXTURE_SPLITS, FEW_PATCHES = (4, 12), 2**14
-
 
 @dataclass(frozen=True, eq=False)
 class PatchRegions:
-    """Where patches belong: which region they are of, and their numbers in it."""
+    """The region of each patch, and its number within it."""
 
-    regions: NDArray[np.int64]  # (n,) region of each patch, ascending
-    numbers: NDArray[np.int64]  # (n,) of each patch within its region
+    regions: NDArray[np.int64]  # (n,) ascending
+    numbers: NDArray[np.int64]  # (n,)
 
     @classmethod
     def of(cls, counts: Sequence[int]) -> PatchRegions:
-        """Return the places of ``counts`` patches per region, region after region."""
+        """Return regions and numbers of ``counts`` patches per region, region after region."""
         regions = np.repeat(np.arange(len(counts)), counts)
         return cls(regions, np.concatenate([np.arange(count) for count in counts]))
 
     def in_parts(self, patch: NDArray[np.integer], slices: int) -> tuple[NDArray[np.integer], NDArray[np.integer]]:
         """Sort patches by part, within it by number; return them and where each part begins, and the last one ends.
 
-        Parts are gathered by lanes of their own: each is one of so many slices of a region. A patch's number within
-        its region decides its slice, so what one laser sends does not depend on the batch's other lasers, whose
-        patches may be others.
+        Each part, one of ``slices`` of a region, is gathered by lanes of its own. A patch's number within its region
+        decides its slice, so that the batch's other lasers, which may light other patches, change nothing.
         """
         part = (self.regions * slices + self.numbers % slices)[patch]
         order = np.lexsort((patch, part))
@@ -55,7 +52,7 @@ class PatchRegions:
 
 @dataclass(frozen=True, eq=False)
 class Curvature:
-    """The sphere or cylinder that each patch lies on."""
+    """Sphere or cylinder that each patch lies on."""
 
     centre: mi.Vector3f  # from the patch's centre to that of a sphere, or to a point of a cylinder's axis
     radius: mi.Float  # 0 for flat patches
@@ -63,7 +60,7 @@ class Curvature:
 
     @classmethod
     def of(cls, built: BuiltScene, patches: Patches) -> Curvature | None:
-        """Return what patches lie on; None where all are flat."""
+        """Return the curvature of patches; None where all are flat."""
         rows = np.zeros((len(built.scene.shapes()), 7))
         for index, shape in enumerate(built.scene.shapes()):
             if shape.class_name() in ROUND_PLUGINS:
@@ -71,8 +68,8 @@ class Curvature:
         if not rows.any():
             return None
         rows = rows[patches.shapes]
-        centre, axis = mi.Vector3f(to_points(rows[:, :3] - patches.centres)), mi.Vector3f(to_points(rows[:, 4:]))
-        return cls(centre, on_device(mi.Float, np.abs(rows[:, 3])), axis)
+        radius = on_device(mi.Float, np.abs(rows[:, 3]))
+        return cls(to_vectors(rows[:, :3] - patches.centres), radius, to_vectors(rows[:, 4:]))
 
     def onto_surface(self, points: mi.Vector3f) -> mi.Vector3f:
         """Return points, relative to the patches' centres, brought onto the surface along its normal."""
@@ -81,7 +78,7 @@ class Curvature:
         return dr.select(self.radius > 0, points + outward * ((self.radius - distance) / distance), points)
 
     def turned(self, along: mi.Vector3f, points: mi.Vector3f) -> mi.Vector3f:
-        """Return vectors along the normals of patches turned along the normals at points of them."""
+        """Return vectors along the normals of patches, turned to the normals at points of them."""
         normal = dr.normalize(self._outward(points))
         return dr.select(self.radius > 0, normal * dr.mulsign(dr.norm(along), dr.dot(normal, along)), along)
 
@@ -94,11 +91,11 @@ class Curvature:
 class DevicePatches:
     """Patches on the device, engine units; one lane per patch."""
 
-    places: PatchRegions
-    number: mi.UInt32  # within its region: with the start, what decides the points its light is asked for
+    regions: PatchRegions
+    number: mi.UInt32  # within its region: chooses, with ``start``, where its shadow rays end
     start: mi.Vector2u  # of the low-discrepancy sequence of these points
-    rounding_residual: mi.Vector3f  # float64 centre minus float32 centre: counts close to the wall
-    is_near: bool  # some patch is so near to a laser or sensor point that the remainder counts
+    rounding_residual: mi.Vector3f  # float64 centre minus float32 centre
+    is_near: bool  # some patch is so near to a laser or sensor point that the residual counts
     corners: list[mi.Vector3f]  # three, from the centre
     curvature: Curvature | None  # None: all are flat
     members: mi.Vector4f  # from the centre to where shadow rays of clusters end, and 1 for a cluster, else 0
@@ -110,9 +107,9 @@ class DevicePatches:
     offset: mi.Vector3f  # ray offset there, see ``off_the_surface``; on curved patches in the middle
 
     def points(self, index: mi.UInt32) -> mi.Vector3f:
-        """Return points of the surface, one per patch, from the centres' float32 positions: where rays end.
+        """Return points of the surface, one per patch, from the centres' float32 positions: where shadow rays end.
 
-        ``index`` chooses a low-discrepancy point of a patch. That of a cluster is its member's, whichever.
+        ``index`` chooses a low-discrepancy point of a patch; a cluster has one, its member's.
         """
         u, v = spread_numbers(self.start, index)
         inside = point_inside(self.corners, u, v)
@@ -123,19 +120,24 @@ class DevicePatches:
     def offset_at(self, points: mi.Vector3f) -> mi.Vector3f:
         """Return the ray offset along the normal at ``points``, as ``points`` returns them.
 
-        On a curved patch a ray that grazes it may come from behind its middle's normal.
+        On a curved patch a grazing ray may come from behind the normal at its centre.
         """
         return self.offset if self.curvature is None else self.curvature.turned(self.offset, points)
 
     def surface(self, points: mi.Vector3f) -> Surface:
-        """Return the surface at ``points``, as ``points`` returns them: what may hide it from the wall."""
+        """Return the surface at ``points``, as ``points`` returns them: for its visibility mask."""
         interaction = self.interaction
-        others = dr.select(self.members.w > 0, self.member_normals, mi.Vector3f(interaction.sh_frame.n))
-        return Surface(mi.Point3f(interaction.p + points), mi.Vector3f(interaction.n), others)
+        other_normals = dr.select(self.members.w > 0, self.member_normals, mi.Vector3f(interaction.sh_frame.n))
+        return Surface(mi.Point3f(interaction.p + points), mi.Vector3f(interaction.n), other_normals)
 
 
 def upload_patches(
-    built: BuiltScene, patches: Patches, places: PatchRegions, seed: int, is_near: bool
+    built: BuiltScene,
+    patches: Patches,
+    regions: PatchRegions,
+    seed: int,
+    is_near: bool,
+    tuning: VirtualLightTuning = DEFAULT_TUNING,
 ) -> DevicePatches:
     """Bring patches to the device, neighbours together, and evaluate their reflectance and shading frames.
 
@@ -143,82 +145,54 @@ def upload_patches(
     ----------
     built, patches
         The scene and what it was cut into, region after region.
-    places
+    regions
         Region of each patch, and its number there.
     seed
-        Of the points that stand for their patches where visibility is asked for. A point at random makes a partly
-        hidden patch count by its visible share, on average; one for all sensor points keeps their rays together.
+        Of the points where shadow rays end. With a point at random a partly hidden patch counts by its visible share,
+        on average; one for all sensor points keeps their rays together (docs/virtual-lights.md, 5).
     is_near
-        Whether some patch is so near to a laser or sensor point that float32 positions do not do.
+        Whether some patch is so near to a laser or sensor point that float32 positions are too coarse.
+    tuning
+        How many lookups a textured patch takes.
     """
-    patches = patches.at(np.lexsort((morton_order(patches.centres), places.regions)))
-    interaction = surface_at(
-        built, patches.centres, patches.normals, patches.shapes, patches.primitives, patches.barycentric
-    )
-    reflectance = _mean_reflectance(built, patches, normal_reflectance(interaction))
-    centre = np.array(interaction.p, np.float64).T
-    from_rounded = patches.centres - centre
-    rounding_residual = mi.Vector3f(to_points(from_rounded))
-    corners = [mi.Vector3f(to_points(patches.corners[:, k] - patches.centres)) for k in range(3)]
-    areas = mi.Vector3f(to_points(patches.normals * patches.areas[:, None]))
-    curvature = Curvature.of(built, patches)
-    offset = off_the_surface(built, patches.members, patches.member_normals, patches.shapes) - patches.members
+    patches = patches.select(np.lexsort((morton_order(patches.centres), regions.regions)))
+    interaction = surface_at(built, patches.points(patches.centres, patches.barycentric))
+    reflectance = _mean_reflectance(built, patches, normal_reflectance(interaction), tuning)
     is_cluster = on_device(mi.Float, patches.is_cluster)
-    members = mi.Vector4f(*to_points(patches.members - patches.centres), is_cluster)
     # a cluster's members have normals of their own: it is lit and seen by their mean
     frame, own = interaction.sh_frame, mi.Frame3f(mi.Normal3f(interaction.n))
-    interaction.sh_frame = dr.select(members.w > 0, own, frame)
-    number, start = on_device(mi.UInt32, places.numbers), mi.Vector2u(*mi.sample_tea_32(mi.UInt32(seed), mi.UInt32(0)))
+    interaction.sh_frame = dr.select(is_cluster > 0, own, frame)
+    start = mi.Vector2u(*mi.sample_tea_32(mi.UInt32(seed), mi.UInt32(0)))
     dr.make_opaque(start)
-    member_normals = mi.Vector3f(to_points(patches.member_normals))
-    offset = mi.Vector3f(to_points(offset))
-    dr.eval(interaction, reflectance, rounding_residual, corners, areas, curvature, members, member_normals, offset)
-    has_clusters = bool(patches.is_cluster.any())
-    return DevicePatches(
-        places,
-        number,
-        start,
-        rounding_residual,
-        is_near,
-        corners,
-        curvature,
-        members,
-        has_clusters,
-        areas,
-        interaction,
-        reflectance,
-        member_normals,
-        offset,
+    offset = off_the_surface(built, patches.members, patches.member_normals, patches.shapes) - patches.members
+    result = DevicePatches(
+        regions=regions,
+        number=on_device(mi.UInt32, regions.numbers),
+        start=start,
+        rounding_residual=to_vectors(patches.centres - np.array(interaction.p, np.float64).T),
+        is_near=is_near,
+        corners=[to_vectors(patches.corners[:, k] - patches.centres) for k in range(3)],
+        curvature=Curvature.of(built, patches),
+        members=mi.Vector4f(*to_points(patches.members - patches.centres), is_cluster),
+        has_clusters=bool(patches.is_cluster.any()),
+        areas=to_vectors(patches.normals * patches.areas[:, None]),
+        interaction=interaction,
+        reflectance=reflectance,
+        member_normals=to_vectors(patches.member_normals),
+        offset=to_vectors(offset),
     )
+    dr.eval(result)
+    return result
 
 
-def surface_at(
-    built: BuiltScene,
-    positions: Float64,
-    normals: Float64,
-    shapes: NDArray[np.uint32],
-    primitives: NDArray[np.uint32],
-    barycentric: Float64,
-) -> mi.SurfaceInteraction3f:
-    """Return the surface at known points, as a ray from one unit above would find it; no ray is traced.
-
-    Parameters
-    ----------
-    built
-        The scene.
-    positions, normals
-        (n, 3) points [engine units] and geometric normals.
-    shapes, primitives
-        (n,) index into the scene's shapes; triangle of a mesh.
-    barycentric
-        (n, 2) coordinates within the triangle.
-    """
-    point, normal = to_points(positions), mi.Vector3f(to_points(normals))
-    hit = dr.zeros(mi.PreliminaryIntersection3f, len(positions))
-    hit.t = dr.full(mi.Float, 1.0, len(positions))
-    hit.prim_uv = mi.Point2f(*columns(barycentric))
-    hit.prim_index = on_device(mi.UInt32, primitives)
-    shape = dr.gather(mi.ShapePtr, built.scene.shapes_dr(), on_device(mi.UInt32, shapes))
+def surface_at(built: BuiltScene, points: SurfacePoints) -> mi.SurfaceInteraction3f:
+    """Return the surface at known points, as a ray from one unit above would find it; no ray is traced."""
+    point, normal = to_points(points.positions), to_vectors(points.normals)
+    hit = dr.zeros(mi.PreliminaryIntersection3f, len(points))
+    hit.t = dr.full(mi.Float, 1.0, len(points))
+    hit.prim_uv = mi.Point2f(*columns(points.barycentric))
+    hit.prim_index = on_device(mi.UInt32, points.primitives)
+    shape = dr.gather(mi.ShapePtr, built.scene.shapes_dr(), on_device(mi.UInt32, points.shapes))
     interaction = shape.compute_surface_interaction(mi.Ray3f(point + normal, -normal), hit, mi.RayFlags.All)
     interaction.initialize_sh_frame()
     interaction.shape = shape
@@ -228,27 +202,26 @@ def surface_at(
     return interaction
 
 
-def _mean_reflectance(built: BuiltScene, patches: Patches, reflectance: mi.Spectrum) -> mi.Spectrum:
-    """Return the reflectance of patches, averaged over random points of each where some surface has a texture.
+def _mean_reflectance(
+    built: BuiltScene, patches: Patches, reflectance: mi.Spectrum, tuning: VirtualLightTuning
+) -> mi.Spectrum:
+    """Return the reflectance of patches, averaged over stratified points of each where some surface has a texture.
 
-    That of the centre alone, ``reflectance``, takes a texture finer than the patches for one of other colours at every
-    resolution, and the difference of two resolutions, the stated error, for noise.
+    With that of the centre alone, ``reflectance``, a texture finer than the patches had other colours at every scale,
+    and the difference of two scales, the stated error, would be noise.
     """
-    shapes = built.scene.shapes()
-    textured = np.array([_has_texture(shape.bsdf()) for shape in shapes])[patches.shapes]
+    textured = np.array([_has_texture(shape.bsdf()) for shape in built.scene.shapes()])[patches.shapes]
     chosen = np.flatnonzero(textured & ~patches.is_cluster)
     if not len(chosen):
         return reflectance
-    some, random = patches.at(chosen), np.random.default_rng(len(patches))
-    parts = split_weights(TEXTURE_SPLITS[0 if len(chosen) > FEW_PATCHES else 1])
+    some, random = patches.select(chosen), np.random.default_rng(len(patches))
+    parts = split_weights(tuning.texture_splits[0 if len(chosen) > tuning.few_patches else 1])
     total = mi.Spectrum(0)
     for part in parts:
         weights = np.stack(triangle_weights(random.random(len(chosen)), random.random(len(chosen))), axis=1) @ part
         positions = np.einsum("nk,nkx->nx", weights, some.corners)
         barycentric = np.einsum("nk,nkx->nx", weights, some.corner_barycentric)
-        total += normal_reflectance(
-            surface_at(built, positions, some.normals, some.shapes, some.primitives, barycentric)
-        )
+        total += normal_reflectance(surface_at(built, some.points(positions, barycentric)))
         dr.eval(total)
     dr.scatter(reflectance, total / len(parts), on_device(mi.UInt32, chosen))
     return reflectance
@@ -272,12 +245,17 @@ def point_inside(corners: list[mi.Vector3f], u: mi.Float, v: mi.Float) -> mi.Vec
 
 
 def spread_numbers(start: mi.Vector2u, index: mi.UInt32) -> tuple[mi.Float, mi.Float]:
-    """Return two low-discrepancy numbers in [0, 1) per index."""
+    """Return two numbers in [0, 1) per index of an additive recurrence, a low-discrepancy sequence."""
     steps = recurrence_steps(2)
     u, v = (mi.Float((start[k] + index * mi.UInt32(steps[k])) >> 8) * 2.0**-24 for k in range(2))
     return u, v
 
 
 def to_points(values: Float64) -> mi.Point3f:
-    """Bring vectors (n, 3) to the device."""
+    """Bring positions (n, 3) to the device."""
     return mi.Point3f(*columns(values))
+
+
+def to_vectors(values: Float64) -> mi.Vector3f:
+    """Bring vectors (n, 3) to the device."""
+    return mi.Vector3f(*columns(values))

@@ -1,4 +1,4 @@
-"""Virtual lights: what the lasers make of patches, and what of it sensor points read."""
+"""Lighting: what the lasers make of patches (virtual lights), packed as sensor points gather it."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from nlosrender.engine.launch.device_arrays import on_device
 from nlosrender.engine.launch.launch_params import LaunchParams
 from nlosrender.engine.path.laser_connections import off_the_wall
 from nlosrender.engine.virtual_lights.gather.device_patches import DevicePatches
+from nlosrender.engine.virtual_lights.tuning import DEFAULT_TUNING
 from nlosrender.engine.virtual_lights.visibility.masks import VisibilityMasks, WallTiles
 from nlosrender.scene.build import BuiltScene
 
-ROWS = 6  # of four numbers each: what the gather reads of a patch
-LASER_RAYS = 4  # shadow rays from the only laser to points spread over a patch
+ROWS = 6  # of four numbers each, aligned loads: what the gather reads of a patch
 
 
 @dataclass(frozen=True)
@@ -27,6 +27,7 @@ class GatherSettings:
     is_diffuse: bool  # every hidden BSDF is Lambertian: reflectance and a cosine are all there is
     needs_visibility: bool  # something may lie between wall and patches
     has_one_laser: bool  # in the whole capture, however it is cut
+    laser_rays: int = DEFAULT_TUNING.laser_rays
 
     @property
     def lights_once(self) -> bool:
@@ -39,15 +40,16 @@ class PackedPatches:
     """What the gather's loop reads: patches that are lit, packed so that one load brings four numbers."""
 
     # 24 a patch: three corners, each with one component of normal times area; the centre, and 1 for a cluster; from it
-    # to the point of the surface that shadow rays ask for, and 0; the ray offset along the normal there, and 0
+    # to the point of the surface where shadow rays end, and 0; the ray offset along the normal there, and 0
     packed: mi.Float
-    mask: mi.UInt64  # there, see ``VisibilityMasks.of``
+    mask: mi.UInt64  # of that point, see ``VisibilityMasks.of``
     rounding_residual: mi.Float | None  # four a patch: float64 minus float32 centre; None: negligible
     shading: mi.Normal3f  # shading normals
     interaction: mi.SurfaceInteraction3f  # at the centres; not read for Lambertian patches
     reflectance: mi.Spectrum  # confocal Lambertian patches: reflectance / pi
-    arriving: mi.Spectrum  # index = laser * count + patch: light that arrives, per area perpendicular to it;
-    # of Lambertian patches the light that leaves; empty for confocal captures
+    # index = laser * count + patch: light that arrives, per area perpendicular to it; of Lambertian patches the light
+    # that leaves; empty for confocal captures
+    arriving: mi.Spectrum
     delays: mi.Float  # four an index: from the laser point to each corner [bins]
     has_clusters: bool
     count: mi.UInt32  # of lit patches, opaque
@@ -56,19 +58,19 @@ class PackedPatches:
 
 @dataclass(frozen=True, eq=False)
 class MaskQuery:
-    """What it takes to leave visibility rays out."""
+    """Visibility masks, and the rectangles of the wall that they are for."""
 
     masks: VisibilityMasks
     wall_tiles: WallTiles  # a rectangle per region of the patches
 
     @property
     def pays_off(self) -> bool:
-        """Whether enough points look."""
+        """Whether enough sensor points share a mask."""
         return self.masks.pay_off(self.wall_tiles.n_points)
 
     def of(self, patches: DevicePatches, shadow_target: mi.Vector3f, active: mi.Bool) -> mi.UInt64:
-        """Return the clearance of patches where rays end, see ``VisibilityMasks.of``."""
-        where = on_device(mi.UInt32, patches.places.regions)
+        """Return the masks of patches where rays end, see ``VisibilityMasks.of``."""
+        where = on_device(mi.UInt32, patches.regions.regions)
         return self.masks.of(patches.surface(shadow_target), self.wall_tiles, where, active)
 
 
@@ -79,12 +81,12 @@ class LitPatches:
     patches: DevicePatches
     arriving: mi.Spectrum  # index = laser * n_patches + patch; see ``PackedPatches``
     is_lit: mi.Bool  # by any of the lasers
-    shadow_target: mi.Vector3f  # from the centres to where sensor points look at them
+    shadow_target: mi.Vector3f  # from the centres to where the sensor points' shadow rays end
     mask: mi.UInt64  # there, see ``VisibilityMasks.of``
-    is_cleared: bool  # it has been asked for: enough points look
+    is_cleared: bool  # masks have been asked for: enough sensor points share them
 
     def cleared(self, mask_query: MaskQuery) -> LitPatches:
-        """Return the same with clearances, if enough points look."""
+        """Return the same with visibility masks, if they pay off."""
         if not mask_query.pays_off:
             return self
         return replace(self, mask=mask_query.of(self.patches, self.shadow_target, self.is_lit), is_cleared=True)
@@ -100,9 +102,9 @@ def light_patches(
     settings, params
         What the gather does and reads.
     patches
-        All patches of a resolution.
+        All patches of a scale.
     mask_query
-        Tells which visibility rays may be left out.
+        Tells which shadow rays may be left out.
     n_lasers
         Lasers of the batch.
     """
@@ -128,65 +130,61 @@ def pack_patches(
     lit = dr.compress(lit_patches.is_lit)
     if not dr.width(lit):
         lit = mi.UInt32(0)  # all is dark: one dark patch, since arrays of no length cannot be read
-    lit, first = (on_device(mi.UInt32, values) for values in patches.places.in_parts(np.array(lit.numpy()), slices))
+    lit, first = (on_device(mi.UInt32, values) for values in patches.regions.in_parts(np.array(lit.numpy()), slices))
+    n_lit = dr.opaque(mi.UInt32, dr.width(lit))  # as a constant it would be part of the kernel
     if not settings.is_confocal:
         index = dr.arange(mi.UInt32, dr.width(lit) * n_lasers)
-        n_lit = dr.opaque(mi.UInt32, dr.width(lit))  # as a constant it would be part of the kernel
         laser, patch = index // n_lit, dr.gather(mi.UInt32, lit, index % n_lit)
         arriving = dr.gather(mi.Spectrum, arriving, laser * dr.opaque(mi.UInt32, count) + patch)
         points = dr.gather(mi.Point3f, params.lasers.interaction.p, laser)
         ends = four_corners(*_corners(patches, patch))
         delays = dr.ravel(mi.Vector4f(*(dr.norm(end - points) * params.bins_per_unit for end in ends)))
     a, b, c = _corners(patches, lit)
-    areas, interaction = (
-        dr.gather(mi.Vector3f, patches.areas, lit),
-        dr.gather(mi.SurfaceInteraction3f, patches.interaction, lit),
-    )
+    areas = dr.gather(mi.Vector3f, patches.areas, lit)
+    interaction = dr.gather(mi.SurfaceInteraction3f, patches.interaction, lit)
     is_cluster = dr.gather(mi.Vector4f, patches.members, lit).w
-    shown = dr.gather(mi.Vector3f, lit_patches.shadow_target, lit)
-    mask = dr.gather(mi.UInt64, lit_patches.mask, lit)
+    target = dr.gather(mi.Vector3f, lit_patches.shadow_target, lit)
     offset = dr.gather(mi.Vector3f, patches.offset_at(lit_patches.shadow_target), lit)
-    rows = [(a, areas.x), (b, areas.y), (c, areas.z), (interaction.p, is_cluster), (shown, 0), (offset, 0)]
+    rows = [(a, areas.x), (b, areas.y), (c, areas.z), (interaction.p, is_cluster), (target, 0), (offset, 0)]
     packed = dr.zeros(mi.Float, 4 * ROWS * dr.width(lit))
     lane = dr.arange(mi.UInt32, dr.width(lit))
     for k, (point, fourth) in enumerate(rows):
         dr.scatter(packed, mi.Vector4f(*point, fourth), lane * ROWS + k)
     rounding_residual = None
     if patches.is_near:
-        rest = dr.gather(mi.Vector3f, patches.rounding_residual, lit)
-        rounding_residual = dr.ravel(mi.Vector4f(rest.x, rest.y, rest.z, 0))
-    reflectance = dr.gather(mi.Spectrum, patches.reflectance, lit) * dr.inv_pi
-    dr.eval(packed, mask, rounding_residual, arriving, delays, interaction, reflectance)
-    return PackedPatches(
-        packed,
-        mask,
-        rounding_residual,
-        interaction.sh_frame.n,
-        interaction,
-        reflectance,
-        arriving,
-        delays,
-        patches.has_clusters,
-        dr.opaque(mi.UInt32, dr.width(lit)),
-        first,
+        rounding_residual = dr.ravel(mi.Vector4f(*dr.gather(mi.Vector3f, patches.rounding_residual, lit), 0))
+    result = PackedPatches(
+        packed=packed,
+        mask=dr.gather(mi.UInt64, lit_patches.mask, lit),
+        rounding_residual=rounding_residual,
+        shading=interaction.sh_frame.n,
+        interaction=interaction,
+        reflectance=dr.gather(mi.Spectrum, patches.reflectance, lit) * dr.inv_pi,
+        arriving=arriving,
+        delays=delays,
+        has_clusters=patches.has_clusters,
+        count=n_lit,
+        first=first,
     )
+    dr.eval(result)
+    return result
 
 
 def _light_by_lasers(
     settings: GatherSettings, params: LaunchParams, dark: LitPatches, mask_query: MaskQuery, n_lasers: int
 ) -> LitPatches:
-    """Light every patch by every laser: emission, distance, and the share of the patch that is not in shadow.
+    """Light every patch by every laser: emission, distance, and the fraction of the patch that is not in shadow.
 
-    Sensor points look where they did, or at a point that the only laser lights. Lambertian patches send light on.
+    Shadow rays of sensor points end where they did, or at a point that the only laser lights. Of Lambertian patches
+    the result is the light that leaves.
     """
-    patches, shadow_target, mask = dark.patches, dark.shadow_target, dark.mask
+    patches, shadow_target = dark.patches, dark.shadow_target
     built = params.built
     n_patches = dr.width(patches.areas)
     index = dr.arange(mi.UInt32, n_patches * n_lasers)
     divisor = dr.opaque(mi.UInt32, n_patches)
     patch, laser = index % divisor, index // divisor
-    points = params.lasers.gather(laser)
-    lit = points.interaction
+    lit = params.lasers.gather(laser).interaction
     to_rounded = dr.gather(mi.Point3f, patches.interaction.p, patch) - lit.p
     to_patch = to_rounded + dr.gather(mi.Vector3f, patches.rounding_residual, patch)
     distance2 = dr.squared_norm(to_patch)
@@ -202,15 +200,15 @@ def _light_by_lasers(
         active &= (cosine > 0) | mi.has_flag(flags, mi.BSDFFlags.BackSide)
     seen = mi.Float(1)
     if settings.needs_visibility and settings.has_one_laser:
-        seen, shadow_target = _share_in_light(built, patches, lit, to_rounded, active)
+        seen, shadow_target = _lit_fraction(settings, built, patches, lit, to_rounded, active)
     elif settings.needs_visibility:
-        # the very point that sensor points look at: what hides a part of a patch from both hides the same part
+        # the very point where the sensor points' rays end: what hides a part of a patch from both hides the same part
         way = to_rounded + dr.gather(mi.Vector3f, shadow_target, patch)
         offset = dr.gather(mi.Vector3f, patches.offset_at(shadow_target), patch)
         tile = mask_query.wall_tiles.tile_bit(mi.UInt32(0), lit.p)
         is_before = dr.dot(dr.gather(mi.Vector3f, patches.areas, patch), way) < 0  # the plane through that point
-        clear = dr.select(is_before, dr.gather(mi.UInt64, mask, patch), 0)
-        seen = dr.select(is_visible(built, lit, way, offset, active, clear, tile), mi.Float(1), 0)
+        mask = dr.select(is_before, dr.gather(mi.UInt64, dark.mask, patch), 0)
+        seen = dr.select(is_visible(built, lit, way, offset, active, mask, tile), mi.Float(1), 0)
     arriving = dr.select(active, arriving * seen, 0)
     brightest = dr.zeros(mi.Float, n_patches)
     dr.scatter_reduce(dr.ReduceOp.Max, brightest, dr.max(arriving), patch)
@@ -219,28 +217,29 @@ def _light_by_lasers(
     return replace(dark, arriving=arriving, is_lit=is_lit, shadow_target=shadow_target)
 
 
-def _share_in_light(
+def _lit_fraction(
+    settings: GatherSettings,
     built: BuiltScene,
     patches: DevicePatches,
     laser: mi.SurfaceInteraction3f,
     to_rounded: mi.Vector3f,
     active: mi.Bool,
 ) -> tuple[mi.Float, mi.Vector3f]:
-    """Return the share of each patch that the only laser lights, and a point in light for sensor points to look at.
+    """Return the fraction of each patch that the only laser lights, and a lit point where sensor points' rays end.
 
-    Shares of a patch that laser and sensor point see are not independent where one edge throws both shadows. A point
-    drawn among those in light makes their product right on average.
+    The fractions that laser and sensor point see are not independent where one edge throws both shadows. One point,
+    drawn among those in light by reservoir sampling, makes their product right on average: docs/virtual-lights.md, 5.
     """
     n_seen, chosen = mi.UInt32(0), mi.Vector3f(0)
-    for k in range(LASER_RAYS):
-        index = patches.number * LASER_RAYS + k
+    for k in range(settings.laser_rays):
+        index = patches.number * settings.laser_rays + k
         point = patches.points(index)
         is_lit = is_visible(built, laser, to_rounded + point, patches.offset_at(point), active)
         n_seen += dr.select(is_lit, mi.UInt32(1), 0)
-        # the n-th point in light takes the place of the one before with a chance of 1 / n
+        # reservoir of one: the n-th lit point replaces the one before with probability 1 / n
         takes = is_lit & (mi.sample_tea_float32(index, patches.start.x) * mi.Float(n_seen) < 1)
         chosen = dr.select(takes, point, chosen)
-    return mi.Float(n_seen) / LASER_RAYS, chosen
+    return mi.Float(n_seen) / settings.laser_rays, chosen
 
 
 def is_visible(
@@ -255,8 +254,8 @@ def is_visible(
     """Return whether nothing lies on the way from a point of the wall to a point of a hidden surface.
 
     The shadow ray ends at the latter moved by ``offset``, the ray offset along the surface's normal, to the side that
-    faces the wall point. ``mask`` is that of the surface point, and ``tile`` the bit of the tile the wall point
-    lies in.
+    faces the wall point. Where ``mask``, that of the surface point, holds ``tile``, that of the wall point, no ray is
+    traced.
     """
     origin = off_the_wall(built, wall_point)
     direction = way - (origin - wall_point.p)

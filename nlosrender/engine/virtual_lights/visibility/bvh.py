@@ -1,4 +1,4 @@
-"""The triangles of the hidden geometry in a tree of boxes, on the device."""
+"""Bounding volume hierarchy (BVH) of the triangles of the hidden geometry, on the device."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ import numpy as np
 from nlosrender.engine.launch.device_arrays import on_device
 from nlosrender.engine.launch.morton import morton_order
 from nlosrender.engine.launch.surface_sampler import triangles_of
-from nlosrender.engine.virtual_lights.elements.subdivision import middles, normals_and_areas
+from nlosrender.engine.virtual_lights.elements.subdivision import centroids, normals_and_areas
 from nlosrender.scene.pose import Float64
 
-LEAF = 8  # triangles
-BOX = 8  # numbers, the last two empty
+LEAF = 8  # triangles; 2, 4 and 16 were slower
+BOX = 8  # numbers, the last two empty: two aligned loads of four
 # Corners of the twelve triangles of a box, in the order of Mitsuba's BoundingBox.corner.
 FACES_OF_BOX = np.array(
     [
@@ -32,16 +32,16 @@ FACES_OF_BOX = np.array(
 class Bvh:
     """A complete binary tree: box 1 holds all triangles, the children of box k are 2 k and 2 k + 1 [engine units]."""
 
-    boxes: mi.Float  # eight a box: least and greatest corner; box 0 is none
+    boxes: mi.Float  # eight a box: lowest and highest corner; box 0 is none
     triangles: mi.Float  # twelve a triangle: three corners, each with one component of the unit normal
     first: mi.UInt32  # triangle of each leaf, LEAF of them; the last boxes are the leaves
     n_leaves: mi.UInt32  # opaque
 
     @classmethod
     def of(cls, shapes: Sequence[mi.Shape]) -> Bvh:
-        """Return the tree of meshes and of boxes around other shapes, cut along a space-filling curve."""
+        """Return the BVH of meshes and of the bounding boxes of other shapes, split along a Morton curve."""
         triangles = np.concatenate([_triangles(shape) for shape in shapes])
-        order = np.argsort(morton_order(middles(triangles)), kind="stable")
+        order = np.argsort(morton_order(centroids(triangles)), kind="stable")
         order = np.append(order, np.repeat(order[-1], max(0, LEAF - len(order))))
         packed = np.empty((len(order), 3, 4), np.float32)
         packed[:, :, :3] = triangles = triangles[order]
@@ -49,9 +49,8 @@ class Bvh:
         packed[:, :, 3] = normals_and_areas(triangles)[0]
         n_leaves = 2 ** math.ceil(math.log2(len(order) / LEAF))
         first = np.arange(n_leaves) * len(order) // n_leaves
-        a, b, c = (packed[:, k, :3] for k in range(3))
-        lows = np.minimum.reduceat(np.minimum(np.minimum(a, b), c), first)
-        highs = np.maximum.reduceat(np.maximum(np.maximum(a, b), c), first)
+        lows = np.minimum.reduceat(packed[:, :, :3].min(axis=1), first)
+        highs = np.maximum.reduceat(packed[:, :, :3].max(axis=1), first)
         boxes = np.zeros((2 * n_leaves, BOX), np.float32)
         level = n_leaves
         while level:
@@ -66,7 +65,7 @@ class Bvh:
         )
 
     def box(self, node: mi.UInt32) -> tuple[mi.Point3f, mi.Point3f]:
-        """Return the least and the greatest corner of a box."""
+        """Return the lowest and the highest corner of a box."""
         one, two = (dr.gather(mi.Vector4f, self.boxes, 2 * node + k) for k in range(2))
         return mi.Point3f(one.x, one.y, one.z), mi.Point3f(one.w, two.x, two.y)
 
@@ -76,10 +75,13 @@ class Bvh:
         return [mi.Point3f(row.x, row.y, row.z) for row in rows], mi.Vector3f(*(row.w for row in rows))
 
     def following(self, node: mi.UInt32) -> mi.UInt32:
-        """Return the box after ``node`` and all it holds, depth first; 0 after the last one."""
-        up = node + 1  # from a right child up to the last box that was a left one; the root has no sibling
-        up = up >> dr.tzcnt(up)
-        return dr.select(up == 1, 0, up)
+        """Return the box after ``node`` and all it holds in depth-first order, without a stack; 0 after the last one.
+
+        The next sibling of the last ancestor that is a left child: all of its trailing ones are shifted out.
+        """
+        sibling = node + 1
+        sibling = sibling >> dr.tzcnt(sibling)
+        return dr.select(sibling == 1, 0, sibling)
 
 
 def _triangles(shape: mi.Shape) -> Float64:

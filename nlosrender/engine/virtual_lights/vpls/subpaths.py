@@ -1,11 +1,11 @@
-"""Walks: the light of bounces 4 and up that leaves a site of the hidden geometry, as a list of impulses.
+"""VPL subpaths: the light of bounces 4 and up that leaves a VPL towards the sensor points, as contributions in time.
 
-Sensor points see light that leaves sites; where that light came from is found by walking on from the site, away from
-the sensor points, until a vertex is connected to the lasers (Royo et al. 2022, section 4, read backwards; the sites
-are the virtual point lights of Keller 1997). Every sensor point looks at every site, so a walk is cheap beside the
-gather of what it brings: many are made, and few impulses are kept, with a probability in proportion to the light they
-bring, so that all carry the same (resampled importance sampling, Talbot et al. 2005). What can only arrive after the
-time window counts for little there, and few walks go on to it.
+Where the light of a VPL (Keller 1997) came from is found by tracing on from it, away from the sensor points, until a
+vertex is connected to the lasers (Royo et al. 2022, section 4, read backwards). Every sensor point gathers every VPL,
+so a subpath is cheap beside the gather of what it brings: many are traced, and few contributions are kept by systematic
+resampling with probability in proportion to the light they bring, so that all carry the same (resampled importance
+sampling, Talbot et al. 2005). Subpaths whose light can only arrive after the time window end by roulette.
+docs/virtual-lights.md, 7.
 """
 
 from __future__ import annotations
@@ -23,52 +23,51 @@ from nlosrender.engine.launch.launch_params import HIGHEST_SURVIVAL, LaneRandomn
 from nlosrender.engine.launch.time_gate import GATE_SURVIVAL, CaptureTimeGate, TimeGate, time_gate_roulette
 from nlosrender.engine.path.laser_connections import connection_segment, offset_origin
 from nlosrender.engine.virtual_lights.gather.device_patches import normal_reflectance, surface_at
+from nlosrender.engine.virtual_lights.tuning import DEFAULT_TUNING
 from nlosrender.engine.virtual_lights.vpls.sampler import Vpls
 from nlosrender.scene.build import BuiltScene
 from nlosrender.scene.pose import Float64
 
-# Share of the average laser's light that a vertex is taken to receive from the lasers it was not tried with.
-UNTRIED_SHARE = 0.2
-
 
 @dataclass(frozen=True, eq=False)
 class ProposalLasers:
-    """Laser points by which the vertices of walks are judged, the same for every batch of a capture."""
+    """Laser points by which the vertices of subpaths are judged, the same for every batch of a capture."""
 
     points: WallPoints
     count: int
     are_all: bool  # whether the capture has no others; otherwise every vertex is given a chance
+    untried_share: float = DEFAULT_TUNING.untried_share
 
 
 @dataclass(frozen=True, eq=False)
 class SubpathVertex:
-    """One vertex of every walk, chosen in proportion to the light it is expected to bring; one lane per walk."""
+    """One vertex of every subpath, chosen in proportion to the light it is expected to bring; one lane per subpath."""
 
     position: mi.Point3f
     normal: mi.Normal3f  # geometric
     shading: mi.Normal3f
     shape: mi.ShapePtr
-    carried: mi.Spectrum  # of the walk up to the vertex, its reflectance / pi included
-    opl: mi.Float  # from the site [engine units]
+    carried: mi.Spectrum  # throughput up to the vertex, its reflectance / pi included
+    opl: mi.Float  # from the VPL [engine units]
     bounce: mi.UInt32  # of a connection to the laser
     expected: mi.Float  # light expected of the vertex chosen
-    total: mi.Float  # light expected of all vertices of the walk
+    total: mi.Float  # light expected of all vertices of the subpath
 
 
 @dataclass(frozen=True, eq=False)
 class VplContributions:
-    """Light that leaves sites at known delays; those of one site lie together.
+    """Light that leaves VPLs at known delays; those of one VPL lie together.
 
-    ``values`` and ``delays`` have index laser * count + impulse. Of confocal captures, whose sensor points each have a
-    laser of their own, they leave out the way from the laser to the end of the walk.
+    ``values`` and ``delays`` have index laser * count + contribution. Of confocal captures, whose sensor points each
+    have a laser of their own, they leave out the way from the laser to the end of the subpath.
     """
 
     count: int
-    vpls: NDArray[np.int64]  # (count,) the site each leaves, ascending
+    vpls: NDArray[np.int64]  # (count,) the VPL each leaves, ascending
     bounces: mi.UInt32  # (count,)
-    values: mi.Spectrum  # radiance towards the sensor points, for the site's area
-    delays: mi.Float  # from the laser point to the site [bins]
-    ends: mi.Point3f  # (count,) where the laser's light meets the walk
+    values: mi.Spectrum  # radiance towards the sensor points, for the VPL's area
+    delays: mi.Float  # from the laser point to the VPL [bins]
+    ends: mi.Point3f  # (count,) where the laser's light meets the subpath
     shading: mi.Normal3f  # (count,) shading normals there
     offset: mi.Vector3f  # (count,) ray offset there, along the geometric normal
 
@@ -83,22 +82,22 @@ def trace_subpaths(
     time_gate: TimeGate | None,
     randomness: LaneRandomness,
 ) -> SubpathVertex:
-    """Walk on from sites until roulette, an escape or ``max_bounces`` ends it.
+    """Trace subpaths from VPLs until roulette, an escape or ``max_bounces`` ends them.
 
     Parameters
     ----------
     built
         The scene.
     vpls, reflectance
-        Where the walks begin, one lane per walk.
+        Where the subpaths begin, one lane each.
     proposal_lasers
         Lasers by which vertices are judged.
     max_bounces
         Highest bounce; None for no limit.
     time_gate
-        After which light comes too late, per walk; None: none does.
+        Beyond which light comes too late, per subpath; None: none does.
     randomness
-        One generator per walk.
+        One generator per subpath.
     """
     scene, wall, context = built.scene, mi.ShapePtr(built.wall_shape), mi.BSDFContext()
     generator = mi.PCG32(randomness.generator)
@@ -110,12 +109,12 @@ def trace_subpaths(
     ray = mi.Ray3f(offset_origin(built, vpls, direction), direction)
     alive = dr.any(throughput > 0) & (dr.dot(direction, vpls.n) > 0)
     origin = mi.Point3f(vpls.p)
-    opl = mi.Float(0)  # optical path length from the site [engine units]
+    opl = mi.Float(0)  # optical path length from the VPL [engine units]
     bounce = mi.UInt32(FIRST_BOUNCE + 1)  # of a connection from the last vertex
     position, normal, shading, shape = mi.Point3f(0), mi.Normal3f(0), mi.Normal3f(0), mi.ShapePtr(wall)
     carried, chosen_opl, chosen_bounce = mi.Spectrum(0), mi.Float(0), mi.UInt32(0)
     expected, total = mi.Float(0), mi.Float(0)
-    is_past_gate = mi.Bool(False)  # the walk can only find light that comes too late, and has survived that roulette
+    is_past_gate = mi.Bool(False)  # all light still to be found comes too late; survived that roulette
 
     while dr.hint(alive, exclude=[built, scene, proposal_lasers, vpls, time_gate]):
         # ---- Intersect -------------------------------------------------------------------------------------------
@@ -124,12 +123,12 @@ def trace_subpaths(
         opl += dr.norm(si.p - origin)
         bounce += 1
 
-        # ---- Thin out what comes after the window, once a walk -------------------------------------------------------
+        # ---- Roulette for what comes after the time window, once a subpath -----------------------------------------
         alive, is_past_gate, throughput = time_gate_roulette(
             time_gate, generator, alive, is_past_gate, opl, si.p, si.shape == wall, throughput
         )
 
-        # ---- What the lasers would bring, were nothing between; a plane is dark to its own laser points -------------
+        # ---- Light expected of the lasers, visibility aside; a plane is dark to its own laser points ---------------
         bsdf = si.bsdf()
         hidden = alive & (mi.Frame3f.cos_theta(si.wi) > 0)
         if dr.hint(built.wall.is_planar, mode="scalar"):
@@ -143,10 +142,11 @@ def trace_subpaths(
             lit += dr.mean(leaving * arriving(built, point, si.p, si.sh_frame.n)) / proposal_lasers.count
         if dr.hint(not proposal_lasers.are_all, mode="scalar"):
             away = dr.squared_norm(si.p - proposal_lasers.points.gather(mi.UInt32(0)).interaction.p)
-            lit += UNTRIED_SHARE * dr.mean(leaving) / away
+            lit += proposal_lasers.untried_share * dr.mean(leaving) / away
         if dr.hint(time_gate is not None, mode="scalar"):
             lit = dr.select(is_past_gate, lit * GATE_SURVIVAL, lit)
         lit = dr.select(hidden, lit, 0)
+        # reservoir sampling: of the vertices so far, each is chosen in proportion to its light
         total += lit
         pick = (lit > 0) & (generator.next_float32(alive) * total < lit)
         position, normal = dr.select(pick, si.p, position), dr.select(pick, si.n, normal)
@@ -159,8 +159,8 @@ def trace_subpaths(
         if dr.hint(max_bounces is not None, mode="scalar"):
             alive &= bounce < max_bounces
         lobe = generator.next_float32(alive)
-        at = mi.Point2f(generator.next_float32(alive), generator.next_float32(alive))
-        bs, weight = bsdf.sample(context, si, lobe, at, alive)
+        sample = mi.Point2f(generator.next_float32(alive), generator.next_float32(alive))
+        bs, weight = bsdf.sample(context, si, lobe, sample, alive)
         survival = dr.minimum(dr.max(weight), HIGHEST_SURVIVAL)
         alive &= generator.next_float32(alive) < survival
         throughput *= weight / dr.maximum(survival, 1e-9)
@@ -182,62 +182,61 @@ def arriving(built: BuiltScene, laser: WallPoints, point: mi.Point3f, shading: m
 
 @dataclass(frozen=True, eq=False)
 class SubpathPlan:
-    """How many walks are made for a capture, and what of them is kept."""
+    """How many subpaths are traced for a capture, and how many contributions are kept."""
 
-    replicas: int  # independent sets of sites
+    replicas: int  # independent sets of VPLs
     vpls: int  # per round and replica
-    subpaths: int  # per site
-    contributions: int  # kept per site, on average
+    subpaths: int  # per VPL
+    contributions: int  # kept per VPL, on average
     max_bounces: int | None
     is_confocal: bool
-    capture_gate: CaptureTimeGate | None  # beyond which light comes too late; None: none does
+    capture_gate: CaptureTimeGate | None  # None: no light comes too late
 
 
 def vpl_contributions(
     plan: SubpathPlan, params: LaunchParams, vpls: Vpls, proposal_lasers: ProposalLasers, seed: int
 ) -> VplContributions:
-    """Walk on from ``vpls`` and return what the lasers of the batch send back along the walks.
+    """Trace subpaths from ``vpls`` and return what the lasers of the batch send back along them.
 
     Parameters
     ----------
     plan
-        Numbers of walks and impulses.
+        Numbers of subpaths and contributions.
     params
         Scene and lasers.
     vpls
-        Where the walks begin: of one replica after the other.
+        Where the subpaths begin: of one replica after the other.
     proposal_lasers
         Lasers by which vertices are judged.
     seed
-        Of the walks' random numbers.
+        Of the subpaths' random numbers.
     """
     built = params.built
-    surface = surface_at(built, vpls.positions, vpls.normals, vpls.shapes, vpls.primitives, vpls.barycentric)
+    surface = surface_at(built, vpls)
     reflectance = normal_reflectance(surface)
     dr.eval(surface, reflectance)
-    row_of_lane = dr.arange(mi.UInt32, len(vpls) * plan.subpaths) // plan.subpaths
+    vpl = dr.arange(mi.UInt32, len(vpls) * plan.subpaths) // plan.subpaths
     time_gate = None
     if plan.capture_gate is not None:
         time_gate = plan.capture_gate.of_points(np.repeat(vpls.positions, plan.subpaths, axis=0))
     ends = trace_subpaths(
         built,
-        dr.gather(mi.SurfaceInteraction3f, surface, row_of_lane),
-        dr.gather(mi.Spectrum, reflectance, row_of_lane),
+        dr.gather(mi.SurfaceInteraction3f, surface, vpl),
+        dr.gather(mi.Spectrum, reflectance, vpl),
         proposal_lasers,
         plan.max_bounces,
         time_gate,
-        LaneRandomness.seeded(seed, dr.arange(mi.UInt32, dr.width(row_of_lane))),
+        LaneRandomness.seeded(seed, dr.arange(mi.UInt32, dr.width(vpl))),
     )
     dr.eval(ends)
     subpath, copies, share = _resample(ends, vpls, plan, np.random.default_rng(seed))
     if not len(subpath):
         return no_contributions()
-    if plan.is_confocal:
-        values, delays, lit = _unconnected(params, ends, subpath, copies * share)
-        n_lasers = 1
-    else:
-        values, delays, lit = _connect(params, ends, subpath, copies * share)
-        n_lasers = params.lasers_per_lane
+    end, scale = on_device(mi.UInt32, subpath), on_device(mi.Float, copies * share)
+    n_lasers = 1 if plan.is_confocal else params.lasers_per_lane
+    values, delays, lit = (
+        _unconnected(params, ends, end, scale) if plan.is_confocal else _connect(params, ends, end, scale)
+    )
     saved = dr.compress(lit)
     n_kept = dr.width(saved)
     if not n_kept:
@@ -248,50 +247,45 @@ def vpl_contributions(
     entry = index // per_laser * found + dr.gather(mi.UInt32, saved, index % per_laser)
     chosen = subpath[np.asarray(saved.numpy())]
     end = on_device(mi.UInt32, chosen)
+    si = _surface_of(ends, end)
+    shading = dr.gather(mi.Normal3f, ends.shading, end)
     contributions = VplContributions(
-        n_kept,
-        chosen // plan.subpaths,
-        dr.gather(mi.UInt32, ends.bounce, end),
-        dr.gather(mi.Spectrum, values, entry),
-        dr.gather(mi.Float, delays, entry),
-        dr.gather(mi.Point3f, ends.position, end),
-        dr.gather(mi.Normal3f, ends.shading, end),
-        _ray_offset(built, ends, end),
+        count=n_kept,
+        vpls=chosen // plan.subpaths,
+        bounces=dr.gather(mi.UInt32, ends.bounce, end),
+        values=dr.gather(mi.Spectrum, values, entry),
+        delays=dr.gather(mi.Float, delays, entry),
+        ends=si.p,
+        shading=shading,
+        offset=mi.Vector3f(offset_origin(built, si, shading) - si.p),
     )
-    dr.eval(
-        contributions.bounces,
-        contributions.values,
-        contributions.delays,
-        contributions.ends,
-        contributions.shading,
-        contributions.offset,
-    )
+    dr.eval(contributions)
     return contributions
 
 
 def no_contributions() -> VplContributions:
-    """Return what comes back when no walk finds light."""
+    """Return what comes back when no subpath finds light."""
     nothing = mi.UInt32(), mi.Spectrum(0), mi.Float(), mi.Point3f(), mi.Normal3f(), mi.Vector3f()
     return VplContributions(0, np.zeros(0, np.int64), *nothing)
 
 
-def _ray_offset(built: BuiltScene, ends: SubpathVertex, index: mi.UInt32) -> mi.Vector3f:
-    """Return the ray offset of the ends of walks, on the side of their shading normals."""
+def _surface_of(ends: SubpathVertex, index: mi.UInt32) -> mi.SurfaceInteraction3f:
+    """Return position, geometric normal and shape of the ends of subpaths: what ray offsets depend on."""
     si = dr.zeros(mi.SurfaceInteraction3f, dr.width(index))
     si.p, si.n = dr.gather(mi.Point3f, ends.position, index), dr.gather(mi.Normal3f, ends.normal, index)
     si.shape = dr.gather(mi.ShapePtr, ends.shape, index)
-    return mi.Vector3f(offset_origin(built, si, dr.gather(mi.Normal3f, ends.shading, index)) - si.p)
+    return si
 
 
 def _resample(
     ends: SubpathVertex, vpls: Vpls, plan: SubpathPlan, generator: np.random.Generator
 ) -> tuple[NDArray[np.int64], Float64, Float64]:
-    """Choose walks in proportion to what they bring to the sensor points, evenly along the sites.
+    """Choose subpaths in proportion to what they bring to the sensor points, by systematic resampling along the VPLs.
 
     Returns
     -------
     tuple
-        Walks (n,) ascending, how often each was chosen, and the value of one choice: radiance per expected light.
+        Subpaths (n,) ascending, how often each was chosen, and the value of one choice: radiance per expected light.
     """
     importance = np.repeat(vpls.importance, plan.subpaths)
     weights = ends.total.numpy().astype(np.float64) * importance
@@ -302,9 +296,9 @@ def _resample(
         total = cumulative[-1]
         if not total > 0:
             continue
-        at = (np.arange(count) + generator.random()) * (total / count)
+        position = (np.arange(count) + generator.random()) * (total / count)
         # never one without weight: the first whose cumulative weight exceeds the number
-        chosen = np.minimum(np.searchsorted(cumulative, at, side="right"), np.searchsorted(cumulative, total))
+        chosen = np.minimum(np.searchsorted(cumulative, position, side="right"), np.searchsorted(cumulative, total))
         subpath, repeats = np.unique(chosen + replica * per_replica, return_counts=True)
         subpaths.append(subpath)
         copies.append(repeats.astype(np.float64))
@@ -313,41 +307,37 @@ def _resample(
 
 
 def _unconnected(
-    params: LaunchParams, ends: SubpathVertex, subpath: NDArray[np.int64], scale: Float64
+    params: LaunchParams, ends: SubpathVertex, end: mi.UInt32, scale: mi.Float
 ) -> tuple[mi.Spectrum, mi.Float, mi.Bool]:
     """Return what chosen ends pass on of the light that will meet them there, its delay, and which pass on any."""
-    end = on_device(mi.UInt32, subpath)
-    values = dr.gather(mi.Spectrum, ends.carried, end) / dr.gather(mi.Float, ends.expected, end)
-    values *= on_device(mi.Float, scale)
+    values = dr.gather(mi.Spectrum, ends.carried, end) / dr.gather(mi.Float, ends.expected, end) * scale
     delays = dr.gather(mi.Float, ends.opl, end) * params.bins_per_unit
     dr.eval(values, delays)
     return values, delays, dr.any(values > 0)
 
 
 def _connect(
-    params: LaunchParams, ends: SubpathVertex, subpath: NDArray[np.int64], scale: Float64
+    params: LaunchParams, ends: SubpathVertex, end: mi.UInt32, scale: mi.Float
 ) -> tuple[mi.Spectrum, mi.Float, mi.Bool]:
-    """Connect chosen ends to every laser; return values and delays (laser * n + walk), and which bring any light."""
-    built, n = params.built, len(subpath)
+    """Connect chosen ends to every laser; return values and delays (laser * n + end), and which bring any light."""
+    built, n = params.built, dr.width(end)
     index = dr.arange(mi.UInt32, n * params.lasers_per_lane)
     per_laser = dr.opaque(mi.UInt32, n)
-    at = index % per_laser
-    end = dr.gather(mi.UInt32, on_device(mi.UInt32, subpath), at)
+    entry = index % per_laser
+    end = dr.gather(mi.UInt32, end, entry)
     lasers = params.lasers.gather(index // per_laser)
-    position = dr.gather(mi.Point3f, ends.position, end)
-    si = dr.zeros(mi.SurfaceInteraction3f, dr.width(index))
-    si.p, si.n, si.shape = position, dr.gather(mi.Normal3f, ends.normal, end), dr.gather(mi.ShapePtr, ends.shape, end)
-    to_laser = lasers.interaction.p - position
+    si = _surface_of(ends, end)
+    to_laser = lasers.interaction.p - si.p
     distance = dr.norm(to_laser)
     value = dr.gather(mi.Spectrum, ends.carried, end) / dr.gather(mi.Float, ends.expected, end)
-    value *= arriving(built, lasers, position, dr.gather(mi.Normal3f, ends.shading, end))
-    value *= dr.gather(mi.Float, on_device(mi.Float, scale), at)
+    value *= arriving(built, lasers, si.p, dr.gather(mi.Normal3f, ends.shading, end))
+    value *= dr.gather(mi.Float, scale, entry)
     active = dr.any(value > 0)
     segment = connection_segment(built, si, to_laser / distance, lasers.interaction)
     active &= ~built.scene.ray_test(segment, coherent=False, active=active)
     value = dr.select(active, value, 0)
     delays = (dr.gather(mi.Float, ends.opl, end) + distance) * params.bins_per_unit
     lit = dr.zeros(mi.UInt32, n)
-    dr.scatter(lit, mi.UInt32(1), at, active)  # of several lasers, all write the same; a reduction would know ``n``
+    dr.scatter(lit, mi.UInt32(1), entry, active)  # lasers write the same 1; a reduction would have ``n`` in its kernel
     dr.eval(value, delays, lit)
     return value, delays, lit > 0
