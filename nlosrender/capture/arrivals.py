@@ -15,7 +15,7 @@ from nlosrender.scene.bounding_box import Bounds, box_corners, distance_to_box, 
 from nlosrender.scene.pose import Float64
 from nlosrender.scene.walls.wall import RelayWall
 
-SAMPLED_POINTS = 32  # per grid; the filled share of the window hardly differs between neighbours
+SAMPLED_POINTS = 32  # per grid; neighbours fill nearly the same share of the window
 # Interactions that "n_bins: auto" makes room for: two bounces above the third, and four for a camera. Each adds at most
 # the scene's diameter; later light is reported as outside the window.
 MAX_EXTRA_BOUNCES = 2
@@ -166,7 +166,7 @@ def _third_bounce_spans(capture: Capture, hidden_bounds: Bounds) -> tuple[Float6
 
 
 def _latest_view(capture: Capture, bounds: Bounds | None, interactions: float) -> float:
-    """Return a bound on the optical path length to a camera after so many surface interactions, in vacuum [m].
+    """Return a bound on the optical path length to a camera after a number of surface interactions, in vacuum [m].
 
     The leg to the camera is at most as long as the way to the farthest corner of the scene's box, every other leg as
     its diagonal. Glass delays light by its refractive index.

@@ -151,7 +151,7 @@ def build_capture(capture_config: CaptureConfig, wall: RelayWall) -> Capture:
     Raises
     ------
     ConfigError
-        A grid does not fit the wall: of a mesh only its file tells how large it is.
+        A grid does not fit the wall; the size of a mesh wall is known from its file alone.
     ValueError
         A point is off the wall, or a value is out of range.
     """

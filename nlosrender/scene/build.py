@@ -29,7 +29,7 @@ from nlosrender.scene.read_surfaces import read_surfaces
 from nlosrender.scene.surfaces import ShapeDescription, Surface
 from nlosrender.scene.walls.wall import RelayWall
 
-MAX_REACH = 1e5  # hidden geometry over the wall's size: float32 then tells points 1 % of the wall apart
+MAX_REACH = 1e5  # hidden geometry over the wall's size: float32 then resolves 1 % of the wall
 MIN_EXTENT = 1e-12  # hidden geometry over the wall's size: the squares of areas stay numbers in float32
 EXACT_PLUGINS = ("Rectangle", "Disk", *ROUND_PLUGINS)  # intersections in closed form, as those of meshes
 
@@ -46,8 +46,8 @@ class BuiltScene:
     hidden_bounds: Bounds | None  # box around the hidden geometry [m, local frame]; None when there is none
     unit: float  # metres per engine unit of length, a power of two
     n_triangles: int  # of the hidden geometry; analytic shapes count as none
-    warnings: tuple[str, ...] = ()  # about what was left out, or hardly meant
-    meshes: tuple[MeshReport, ...] = ()  # what was read of mesh files
+    warnings: tuple[str, ...] = ()  # about what was left out, or is likely a mistake
+    meshes: tuple[MeshReport, ...] = ()  # of mesh files
 
     @property
     def all_flat(self) -> bool:

@@ -1,4 +1,4 @@
-"""Which way up pictures (textures) lie: their first row at a surface's ``up`` side, their first column at the left.
+"""Orientation of pictures (textures): their first row lies at a surface's ``up`` side, their first column at the left.
 
 Left is as seen from the front, the side that reflects. Mitsuba reads a picture's first row at v = 0, while its own
 rectangle and cylinder have v = 0 at the bottom, and its round shapes mirror a picture that is seen from within.
@@ -43,10 +43,8 @@ def round_plugin(radius: float, height: float | None, *, inside: bool, turned: b
 
     Parameters
     ----------
-    radius
-        [m].
-    height
-        Of the cylinder [m]; None: a sphere.
+    radius, height
+        [m]; height None: a sphere.
     inside
         Whether the front is the inner side.
     turned

@@ -44,8 +44,8 @@ class BuiltView:
     frame: Pose  # of the engine, in the scene
     unit: float  # metres per engine unit of length, a power of two
     n_triangles: int
-    warnings: tuple[str, ...] = ()  # about what was hardly meant
-    meshes: tuple[MeshReport, ...] = ()  # what was read of mesh files
+    warnings: tuple[str, ...] = ()  # about likely mistakes
+    meshes: tuple[MeshReport, ...] = ()  # of mesh files
 
     def to_engine(self, positions: ArrayLike) -> Float64:
         """Take positions (..., 3) [m] of the local frame to the engine's [engine units]."""

@@ -1,9 +1,9 @@
-"""Coincident surfaces: triangles in one place, or closer than rays tell apart, are moved apart by a ray offset or two.
+"""Coincident surfaces: triangles in one place, or closer than rays resolve, are moved apart by 1.25 gaps.
 
 Shadow rays end a ray offset (about 5e-7 of the scene's size) before a surface, and float32 intersections are good to
 about 1e-7: of two surfaces closer than that, both would be lit, or either one met by chance. The later of the two, in
-the order of the items and of the triangles of a mesh, is moved along its normal until the gap is wide enough to tell
-them apart. Visibility then decides as everywhere: what lies behind is dark, and their union counts once.
+the order of the items and of the triangles of a mesh, is moved along its normal by more than the gap that rays resolve.
+Visibility then decides as everywhere: what lies behind is dark, and their union counts once.
 """
 
 from __future__ import annotations
@@ -20,18 +20,21 @@ from nlosrender.scene.meshes.triangle_mesh import TriangleMesh, unit_rows
 from nlosrender.scene.pose import Float64
 from nlosrender.scene.triangle_point import triangle_weights
 
-GAP = 2e-6  # over 1 + the largest coordinate [engine units]: four times the ray offset
-MIN_POINTS = 2**16  # tried on all meshes of a scene
-STEP = 1.25  # gaps by which triangles are moved: what has been moved is not found again
-FLATNESS = 4.0  # gaps that the corners of a triangle may be off the plane of the other
-EDGE = 1e-3  # barycentric distance from an edge within which a neighbour in the same plane may be met
-DISK_POINTS = 4096  # tried on each disk; of crossing surfaces a hundredth is never within the gap
-MAX_LAYERS = 32  # so many layers in one place are told apart
+# over 1 + the largest coordinate [engine units]: four times the ray offset of 5e-7. A shadow ray leaves one surface by
+# an offset and ends another before the next; float32 rounds each by up to 1e-7
+GAP = 2e-6
+STEP = 1.25  # gaps by which triangles are moved: farther than the gap, so that they are not found again
+FLATNESS = 4.0  # gaps that the corners of a triangle may be off the plane of the other; surfaces that cross are farther
+EDGE = 1e-3  # barycentric distance from an edge within which float32 may meet a neighbour in the same plane
+MIN_POINTS = 2**16  # tried on all meshes of a scene: 65 of them lie in an overlap of 1e-3 of the area
+DISK_POINTS = 4096  # tried on each disk
+MIN_DISK_SHARE = 0.01  # of these within the gap: of surfaces that cross the disk it is a strip of about 1e-5
+MAX_LAYERS = 32  # in one place that are moved apart: each takes a pass, which loads the scene anew
 
 
 @dataclass(frozen=True, eq=False)
 class Overlap:
-    """Triangles of one mesh that lie in the same place as others."""
+    """Triangles of one mesh that coincide with others."""
 
     mesh: int
     other: int  # the mesh that most of them lie on
@@ -84,7 +87,7 @@ def overlaps(
 
 
 def coincident_disks(shapes: Sequence[mi.Shape]) -> list[tuple[int, int]]:
-    """Return pairs of a disk and a shape that lies where it is: disks are no triangles, and are not moved."""
+    """Return pairs of a disk and a shape that coincide: disks are no triangles, and are not moved."""
     pairs = []
     for number, shape in enumerate(shapes):
         others = [other for other in range(len(shapes)) if other != number]
@@ -97,7 +100,9 @@ def coincident_disks(shapes: Sequence[mi.Shape]) -> list[tuple[int, int]]:
         hit = scene.ray_intersect_preliminary(mi.Ray3f(sample.p + reach, -2 * reach, mi.Float(1), mi.Float(0), []))
         in_scene = list(scene.shapes())
         counts = np.bincount(np.array(hit.shape_index)[np.array(hit.is_valid())], minlength=len(in_scene))
-        pairs += [(number, other) for other in others if counts[in_scene.index(shapes[other])] > DISK_POINTS // 100]
+        pairs += [
+            (number, other) for other in others if counts[in_scene.index(shapes[other])] > MIN_DISK_SHARE * DISK_POINTS
+        ]
     return pairs
 
 
@@ -121,8 +126,8 @@ def moved_apart(mesh: TriangleMesh, faces: NDArray[np.bool_], *, both_sides: boo
 def _pairs(scene: mi.Scene, mesh: TriangleMesh, areas: Float64, first: mi.UInt32, seed: int) -> NDArray[np.uint32]:
     """Return pairs (2, n) of triangles of ``mesh`` in one plane, one within ``GAP`` before a point of the other.
 
-    ``areas`` (m,) are those of its triangles. ``first`` tells for each shape of the scene with which triangle of
-    ``mesh`` it begins, plus 1; 0 for other shapes.
+    ``areas`` (m,) are those of its triangles. ``first`` is, for each shape of the scene, the triangle of ``mesh`` that
+    it begins with, plus 1; 0 for other shapes.
     """
     count = max(MIN_POINTS, len(areas))
     copies = 1 + np.ceil(areas / areas.sum() * count).astype(np.intp)

@@ -1,4 +1,4 @@
-"""Triangles that lie in the same place twice: light would count both, although only one of them is met."""
+"""Removes duplicate triangles: light would count both, although rays meet only one of them."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from nlosrender.scene.meshes.triangle_mesh import TriangleMesh
 
+# 2^64 over the golden ratio, and two primes of xxHash64: products with odd numbers of many bits mix a coordinate's bits
 _MULTIPLIERS = np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9], dtype=np.uint64)
 
 
@@ -33,7 +34,7 @@ def first_of_doubles(corners: NDArray[np.floating], *, both_sides: bool) -> NDAr
     _, first, group = np.unique(keys, return_index=True, return_inverse=True)
     if len(first) == len(keys):
         return twins
-    suspects = np.flatnonzero(np.bincount(group)[group] > 1)  # the same key may be chance: look closely at these few
+    suspects = np.flatnonzero(np.bincount(group)[group] > 1)  # equal keys may be chance: these few are compared
     order = np.lexsort(np.moveaxis(corners[suspects], -1, 0)[::-1], axis=-1)
     sorted_corners = np.take_along_axis(corners[suspects], order[..., None], axis=1).reshape(len(suspects), 9)
     if not both_sides:

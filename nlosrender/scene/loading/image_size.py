@@ -1,4 +1,4 @@
-"""The size of image files, read from their headers: a file of a kilobyte may unpack to more memory than there is."""
+"""Refuses huge images by their headers: a file of a kilobyte may unpack to more memory than there is."""
 
 from __future__ import annotations
 
@@ -20,13 +20,7 @@ def image_files(plugin: Mapping[str, object]) -> Iterator[Path]:
 
 
 def check_image(path: Path) -> None:
-    """Refuse an image that would unpack to more than ``MAX_TEXELS``; of formats not known here nothing is said.
-
-    Raises
-    ------
-    ValueError
-        It is too large.
-    """
+    """Raise ValueError for an image that would unpack to more than ``MAX_TEXELS``; other formats pass unchecked."""
     size = _exr_size(path) if path.suffix.lower() == ".exr" else _bitmap_size(path)
     if size is not None and size[0] * size[1] > MAX_TEXELS:
         raise ValueError(f"{path} has {size[0]} x {size[1]} texels, need at most {MAX_TEXELS:_}. Scale it down.")
@@ -37,7 +31,7 @@ def _bitmap_size(path: Path) -> tuple[int, int] | None:
 
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # our own limit is below its
+            warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # ours is the limit
             with Image.open(path) as image:
                 return image.size
     except Image.DecompressionBombError as error:

@@ -16,10 +16,10 @@ from nlosrender.scene.loading.image_size import check_image, image_files
 from nlosrender.scene.surfaces import Radiance
 from nlosrender.scene.transforms import transform_matrix
 
-TEXEL_ROUNDING = 1e-3  # half-precision images and their filters may pass 1 a little
-_SOURCE = re.compile(r"\[\w+\.(?:cpp|h|py):\d+\] |At dictionary node \"root\": ")
+TEXEL_ROUNDING = 1e-3  # half-precision images, of 2^-11, and their filters may pass 1 a little
 BENDING = ("RoughDielectric", "Principled")  # BSDF classes that refract in directions a connection can take
 TRANSFORMS = ("to_world", "to_uv")  # keys of a plugin that hold a matrix or a list of steps
+_SOURCE = re.compile(r"\[\w+\.(?:cpp|h|py):\d+\] |At dictionary node \"root\": ")
 
 
 def load_bsdf(bsdf: Mapping[str, object], key: str) -> mi.BSDF:
@@ -36,10 +36,8 @@ def load_bsdf(bsdf: Mapping[str, object], key: str) -> mi.BSDF:
         loaded = mi.load_dict(mitsuba_value(bsdf))
     except (RuntimeError, TypeError, ValueError) as error:
         raise ConfigError.at(key, f"Mitsuba rejects this BSDF: {first_line(error)}") from error
-    parameters = mi.traverse(loaded)
-    for name in parameters.keys():  # noqa: SIM118  # not its items: some of other parameters cannot be read
-        if name.endswith(".data"):
-            _check_texels(np.asarray(parameters[name]), name.removesuffix(".data"), f"{key}.{name.split('.')[0]}")
+    for name, values in _parameters(loaded, "", (".data",)):
+        _check_texels(values, name.removesuffix(".data"), f"{key}.{name.split('.')[0]}")
     return loaded
 
 
@@ -118,7 +116,7 @@ def index_behind(bsdf: mi.BSDF) -> float:
 
 
 def medium_warnings(surfaces: Iterable[tuple[str, mi.Shape]]) -> tuple[str, ...]:
-    """Return a sentence for each surface, told by its key, that light enters bent and unbent: a mask over glass.
+    """Return a sentence for each (key, shape) that light enters bent and unbent, such as a mask over glass.
 
     Refractive indices are counted at every crossing, and a crossing that does not bend counts none.
     """
@@ -126,17 +124,15 @@ def medium_warnings(surfaces: Iterable[tuple[str, mi.Shape]]) -> tuple[str, ...]
         f"{key}: light crosses it bent as well as unbent, and which medium it is in behind is a guess: arrival times "
         "there are wrong. Leave out the mask, null or thin part of its BSDF, or its glass."
         for key, shape in surfaces
-        if shape.bsdf().flags() & mi.BSDFFlags.Null and _bends_and_does_not(list(_innermost(shape.bsdf())))
+        if shape.bsdf().flags() & mi.BSDFFlags.Null and _bends_in_part(shape.bsdf())
     )
 
 
-def _bends_and_does_not(parts: list[mi.BSDF]) -> bool:
-    return any(_bends(part) for part in parts) and any(part.flags() & mi.BSDFFlags.Null for part in parts)
-
-
-def _bends(bsdf: mi.BSDF) -> bool:
+def _bends_in_part(bsdf: mi.BSDF) -> bool:
     bent = mi.BSDFFlags.DeltaTransmission | mi.BSDFFlags.GlossyTransmission
-    return bool(bsdf.class_name() in (*BENDING, "SmoothDielectric") and bsdf.flags() & bent)
+    parts = list(_innermost(bsdf))
+    bends = any(part.class_name() in (*BENDING, "SmoothDielectric") and part.flags() & bent for part in parts)
+    return bends and any(part.flags() & mi.BSDFFlags.Null for part in parts)
 
 
 def _innermost(bsdf: mi.BSDF) -> Iterator[mi.BSDF]:
@@ -144,8 +140,8 @@ def _innermost(bsdf: mi.BSDF) -> Iterator[mi.BSDF]:
 
     A BSDF that holds none yields itself, and a mask with holes an empty BSDF for them.
     """
-    above = mi.traverse(bsdf).hierarchy  # of every part, textures too: what it is part of, and how deep
-    parts = [part for part, (holder, _) in above.items() if isinstance(part, mi.BSDF) and holder is bsdf]
+    holders = mi.traverse(bsdf).hierarchy  # of every part, textures too: what it is part of, and how deep
+    parts = [part for part, (holder, _) in holders.items() if isinstance(part, mi.BSDF) and holder is bsdf]
     if bsdf.class_name() == "MaskBSDF":
         low, high = _extremes(bsdf, "opacity")
         parts = parts if high > 0 else []
@@ -161,15 +157,20 @@ def _innermost(bsdf: mi.BSDF) -> Iterator[mi.BSDF]:
 
 
 def _extremes(bsdf: mi.BSDF, texture: str) -> tuple[float, float]:
-    """Return the least and the largest value of a texture of a BSDF; 0 and 1 where it does not tell."""
-    parameters = mi.traverse(bsdf)
-    # not its items: some of other parameters cannot be read
-    names = [name for name in parameters.keys() if name.startswith(f"{texture}.")]  # noqa: SIM118
-    told = [np.ravel(np.asarray(parameters[name])) for name in names if name.endswith((".value", ".data"))]
-    if not told:
+    """Return the least and the largest value of a texture of a BSDF; 0 and 1 where they are not known."""
+    found = _parameters(bsdf, f"{texture}.", (".value", ".data"))
+    values = [part / 255 if part.dtype.kind == "u" else part for _, part in found]  # 8 bits: 0 to 1
+    if not values:
         return 0.0, 1.0
-    values = np.concatenate([part / 255 if part.dtype.kind == "u" else part for part in told])  # 8 bits: 0 to 1
-    return float(values.min()), float(values.max())
+    return float(min(part.min() for part in values)), float(max(part.max() for part in values))
+
+
+def _parameters(bsdf: mi.BSDF, prefix: str, suffixes: tuple[str, ...]) -> Iterator[tuple[str, NDArray]]:
+    """Yield names and values of the parameters of a BSDF's textures."""
+    parameters = mi.traverse(bsdf)
+    for name in parameters.keys():  # noqa: SIM118  # not its items: some of other parameters cannot be read
+        if name.startswith(prefix) and name.endswith(suffixes):
+            yield name, np.ravel(np.asarray(parameters[name]))
 
 
 def _index_of(bsdf: mi.BSDF) -> float:
@@ -178,7 +179,7 @@ def _index_of(bsdf: mi.BSDF) -> float:
     parameters = dict(mi.traverse(bsdf))
     if "eta" in parameters:
         return float(np.ravel(parameters["eta"])[0])
-    # a principled BSDF told by its reflectance along the normal, 0.08 specular = ((eta - 1) / (eta + 1))^2
+    # a principled BSDF has its reflectance along the normal, 0.08 specular = ((eta - 1) / (eta + 1))^2
     return float(2 / (1 - math.sqrt(0.08 * np.ravel(parameters["specular"])[0])) - 1)
 
 
@@ -189,10 +190,9 @@ def _check_texels(values: NDArray, name: str, key: str) -> None:
     most = 1.0 if "reflectance" in name or "color" in name else float("inf")
     wrong = ~((values >= 0) & (values <= most * (1 + TEXEL_ROUNDING)) & np.isfinite(values))
     if wrong.any():
-        found, need = float(values[wrong][0]), "from 0 to 1" if most == 1 else "finite and not negative"
-        raise ConfigError.at(
-            key, f"{int(wrong.sum())} of {values.size} values of the image, such as {found:g}, are not {need}."
-        )
+        need = "from 0 to 1" if most == 1 else "finite and not negative"
+        message = f"{int(wrong.sum())} of {values.size} values of the image, such as {float(values[wrong][0]):g}"
+        raise ConfigError.at(key, f"{message}, are not {need}.")
 
 
 def first_line(error: BaseException) -> str:

@@ -12,25 +12,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 VERTEX_COLOR = "vertex_color"  # the name Mitsuba has for them
-ROUNDING = 1e-6  # of float32
+ROUNDING = 1e-6  # ten times that of float32: values may pass 1 by it
 
 
 @dataclass(frozen=True)
 class AttributeUse:
-    """A texture that reads an attribute."""
+    """A texture that reads an attribute of a mesh."""
 
-    parameter: str  # of the BSDF: what it is used as
+    parameter: str  # of the BSDF that the texture sets
     name: str
     scale: float = 1.0
 
     def check(self, attributes: Mapping[str, NDArray]) -> None:
-        """Refuse an attribute that is not there, or whose values cannot be.
-
-        Raises
-        ------
-        ValueError
-            Says what the surface has, or which value is wrong.
-        """
+        """Raise ValueError for an attribute that is not there, or has values that the parameter cannot have."""
         if self.name not in attributes:
             there = ", ".join(attributes) or "none"
             raise ValueError(f"{self.parameter}: the surface has no attribute {self.name} (it has: {there})")

@@ -1,4 +1,4 @@
-"""Spheres and cylinders as Mitsuba has them, and concentric ones that rays do not tell apart."""
+"""Spheres and cylinders as Mitsuba has them, and new radii for concentric ones that rays cannot resolve."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class RoundSurface:
 
     @property
     def gap(self) -> float:
-        """Distance from which rays tell it from a concentric one: four ray offsets, see ``ray_offset_at``."""
+        """Distance from which rays resolve it and a concentric one: four ray offsets, see ``ray_offset_at``."""
         farthest = np.abs([self.centre, self.centre + self.axis]).max() + self.radius
         return float(GAP * (1 + farthest) * max(1.0, 1 / self.radius))
 
@@ -58,7 +58,7 @@ class RoundSurface:
 
 @dataclass(frozen=True)
 class Nested:
-    """A sphere or cylinder that is given another radius, so that rays tell it from a concentric one."""
+    """A sphere or cylinder that is given another radius, so that rays resolve it and a concentric one."""
 
     moved: int  # its number
     other: int  # the next one
@@ -72,7 +72,7 @@ def curvature(shape: mi.Shape) -> float:
 
 
 def nested_surfaces(shapes: Sequence[mi.Shape], wall: mi.Shape) -> list[Nested]:
-    """Return which spheres and cylinders get another radius: of those as near to a concentric one as rays can tell.
+    """Return which spheres and cylinders get another radius: of those too near to a concentric one for rays.
 
     Of surfaces with one radius the later one is in front: outermost where they are seen from outside, innermost where
     they are seen from within, and these lie inside the former. Before a round relay wall hidden surfaces are in front.
@@ -87,10 +87,10 @@ def nested_surfaces(shapes: Sequence[mi.Shape], wall: mi.Shape) -> list[Nested]:
             if one is not other:
                 one |= other
                 groups.remove(other)
-    return [nested for group in groups if len(group) > 1 for nested in _spread({n: surfaces[n] for n in group})]
+    return [nested for group in groups if len(group) > 1 for nested in _separated({n: surfaces[n] for n in group})]
 
 
-def _spread(group: Mapping[int, RoundSurface]) -> list[Nested]:
+def _separated(group: Mapping[int, RoundSurface]) -> list[Nested]:
     """Return the new radii of concentric surfaces, from the one that is seen inwards and outwards."""
     gap = max(surface.gap for surface in group.values())
     apart = max(a.distance_of_axes(b) for a, b in itertools.permutations(group.values(), 2))

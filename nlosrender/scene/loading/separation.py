@@ -1,4 +1,4 @@
-"""Loads the hidden surfaces so that rays tell them apart: coincident ones are moved, with a warning for each item."""
+"""Loads the hidden surfaces, coincident ones moved apart so that rays resolve them, with a warning for each item."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A whole Mitsuba scene from XML: its shapes are measured here first, and what Mitsuba says is told by line."""
+"""Loads a whole Mitsuba scene from XML: shapes are measured first, and Mitsuba's errors are given by line."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from nlosrender.errors import ConfigError
 from nlosrender.scene.bounding_box import box_corners
 from nlosrender.scene.loading.image_size import check_image
 from nlosrender.scene.loading.materials import first_line
-from nlosrender.scene.loading.mitsuba_shapes import load_flat_serialized, shape_bounds
+from nlosrender.scene.loading.mitsuba_shapes import load_flat_serialized, shape_bounds, triangles_of
 from nlosrender.scene.loading.xml_textures import check_attributes, has_two_sides, picture_warnings
 from nlosrender.scene.meshes.file_mesh import FileMesh
 from nlosrender.scene.meshes.mesh_file import read_mesh_file
@@ -32,7 +32,7 @@ from nlosrender.scene.surfaces import MESH_PLUGINS, ShapeDescription
 from nlosrender.scene.transforms import transform_matrix
 
 WHERE = "scene.mitsuba"
-SAME_AREA = 0.01  # float32, and bent quadrangles cut along the other diagonal
+MAX_AREA_DIFFERENCE = 0.01  # of float32, and of bent quadrangles cut along the other diagonal; misread files lose more
 _AS_ITEM = "Write it as triangles, or take it as an item of scene.hidden_geometry."
 _ADVICE = "Check its size and its transformation."
 _UNKNOWN = re.compile(r"string \(line (\d+), col \d+\): Found \d+ unreferenced propert")
@@ -46,7 +46,7 @@ def load_xml_scene(path: Path) -> tuple[mi.Scene, tuple[MeshReport, ...], tuple[
     Returns
     -------
     tuple
-        The scene; what is in its mesh files; and what was left out of it or is hardly meant, a sentence each.
+        The scene; reports of its mesh files; and a sentence for everything left out of it or likely a mistake.
 
     Raises
     ------
@@ -54,7 +54,7 @@ def load_xml_scene(path: Path) -> tuple[mi.Scene, tuple[MeshReport, ...], tuple[
         It is not allowed, a shape has no extent or no bounds in float32, a file it names cannot be used, or Mitsuba
         rejects it; the line is named where there is one.
     """
-    told: list[str] = []
+    warnings: list[str] = []
     meshes: list[MeshReport] = []
     try:
         root, _ = read_mitsuba_xml(path)
@@ -64,16 +64,16 @@ def load_xml_scene(path: Path) -> tuple[mi.Scene, tuple[MeshReport, ...], tuple[
             check_attributes(shape, with_id)
             if read is not None:
                 meshes.append(_report(shape, read))
-                told += meshes[-1].warnings(read, has_two_sides=has_two_sides(shape, with_id))
-                told += picture_warnings(shape, with_id, read.mesh)
+                warnings += meshes[-1].warnings(read, has_two_sides=has_two_sides(shape, with_id))
+                warnings += picture_warnings(shape, with_id, read.mesh)
         for image in image_files(root):
             check_image(image)
     except ValueError as error:
         raise ConfigError.at(WHERE, f"{path}: {error}.") from error
-    scene, warnings = _loaded(root, path)
+    scene, left_out = _loaded(root, path)
     for shape in scene.shapes():
         _check_bounds(shape, path)
-    return scene, tuple(meshes), (*told, *warnings)
+    return scene, tuple(meshes), (*warnings, *left_out)
 
 
 def _loaded(root: Element, path: Path) -> tuple[mi.Scene, tuple[str, ...]]:
@@ -88,8 +88,8 @@ def _loaded(root: Element, path: Path) -> tuple[mi.Scene, tuple[str, ...]]:
             names = _PARAMETER.findall(str(error))
             plugin = elements[int(unknown[1]) - 1] if unknown else None
             if plugin is None or not any(child.get("name") in names for child in plugin):
-                told = _LINE.sub(lambda found: place_of(elements[int(found[1]) - 1]), first_line(error))  # noqa: B023
-                raise ConfigError.at(WHERE, f"{path}: Mitsuba rejects this scene: {told}.") from error
+                message = _LINE.sub(lambda found: place_of(elements[int(found[1]) - 1]), first_line(error))  # noqa: B023
+                raise ConfigError.at(WHERE, f"{path}: Mitsuba rejects this scene: {message}.") from error
             warnings.append(_without_parameters(plugin, names))
 
 
@@ -108,8 +108,7 @@ def _check_shape(shape: Element) -> FileMesh | None:
     """
     parameters, to_world = shape_parameters(shape), _to_world(shape)
     try:
-        read = _file_of(parameters)
-        mesh = _mesh_of(parameters) if read is None else read.mesh
+        read, mesh = _mesh_of(parameters)
         box = ShapeDescription(parameters).bounds() if mesh is None else mesh.bounds()
         if box is None:
             return None  # only Mitsuba knows its extent
@@ -131,7 +130,7 @@ def _to_world(shape: Element) -> Float64:
 
 
 def _report(shape: Element, read: FileMesh) -> MeshReport:
-    """Return what there is to say of a mesh, with the normals that Mitsuba gives it."""
+    """Return the report of a mesh, with the normals that Mitsuba gives it."""
     parameters = shape_parameters(shape)
     mesh, normals = with_normals(read.mesh, "flat" if parameters.get("face_normals") is True else "mitsuba")
     mesh = mesh.transformed(_to_world(shape))
@@ -140,42 +139,23 @@ def _report(shape: Element, read: FileMesh) -> MeshReport:
     return mesh_report(WHERE, name, Path(str(parameters["filename"])).name, read, mesh, normals, None)
 
 
-def _file_of(parameters: Mapping[str, object]) -> FileMesh | None:
-    """Return what the .obj or .ply file of a shape holds; None for a shape without."""
+def _mesh_of(parameters: Mapping[str, object]) -> tuple[FileMesh | None, TriangleMesh | None]:
+    """Return what the .obj or .ply file of a shape holds, and the shape's triangles in its own coordinates.
+
+    None for a shape without.
+    """
     kind, filename = str(parameters["type"]), str(parameters.get("filename"))
-    if kind not in MESH_PLUGINS:
-        return None
-    try:
-        read = read_mesh_file(filename, kind)
-        _check_reading(filename, kind, read.mesh)
-    except ValueError as error:
-        raise ValueError(f"{filename} cannot be used as a mesh: {error}") from error
-    return read
-
-
-def _mesh_of(parameters: Mapping[str, object]) -> TriangleMesh | None:
-    """Return the triangles of another shape that has some, in its own coordinates; None for one without."""
-    kind = str(parameters["type"])
     if kind in ("cube", "disk", "rectangle"):
-        return _unit_mesh(is_flat=kind != "cube")
-    if kind != "serialized":
-        return None
+        return None, _unit_mesh(is_flat=kind != "cube")
     try:
-        return _serialized(parameters)
-    except ValueError as error:
-        raise ValueError(f"{parameters['filename']} cannot be used as a mesh: {error}") from error
-
-
-def _serialized(parameters: Mapping[str, object]) -> TriangleMesh:
-    """Return the triangles of a mesh in Mitsuba's own format."""
-    try:
-        mesh = load_flat_serialized(parameters)
-    except RuntimeError as error:
-        raise ValueError(first_line(error)) from error
-    arrays = mi.traverse(mesh)
-    return TriangleMesh(
-        np.reshape(arrays["vertex_positions"], (-1, 3)), np.reshape(arrays["faces"], (-1, 3)).astype(np.uint32)
-    )
+        if kind in MESH_PLUGINS:
+            read = read_mesh_file(filename, kind)
+            _check_reading(filename, kind, read.mesh)
+            return read, read.mesh
+        return None, triangles_of(load_flat_serialized(parameters)) if kind == "serialized" else None
+    except (RuntimeError, ValueError) as error:
+        reason = first_line(error) if isinstance(error, RuntimeError) else error
+        raise ValueError(f"{filename} cannot be used as a mesh: {reason}") from error
 
 
 def _check_reading(filename: str, kind: str, mesh: TriangleMesh) -> None:
@@ -185,7 +165,7 @@ def _check_reading(filename: str, kind: str, mesh: TriangleMesh) -> None:
         area = float(np.ravel(theirs.surface_area())[0])
     except RuntimeError as error:
         raise ValueError(f"Mitsuba cannot read it: {first_line(error)}. {_AS_ITEM}") from error
-    if abs(area - mesh.area) > SAME_AREA * mesh.area:
+    if abs(area - mesh.area) > MAX_AREA_DIFFERENCE * mesh.area:
         raise ValueError(f"Mitsuba reads {area:.4g} of its {mesh.area:.4g} square units. {_AS_ITEM}")
 
 
