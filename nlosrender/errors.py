@@ -6,7 +6,7 @@ Only ``cli/`` catches these and exits; everything else raises them.
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal, Self, TypeAlias
 
 EXIT_OK = 0
@@ -46,6 +46,10 @@ class ValidationIssue:
     def at_key(cls, key: str, message: str) -> Self:
         """Return the issue of a dotted key."""
         return cls(tuple(int(part) if part.isdigit() else part for part in key.split(".")), message)
+
+    def below(self, path: KeyPath) -> Self:
+        """Return the issue of a section, or of a value, as that of the whole it stands in at ``path``."""
+        return replace(self, path=(*path, *self.path))
 
     def __str__(self) -> str:
         return ": ".join(part for part in (self.place, self.key, self.message) if part)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from nlosrender.cli.json_output import OUTPUT
-from nlosrender.cli.options import AsJson, ConfigFile, Overrides, config_places
+from nlosrender.cli.options import AsJson, ConfigFile, Overrides
 
 if TYPE_CHECKING:
     from nlosrender.analysis.engine_check import EngineCheck, PairCheck
@@ -44,12 +44,12 @@ def check_engines(
     small a difference would have been seen)
     """
     from nlosrender.analysis import engine_check
-    from nlosrender.config.load import load_config
+    from nlosrender.config.load import config_of, load_document
     from nlosrender.errors import EXIT_COMPARISON_EXCEEDED, EXIT_FAILURE, EXIT_OK, ComparisonError, RenderError
 
-    changes = list(overrides or [])
-    loaded = load_config(config, changes)
-    with config_places(config, changes):
+    document = load_document(config, overrides or ())
+    loaded = config_of(document)
+    with document.placing_issues():
         check = engine_check.check_engines(
             loaded,
             points_per_axis=points,

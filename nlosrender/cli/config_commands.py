@@ -62,9 +62,8 @@ def validate(
     Example: nlosrender validate z.yaml --set render.spp=64 (creates nothing; prints ok or every mistake with its
     line, exit code 3)
     """
-    from nlosrender.config.load import load_config
-    from nlosrender.config.places import with_places
-    from nlosrender.config.sweep_load import load_sweep
+    from nlosrender.config.load import config_of, load_document
+    from nlosrender.config.sweep_load import sweep_of
     from nlosrender.config.warnings import config_warnings
 
     issues: list[ValidationIssue] = []
@@ -72,15 +71,13 @@ def validate(
     meshes: list[MeshReport] = []
     for path in configs:
         try:
-            sweep = load_sweep(path, overrides or ())
-            config = load_config(path, overrides or ()) if sweep is None else sweep.config(0)
+            document = load_document(path, overrides or ())
+            sweep = sweep_of(document)
+            config = config_of(document) if sweep is None else sweep.config(0)
+            with document.placing_issues():
+                own_meshes, lines, doubts = _meshes_of(config)
         except ConfigError as error:
             issues += error.issues
-            continue
-        try:
-            own_meshes, lines, doubts = _meshes_of(config)
-        except ConfigError as error:
-            issues += with_places(error, path, overrides or ()).issues
             continue
         found = [f"{path}: {warning}" for warning in (*config_warnings(config), *doubts)]
         warnings += found

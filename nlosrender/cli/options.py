@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated
 
@@ -22,24 +21,6 @@ Overrides = Annotated[
 ]
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="No progress, no report; warnings stay.")]
-
-
-@contextmanager
-def config_places(path: Path, overrides: Sequence[str]) -> Iterator[None]:
-    """Add file, line and column to the mistakes in a configuration that only a render finds.
-
-    Raises
-    ------
-    ConfigError
-        One left the block.
-    """
-    from nlosrender.config.places import with_places
-    from nlosrender.errors import ConfigError
-
-    try:
-        yield
-    except ConfigError as error:
-        raise with_places(error, path, overrides) from error
 
 
 def beside(file: Path, ending: str) -> Path:

@@ -9,7 +9,7 @@ import typer
 
 from nlosrender.capture.bounces import LINE_OF_SIGHT
 from nlosrender.cli.json_output import OUTPUT
-from nlosrender.cli.options import AsJson, ConfigFile, Overrides, config_places
+from nlosrender.cli.options import AsJson, ConfigFile, Overrides
 from nlosrender.cli.tables import print_table
 from nlosrender.readable import readable_duration, readable_size
 
@@ -29,16 +29,16 @@ def plan(config: ConfigFile, overrides: Overrides = None, as_json: AsJson = Fals
     and why, what is skipped, memory, file size and an estimate of the time)
     """
     from nlosrender.analysis.render_plan import plan_render
-    from nlosrender.config.load import load_config
-    from nlosrender.config.sweep_load import load_sweep
+    from nlosrender.config.load import config_of, load_document
+    from nlosrender.config.sweep_load import sweep_of
 
-    changes = list(overrides or [])
-    sweep = load_sweep(config, changes)
-    with config_places(config, changes):
+    document = load_document(config, overrides or ())
+    sweep = sweep_of(document)
+    with document.placing_issues():
         if sweep is not None:
             _plan_all(sweep, as_json)
             return
-        found = plan_render(load_config(config, changes))
+        found = plan_render(config_of(document))
     if as_json:
         OUTPUT.print(found.as_json())
         return

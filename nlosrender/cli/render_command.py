@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from enum import StrEnum
 from pathlib import Path
@@ -20,7 +20,6 @@ from nlosrender.cli.options import (
     ConfigFile,
     Overrides,
     Quiet,
-    config_places,
     refuse_folder,
     two_numbers,
 )
@@ -94,8 +93,8 @@ def render(
         hint = "--workers" if scheduler is None else "--scheduler"
         raise typer.BadParameter("needs --executor dask", param_hint=hint)
 
-    from nlosrender.config.load import load_config
-    from nlosrender.config.sweep_load import load_sweep
+    from nlosrender.config.load import config_of, load_document
+    from nlosrender.config.sweep_load import sweep_of
     from nlosrender.files.atomic_write import refuse_sources
     from nlosrender.pipeline import render_capture
 
@@ -103,18 +102,19 @@ def render(
     if output is not None:
         refuse_folder(output, "capture.hdf5")
         changes.append(f"output.path={json.dumps(str(output))}")  # JSON is YAML: "1e3" or "yes" stay text
-    sweep = load_sweep(config, changes)
+    document = load_document(config, changes)
+    sweep = sweep_of(document)
     if sweep is not None:
         if lasers is not None:
             raise typer.BadParameter("cuts one capture, not a sweep; use --shard", param_hint="--lasers")
         with _cluster(executor, scheduler, workers) as cluster:
             how = functools.partial(render_capture, cluster=cluster, strict=strict)
-            _render_all(sweep, changes, how, shard=selection.shard, resume=resume, quiet=quiet, as_json=as_json)
+            _render_all(sweep, how, shard=selection.shard, resume=resume, quiet=quiet, as_json=as_json)
         return
-    loaded = load_config(config, changes)
+    loaded = config_of(document)
     refuse_sources(loaded.output.path, [config])
     with (
-        config_places(config, changes),
+        document.placing_issues(),
         _cluster(executor, scheduler, workers) as cluster,
         reporting("render", quiet) as listeners,
     ):
@@ -129,7 +129,6 @@ def render(
 
 def _render_all(
     sweep: Sweep,
-    overrides: Sequence[str],
     render_capture: Callable[..., RenderReport],
     *,
     shard: tuple[int, int] | None,
@@ -144,7 +143,7 @@ def _render_all(
     with reporting("sweep", quiet) as listeners:
 
         def render(config: Config, progress: Progress, warn: Warn, resume: bool | None) -> RenderReport:
-            with config_places(Path(sweep.source), overrides):  # a capture that fails is reported by the sweep
+            with sweep.document.placing_issues():  # a capture that fails is reported by the sweep
                 return render_capture(config, progress, warn, resume=resume, watch=listeners.watch)
 
         report = render_sweep(sweep, render, shard=shard, resume=resume, **listeners._asdict())

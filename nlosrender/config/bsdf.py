@@ -26,9 +26,9 @@ from nlosrender.config.bsdf_table import (
 )
 from nlosrender.config.fields import Checked, as_finite
 from nlosrender.config.frozen import FrozenDict
+from nlosrender.config.issues import did_you_mean
 from nlosrender.config.plugin_check import TRANSFORM_KEYS, PluginCheck, checked_plugin
-from nlosrender.config.refusal import listed
-from nlosrender.errors import KeyPath, nearest
+from nlosrender.errors import KeyPath
 
 _NAMES = {  # known ones only: Mitsuba makes a file name of a metal's
     Kind.MATERIAL: (NO_METAL, *METALS),
@@ -51,7 +51,7 @@ def check_bsdf(value: Any, validation: ValidationInfo) -> FrozenDict:
 
     Raises
     ------
-    pydantic.ValidationError
+    InvalidValue
         Unknown type or parameter, a value out of range, a missing file; all of them at once.
     """
     return checked_plugin(lambda check, bsdf: _bsdf(check, bsdf, ()), value, validation)
@@ -122,10 +122,9 @@ def _is_texture(value: object) -> bool:
 
 def _unknown_parameter(check: PluginCheck, kind: str, key: str, path: KeyPath) -> None:
     known = list(BSDF_PARAMETERS[kind])
-    close = nearest(key, known)
-    hint = f" Did you mean {close}?" if close else ""
-    allowed = listed(known) if known else "nested BSDFs only"
-    check.fault(path, f"unknown parameter of the {kind} BSDF, it has: {allowed}.{hint}", at_key=True)
+    allowed = ", ".join(known) or "nested BSDFs only"
+    message = f"unknown parameter of the {kind} BSDF, it has: {allowed}. {did_you_mean(key, known)}"
+    check.note(path, message.rstrip(), at_key=True)
 
 
 def _check_combination(
@@ -133,24 +132,24 @@ def _check_combination(
 ) -> None:
     for key in BSDF_REQUIRED.get(kind, ()):
         if key not in value:
-            check.fault((*path, key), f"missing, the {kind} BSDF needs it.")
+            check.note((*path, key), f"missing, the {kind} BSDF needs it.")
     fewest, most = NESTED_BSDFS.get(kind, (0, 0))
     if not fewest <= len(nested) <= most and kind in NESTED_BSDFS:
         count = str(fewest) if fewest == most else f"{fewest} to {most}"
-        check.fault(path, f"got {len(nested)} nested BSDFs, need {count} in a {kind} BSDF.", at_key=True)
+        check.note(path, f"got {len(nested)} nested BSDFs, need {count} in a {kind} BSDF.", at_key=True)
     for key in nested:
         if kind == "twosided" and value[key].get("type") in TRANSMITTING:
             message = f"got {value[key]['type']}, which lets light through; need a BSDF that only reflects."
-            check.fault((*path, key, "type"), message)
+            check.note((*path, key, "type"), message)
     if ("alpha_u" in value) != ("alpha_v" in value):
         given, absent = ("alpha_u", "alpha_v") if "alpha_u" in value else ("alpha_v", "alpha_u")
-        check.fault((*path, given), f"{given} needs {absent} beside it; use alpha for both.", at_key=True)
+        check.note((*path, given), f"{given} needs {absent} beside it; use alpha for both.", at_key=True)
     if "alpha" in value and "alpha_u" in value:
-        check.fault((*path, "alpha"), "alpha and alpha_u, alpha_v exclude each other; keep one.", at_key=True)
+        check.note((*path, "alpha"), "alpha and alpha_u, alpha_v exclude each other; keep one.", at_key=True)
     if value.get("material", NO_METAL) != NO_METAL and ("eta" in value or "k" in value):
-        check.fault((*path, "material"), "material and eta, k exclude each other; keep one.", at_key=True)
+        check.note((*path, "material"), "material and eta, k exclude each other; keep one.", at_key=True)
     if kind == "principled" and "eta" in value and "specular" in value:
-        check.fault((*path, "specular"), "eta and specular exclude each other; keep one.", at_key=True)
+        check.note((*path, "specular"), "eta and specular exclude each other; keep one.", at_key=True)
 
 
 def _parameter(check: PluginCheck, value: Any, path: KeyPath, kind: Kind) -> Any:
@@ -163,8 +162,7 @@ def _parameter(check: PluginCheck, value: Any, path: KeyPath, kind: Kind) -> Any
     if kind in _NAMES and isinstance(value, str):
         known = _NAMES[kind]
         if value not in known and not (kind is Kind.IOR and value.lower() in known):
-            close = nearest(value, known)
-            check.refuse(path, value, kind.value, f"Did you mean {close}?" if close else "")
+            check.note_mismatch(path, value, kind.value, did_you_mean(value, known))
         return value
     low, high = _NUMBER_RANGES.get(kind, (1.0, 0.0))  # an empty range: no number is allowed
     if isinstance(value, (list, tuple)) and len(value) == 3 and kind in _WITH_RGB:
@@ -172,7 +170,7 @@ def _parameter(check: PluginCheck, value: Any, path: KeyPath, kind: Kind) -> Any
     else:
         numbers = [as_finite(value)]
     if any(number is None or not low <= number <= high for number in numbers):
-        check.refuse(path, value, kind.value)
+        check.note_mismatch(path, value, kind.value)
         return value
     return numbers[0] if len(numbers) == 1 else numbers
 
@@ -183,9 +181,9 @@ def _texture(check: PluginCheck, value: Any, path: KeyPath, *, unit: bool = Fals
         return value
     for key in TEXTURE_REQUIRED.get(kind, ()):
         if key not in value:
-            check.fault((*path, key), f"missing, the {kind} texture needs it.")
+            check.note((*path, key), f"missing, the {kind} texture needs it.")
     if kind == "spectrum" and len({"value", "filename"} & set(value)) != 1:
-        check.fault(path, "need either value or filename in a spectrum.", at_key=True)
+        check.note(path, "need either value or filename in a spectrum.", at_key=True)
     result: dict[str, Any] = {"type": kind}
     for key, item in value.items():
         at = (*path, key)
@@ -203,5 +201,5 @@ def _texture(check: PluginCheck, value: Any, path: KeyPath, *, unit: bool = Fals
 def _channels(check: PluginCheck, value: Any, path: KeyPath, unit: bool) -> Any:
     numbers = [as_finite(item) for item in value] if isinstance(value, (list, tuple)) else []
     if len(numbers) != 3 or any(number is None or number < 0 or (unit and number > 1) for number in numbers):
-        check.refuse(path, value, f"[r, g, b] with each {'from 0 to 1' if unit else '>= 0'}")
+        check.note_mismatch(path, value, f"[r, g, b] with each {'from 0 to 1' if unit else '>= 0'}")
     return numbers or value

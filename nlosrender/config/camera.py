@@ -6,9 +6,10 @@ import math
 from collections.abc import Iterator
 
 from nlosrender.config.fields import Direction, FieldOfView, GridCount, Point3
-from nlosrender.config.refusal import Fault, shown
+from nlosrender.config.issues import shown
 from nlosrender.config.section import Section
 from nlosrender.config.vectors import parallel
+from nlosrender.errors import ValidationIssue
 
 
 class CameraConfig(Section):
@@ -27,14 +28,12 @@ class CameraConfig(Section):
     height: GridCount
     """pixels of a column"""
 
-    def rules(self) -> Iterator[Fault]:
-        """Yield the fault of a camera that looks nowhere, or whose picture has no up."""
+    def rule_direction(self) -> Iterator[ValidationIssue]:
+        """The camera looks somewhere, and its picture has an up."""
         towards = tuple(a - b for a, b in zip(self.look_at, self.position, strict=True))
-        needs = (("position",), ("look_at",), ("up",))
         if math.hypot(*towards) < 1e-9:
-            yield Fault(
-                ("look_at",), f"got {shown(self.look_at)}, the camera's position, need another point.", "value", needs
-            )
+            message = f"got {shown(self.look_at)}, the camera's position, need another point."
+            yield ValidationIssue(("look_at",), message)
         elif parallel(towards, self.up):
             message = f"got {shown(self.up)}, the direction the camera looks in, need one across it."
-            yield Fault(("up",), message, "value", needs)
+            yield ValidationIssue(("up",), message)

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import model_validator
+from pydantic import ValidationInfo
 
 from nlosrender.config.camera import CameraConfig
 from nlosrender.config.fields import (
@@ -19,8 +19,8 @@ from nlosrender.config.fields import (
     Point2,
     Point3,
 )
-from nlosrender.config.refusal import Fault
-from nlosrender.config.section import Section
+from nlosrender.config.section import ONE_OF, Section
+from nlosrender.errors import ValidationIssue
 
 ScanType = Literal["single", "confocal", "exhaustive", "line_of_sight"]
 
@@ -46,7 +46,7 @@ class GridConfig(Section):
 class CaptureConfig(Section):
     """The scan: laser points, sensor points, and where laser and sensor stand."""
 
-    scan_type: ScanType
+    scan_type: Annotated[ScanType, ONE_OF]
     """single: one laser point; confocal: laser and sensor on the same point; exhaustive: every pair;
     line_of_sight: what a camera sees of a scene with emitters"""
     sensor_grid: GridConfig
@@ -68,40 +68,35 @@ class CaptureConfig(Section):
     account_first_and_last_bounces: Flag = True
     """count the legs laser to wall and wall to sensor in the path length; line_of_sight: the leg to the camera"""
 
-    @model_validator(mode="before")
     @classmethod
-    def _pixels(cls, raw: Any) -> Any:
-        """Make the camera's pixels the sensor grid."""
-        if not isinstance(raw, Mapping) or raw.get("scan_type") != "line_of_sight" or "sensor_grid" in raw:
-            return raw
-        camera = raw.get("camera")
-        pixels = {"nx": 1, "ny": 1}  # what the camera lacks is its own mistake
-        if isinstance(camera, Mapping):
-            sizes = {"nx": camera.get("width"), "ny": camera.get("height")}
-            pixels |= {key: size for key, size in sizes.items() if type(size) is int and size >= 1}
-        return {**raw, "sensor_grid": pixels}
+    def with_defaults(cls, raw: dict[str, Any], validation: ValidationInfo) -> dict[str, Any]:
+        """Light the wall's centre, or make the camera's pixels the sensor grid."""
+        scan = raw.get("scan_type")
+        if scan == "single" and raw.get("laser_point") is None:
+            raw["laser_point"] = [0.0, 0.0]
+        if scan == "line_of_sight" and "sensor_grid" not in raw:
+            pixels = {"nx": 1, "ny": 1}  # what the camera lacks is its own mistake
+            if isinstance(camera := raw.get("camera"), Mapping):
+                sizes = {"nx": camera.get("width"), "ny": camera.get("height")}
+                pixels |= {key: size for key, size in sizes.items() if type(size) is int and size >= 1}
+            raw["sensor_grid"] = pixels
+        return raw
 
-    @model_validator(mode="before")
-    @classmethod
-    def _default_laser_point(cls, raw: Any) -> Any:
-        is_single = isinstance(raw, Mapping) and raw.get("scan_type") == "single"
-        return {**raw, "laser_point": [0.0, 0.0]} if is_single and raw.get("laser_point") is None else raw
-
-    def rules(self) -> Iterator[Fault]:
-        """Yield the faults of grids that are missing, or are none of a camera's."""
-        if self.is_line_of_sight:
-            yield from self._line_of_sight_rules()
-            return
+    def rule_laser_grid(self) -> Iterator[ValidationIssue]:
+        """An exhaustive scan has one."""
         if self.scan_type == "exhaustive" and self.laser_grid is None:
             message = "missing, an exhaustive scan needs it, such as {nx: 4, ny: 3}."
-            yield Fault(("laser_grid",), message, needs=(("scan_type",), ("laser_grid",)))
+            yield ValidationIssue(("laser_grid",), message)
 
-    def _line_of_sight_rules(self) -> Iterator[Fault]:
+    def rule_pixels(self) -> Iterator[ValidationIssue]:
+        """The grid of a camera is its pixels."""
         camera, grid = self.camera, self.sensor_grid
+        if not self.is_line_of_sight:
+            return
         if grid.width or grid.height or (camera and (grid.nx, grid.ny) != (camera.width, camera.height)):
             message = "the sensor points of a line_of_sight capture are the camera's pixels; remove it, and set "
             message += "capture.camera.width and height."
-            yield Fault(("sensor_grid",), message, "key", (("scan_type",), ("camera",), ("sensor_grid",)))
+            yield ValidationIssue(("sensor_grid",), message, "key")
 
     @property
     def is_line_of_sight(self) -> bool:

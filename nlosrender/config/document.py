@@ -3,29 +3,26 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
+from contextlib import suppress
 from typing import Any, Self
 
-from pydantic import Field, ModelWrapValidatorHandler, PrivateAttr, ValidationInfo, model_validator
+from pydantic import Field, PrivateAttr, ValidationInfo
 
 from nlosrender.config.capture import CaptureConfig, TimeAxisConfig
 from nlosrender.config.fields import Name
-from nlosrender.config.idle_keys import without_idle_keys
-from nlosrender.config.line_of_sight import line_of_sight_faults, relay_wall_faults
+from nlosrender.config.issues import WrongValueRead, mismatch, shown
 from nlosrender.config.mitsuba_xml import read_mitsuba_xml
 from nlosrender.config.plugin_check import config_folder
-from nlosrender.config.refusal import Fault, shown
-from nlosrender.config.relay_wall import EDGE_TOLERANCE, RelayWallConfig
+from nlosrender.config.relay_wall import EDGE_TOLERANCE
 from nlosrender.config.render import OutputConfig, RenderConfig
 from nlosrender.config.scene import SceneConfig
 from nlosrender.config.section import Section
 from nlosrender.config.sweep import SweepConfig
-from nlosrender.errors import KeyPath
+from nlosrender.errors import KeyPath, ValidationIssue
 
 STOKES_COMPONENTS = 4
 MAX_BINS = 2**40  # 4 TiB of float32: beyond it a grid or bin count is a slip of the pen
-_WALL: KeyPath = ("scene", "relay_wall")
-_WALL_SHAPE = tuple((*_WALL, key) for key in ("type", "width", "height", "radius", "center", "normal"))
-_LASER_GRID: KeyPath = ("capture", "laser_grid")
+MIN_BOUNCES_OF_WALLS = 2  # laser point and sensor point
 
 
 class Config(Section):
@@ -49,15 +46,6 @@ class Config(Section):
 
     _notes: tuple[str, ...] = PrivateAttr(default=())  # what of the file has no effect
 
-    @model_validator(mode="wrap")
-    @classmethod
-    def _leave_out_idle_keys(cls, raw: Any, handler: ModelWrapValidatorHandler[Self]) -> Self:
-        if not isinstance(raw, Mapping):
-            return handler(raw)
-        kept, notes = without_idle_keys(raw)
-        config = handler(kept)
-        return config.noting(notes)
-
     def noting(self, notes: Iterable[str]) -> Self:
         """Return this config, which from now on knows what of its file has no effect."""
         self._notes = (*self._notes, *notes)
@@ -68,13 +56,10 @@ class Config(Section):
         """A sentence for each choice that leaves keys of the file without effect."""
         return self._notes
 
-    @model_validator(mode="before")
     @classmethod
-    def _default_names(cls, raw: Any, validation: ValidationInfo) -> Any:
-        if not isinstance(raw, Mapping):
-            return raw
-        stem = validation.context.get("stem", "capture") if validation.context else "capture"
-        filled = {"name": stem, **raw}
+    def with_defaults(cls, raw: dict[str, Any], validation: ValidationInfo) -> dict[str, Any]:
+        """Fill in names, and grids that the scene gives."""
+        filled = {"name": (validation.context or {}).get("stem", "capture"), **raw}
         output = filled.get("output", {})
         if isinstance(output, Mapping) and isinstance(filled["name"], str):
             path = output.get("path", "{name}.hdf5")
@@ -82,70 +67,152 @@ class Config(Section):
             filled["output"] = {**output, "path": path}
         return _film_of_scene(_grids_on_patch(filled), validation)
 
-    def rules(self) -> Iterator[Fault]:
-        """Yield the faults between sections."""
-        if self.capture.is_line_of_sight:
-            yield from line_of_sight_faults(self.scene, self.capture, self.render)
-        else:
-            yield from relay_wall_faults(self.scene, self.capture, self.render)
-            if self.scene.relay_wall is not None:
-                yield from self._points_off_the_wall(self.scene.relay_wall)
-                yield from self._devices_behind_the_wall(self.scene.relay_wall)
-                yield from self._laser_spot(self.scene.relay_wall)
-        pairs = self.capture.sensor_grid.n_points * self.capture.n_lasers
-        n_bins = 1 if self.time_axis.n_bins == "auto" else self.time_axis.n_bins
-        if pairs * n_bins > MAX_BINS:
-            grid = ("capture", "camera" if self.capture.is_line_of_sight else "sensor_grid")
-            path: KeyPath = ("time_axis", "n_bins") if pairs <= MAX_BINS else grid
-            counted = "pixels" if self.capture.is_line_of_sight else "pairs of laser and sensor points"
-            message = (
-                f"got {pairs:_} {counted} with {n_bins:_} bins each, need at most 2**40 bins in all. Use fewer "
-                f"{counted.split()[-1]} or bins."
-            )
-            yield Fault(path, message, needs=(("time_axis", "n_bins"), grid, _LASER_GRID))
+    # --- line-of-sight captures ---
 
-    def _points_off_the_wall(self, relay_wall: RelayWallConfig) -> Iterator[Fault]:
-        extent, wall = relay_wall.extent, relay_wall.type
-        grids = {"sensor_grid": self.capture.sensor_grid, "laser_grid": self.capture.laser_grid}
-        for key, grid in grids.items():
-            sizes = (grid.width, grid.height) if grid else (None, None)
-            for axis, size, largest in zip(("width", "height"), sizes, extent, strict=True):
-                if size is not None and size > largest * (1 + EDGE_TOLERANCE):
-                    message = f"got {shown(size)} m, need at most {largest:.6g} m, the {axis} of the {wall} relay wall."
-                    path: KeyPath = ("capture", key, axis)
-                    yield Fault(path, message, needs=(path, *_WALL_SHAPE))
-        point = self.capture.laser_point or (0.0, 0.0)
-        if any(abs(x) > size / 2 * (1 + EDGE_TOLERANCE) for x, size in zip(point, extent, strict=True)):
-            message = (
-                f"got {shown(point)}, off the relay wall; need x from {-extent[0] / 2:.6g} to {extent[0] / 2:.6g} m "
-                f"and y from {-extent[1] / 2:.6g} to {extent[1] / 2:.6g} m."
-            )
-            yield Fault(("capture", "laser_point"), message, needs=(("capture", "laser_point"), *_WALL_SHAPE))
-
-    def _devices_behind_the_wall(self, wall: RelayWallConfig) -> Iterator[Fault]:
-        if wall.type != "rectangle":
+    def rule_camera(self) -> Iterator[ValidationIssue]:
+        """There is one, here or in the Mitsuba scene."""
+        mitsuba = self.scene.mitsuba
+        if not self.capture.is_line_of_sight or self.capture.camera is not None:
             return
-        for key in ("laser_position", "sensor_position"):
-            position = getattr(self.capture, key)
-            if position is None:
-                continue
-            height = wall.height_above(position)
-            if height <= 0:
-                where = f"{-height:.6g} m behind the relay wall" if height < 0 else "in the plane of the relay wall"
-                message = f"got {shown(position)}, {where}; need a point on the side its normal looks to."
-                yield Fault(("capture", key), message, needs=(("capture", key), *_WALL_SHAPE))
+        path, example = (
+            ("capture", "camera"),
+            "such as {position: [0, 1, 4], look_at: [0, 1, 0], width: 64, height: 64}.",
+        )
+        if mitsuba is None:
+            yield ValidationIssue(path, f"missing, a line_of_sight capture needs it, {example}")
+        elif read_mitsuba_xml(mitsuba)[1] is None:
+            lacking = f"{mitsuba.name} has no perspective sensor with a whole film"
+            yield ValidationIssue(path, f"missing, and {lacking}; need a camera, {example}")
 
-    def _laser_spot(self, wall: RelayWallConfig) -> Iterator[Fault]:
-        path: KeyPath = ("capture", "laser_spot_radius")
-        radius = self.capture.laser_spot_radius
-        if radius > 0 and wall.type != "rectangle":
+    def rule_line_of_sight_engine(self) -> Iterator[ValidationIssue]:
+        """Virtual lights are on a relay wall."""
+        if self.capture.is_line_of_sight and self.render.engine == "virtual_lights":
+            message = "got virtual_lights, which need a relay wall; a line_of_sight capture needs auto or path."
+            yield ValidationIssue(("render", "engine"), message)
+
+    def rule_temporal_kernel(self) -> Iterator[ValidationIssue]:
+        """A camera's bins are plain."""
+        width = self.render.temporal_kernel_opl
+        if self.capture.is_line_of_sight and width > 0:
+            message = mismatch(width, "0: a line_of_sight capture has plain bins")
+            yield ValidationIssue(("render", "temporal_kernel_opl"), message)
+
+    # --- captures of a relay wall ---
+
+    def rule_relay_wall(self) -> Iterator[ValidationIssue]:
+        """There is one."""
+        if self.scene.relay_wall is None and not self.capture.is_line_of_sight:
+            message = "missing, it is required: the visible surface, told by its type; "
+            message += "only scan_type: line_of_sight does without."
+            yield ValidationIssue(("scene", "relay_wall"), message)
+
+    def rule_mitsuba_scene(self) -> Iterator[ValidationIssue]:
+        """A whole Mitsuba scene is seen by a camera."""
+        if self.scene.mitsuba is not None and not self.capture.is_line_of_sight:
+            message = "a whole Mitsuba scene is for scan_type: line_of_sight; here its shapes go into hidden_geometry, "
+            message += "one by one, as {type: mitsuba, shape: {...}, bsdf: {...}} or {type: mesh, ...}."
+            yield ValidationIssue(("scene", "mitsuba"), message, "key")
+
+    def rule_polarized_engine(self) -> Iterator[ValidationIssue]:
+        """Only paths know polarisation."""
+        polarized_wall = self.render.polarized and not self.capture.is_line_of_sight
+        if polarized_wall and self.render.engine == "virtual_lights":
+            message = "got virtual_lights, which know no polarisation; with render.polarized need auto or path."
+            yield ValidationIssue(("render", "engine"), message)
+
+    def rule_polarized_wall(self) -> Iterator[ValidationIssue]:
+        """Polarised light falls on a rectangle."""
+        wall = self.scene.relay_wall
+        if self.render.polarized and not self.capture.is_line_of_sight and wall and wall.type != "rectangle":
+            message = f"got true before a {wall.type} wall; polarised light needs a rectangle relay wall."
+            yield ValidationIssue(("render", "polarized"), message)
+
+    def rule_polarized_spot(self) -> Iterator[ValidationIssue]:
+        """Polarised light comes from a point."""
+        if self.render.polarized and self.capture.laser_spot_radius > 0 and not self.capture.is_line_of_sight:
+            message = "got true with a laser that has a spot; polarised light needs capture.laser_spot_radius: 0."
+            yield ValidationIssue(("render", "polarized"), message)
+
+    def rule_grids_on_the_wall(self) -> Iterator[ValidationIssue]:
+        """Grids are no larger than the wall."""
+        wall = self.scene.relay_wall
+        for key, axis in (("sensor_grid", 0), ("sensor_grid", 1), ("laser_grid", 0), ("laser_grid", 1)):
+            name = ("width", "height")[axis]
+            with suppress(WrongValueRead):
+                grid = getattr(self.capture, key)
+                size = getattr(grid, name) if grid is not None else None
+                if wall is None or size is None or size == getattr(wall, name, None):  # the wall's own is told there
+                    continue
+                if size > wall.extent[axis] * (1 + EDGE_TOLERANCE):
+                    need = f"at most {wall.extent[axis]:.6g} m, the {name} of the {wall.type} relay wall"
+                    yield ValidationIssue(("capture", key, name), f"got {shown(size)} m, need {need}.")
+
+    def rule_laser_point_on_the_wall(self) -> Iterator[ValidationIssue]:
+        """The laser point is on the wall."""
+        if (wall := self.scene.relay_wall) is None:
+            return
+        point, (width, height) = self.capture.laser_point or (0.0, 0.0), wall.extent
+        if any(abs(x) > size / 2 * (1 + EDGE_TOLERANCE) for x, size in zip(point, wall.extent, strict=True)):
+            message = (
+                f"got {shown(point)}, off the relay wall; need x from {-width / 2:.6g} to {width / 2:.6g} m "
+                f"and y from {-height / 2:.6g} to {height / 2:.6g} m."
+            )
+            yield ValidationIssue(("capture", "laser_point"), message)
+
+    def rule_laser_before_the_wall(self) -> Iterator[ValidationIssue]:
+        """The laser stands on the lit side of a flat wall."""
+        yield from self._behind_the_wall("laser_position")
+
+    def rule_sensor_before_the_wall(self) -> Iterator[ValidationIssue]:
+        """The sensor stands on the lit side of a flat wall."""
+        yield from self._behind_the_wall("sensor_position")
+
+    def _behind_the_wall(self, key: str) -> Iterator[ValidationIssue]:
+        wall, position = self.scene.relay_wall, getattr(self.capture, key)
+        if wall is None or wall.type != "rectangle" or position is None:
+            return
+        height = wall.height_above(position)
+        if height <= 0:
+            where = f"{-height:.6g} m behind the relay wall" if height < 0 else "in the plane of the relay wall"
+            message = f"got {shown(position)}, {where}; need a point on the side its normal looks to."
+            yield ValidationIssue(("capture", key), message)
+
+    def rule_spot_on_the_wall(self) -> Iterator[ValidationIssue]:
+        """A laser spot is on a rectangle."""
+        radius, wall = self.capture.laser_spot_radius, self.scene.relay_wall
+        if radius > 0 and wall and wall.type != "rectangle":
             message = f"got {shown(radius)} on a {wall.type} wall; need 0 there, or a rectangle wall."
-            yield Fault(path, message, needs=(path, (*_WALL, "type")))
-        if not self.render.laser_sampling and radius == 0:
+            yield ValidationIssue(("capture", "laser_spot_radius"), message)
+
+    def rule_laser_can_be_found(self) -> Iterator[ValidationIssue]:
+        """Paths find a point by sampling it alone."""
+        if not self.render.laser_sampling and self.capture.laser_spot_radius == 0 and self.scene.relay_wall:
             message = "got false with a laser that is a point, which no path finds by chance; "
             message += "need capture.laser_spot_radius > 0, such as 0.01."
-            key: KeyPath = ("render", "laser_sampling")
-            yield Fault(key, message, needs=(path, key))
+            yield ValidationIssue(("render", "laser_sampling"), message)
+
+    # --- all captures ---
+
+    def rule_enough_bounces(self) -> Iterator[ValidationIssue]:
+        """Light gets from the source to the sensor."""
+        bounces, is_view = self.render.max_bounces, self.capture.is_line_of_sight
+        fewest = 0 if is_view else MIN_BOUNCES_OF_WALLS
+        if bounces is not None and bounces < fewest:
+            advice = "0 is the emitters alone, 1 what they light." if is_view else "3 is the third bounce."
+            message = mismatch(bounces, f"an integer >= {fewest} or null for no limit", advice)
+            yield ValidationIssue(("render", "max_bounces"), message)
+
+    def rule_bins(self) -> Iterator[ValidationIssue]:
+        """The capture fits a disk."""
+        is_view, n_bins = self.capture.is_line_of_sight, self.time_axis.n_bins
+        pairs = self.capture.sensor_grid.n_points * self.capture.n_lasers
+        per_pair = 1 if n_bins == "auto" else n_bins
+        if pairs * per_pair > MAX_BINS:
+            grid = ("capture", "camera" if is_view else "sensor_grid")
+            path: KeyPath = ("time_axis", "n_bins") if pairs <= MAX_BINS else grid
+            counted = "pixels" if is_view else "pairs of laser and sensor points"
+            message = f"got {pairs:_} {counted} with {per_pair:_} bins each, need at most 2**40 bins in all. "
+            yield ValidationIssue(path, f"{message}Use fewer {counted.split()[-1]} or bins.")
 
     @property
     def is_colored(self) -> bool:
@@ -170,7 +237,7 @@ def _film_of_scene(raw: dict[str, Any], validation: ValidationInfo) -> dict[str,
         return raw
     try:
         _, size = read_mitsuba_xml(config_folder(validation) / name)
-    except ValueError:  # the scene's own fault, told with its place
+    except ValueError:  # the scene's own issue, told with its place
         return raw
     grid = {} if size is None else {"sensor_grid": {"nx": size[0], "ny": size[1]}}
     return {**raw, "capture": {**capture, **grid}}

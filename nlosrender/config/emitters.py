@@ -23,8 +23,9 @@ from nlosrender.config.hidden_geometry import (
     RectangleConfig,
     SphereConfig,
 )
-from nlosrender.config.refusal import Fault, refusal, shown
-from nlosrender.config.section import Section
+from nlosrender.config.issues import mismatch, shown
+from nlosrender.config.section import BY_TYPE, Section
+from nlosrender.errors import ValidationIssue
 
 BLACK_DIFFUSE = FrozenDict(type="diffuse", reflectance=0.0)
 
@@ -93,16 +94,20 @@ class SpotLamp(Section):
     beam_deg: FieldOfView | None = None
     """degrees from the axis up to which there is all of it; null: 3/4 of cutoff_deg"""
 
-    def rules(self) -> Iterator[Fault]:
-        """Yield the faults of a spot without direction or with a beam wider than its cone."""
+    def rule_direction(self) -> Iterator[ValidationIssue]:
+        """The spot shines somewhere."""
         if self.position == self.look_at:
-            yield Fault(("look_at",), f"got {shown(self.look_at)}, the spot's position, need another point.")
+            message = f"got {shown(self.look_at)}, the spot's position, need another point."
+            yield ValidationIssue(("look_at",), message)
+
+    def rule_cone(self) -> Iterator[ValidationIssue]:
+        """The cone is one, and as wide as the beam in it."""
         if self.cutoff_deg >= 90:
-            yield Fault(("cutoff_deg",), refusal(self.cutoff_deg, "less than 90"))
+            yield ValidationIssue(("cutoff_deg",), mismatch(self.cutoff_deg, "less than 90"))
         if self.beam_deg is not None and self.beam_deg >= self.cutoff_deg:
-            message = refusal(self.beam_deg, f"less than cutoff_deg, {self.cutoff_deg:g}")
-            yield Fault(("beam_deg",), message, needs=(("beam_deg",), ("cutoff_deg",)))
+            need = f"less than cutoff_deg, {self.cutoff_deg:g}"
+            yield ValidationIssue(("beam_deg",), mismatch(self.beam_deg, need))
 
 
 ShapedLamp = RectangleLamp | MeshLamp | LettersLamp | BoxLamp | SphereLamp | CylinderLamp | MitsubaLamp
-EmitterConfig = Annotated[ShapedLamp | PointLamp | SpotLamp, Field(discriminator="type")]
+EmitterConfig = Annotated[ShapedLamp | PointLamp | SpotLamp, Field(discriminator="type"), BY_TYPE]

@@ -25,13 +25,14 @@ from nlosrender.config.fields import (
     Text,
 )
 from nlosrender.config.frozen import FrozenDict
+from nlosrender.config.issues import InvalidValue, invalid_value, mismatch, shown
 from nlosrender.config.plugin_check import checked_plugin, config_folder, existing_file
-from nlosrender.config.refusal import Fault, refusal, refuse, shown
-from nlosrender.config.section import Section, pose_faults
+from nlosrender.config.section import BY_TYPE, ONE_OF, Section, pose_issues
 from nlosrender.config.shape_check import check_shape
+from nlosrender.errors import ValidationIssue
 
 LETTERS = string.ascii_uppercase + string.digits + " "
-MOST_LETTERS = 256
+MAX_LETTERS = 256
 _MESH_SUFFIXES = (".ply", ".obj")
 _TOWARDS_WALL = (0.0, 0.0, -1.0)  # a default wall looks along +z
 _NO_ROTATION = (0.0, 0.0, 0.0)
@@ -40,25 +41,25 @@ _NO_ROTATION = (0.0, 0.0, 0.0)
 def _letters(value: object) -> str:
     need = "A-Z, 0-9 and spaces, at least one of them visible"
     if not isinstance(value, str):
-        raise refuse(value, need, "" if value is None else "Put it in quotes.")
-    if len(value) > MOST_LETTERS:
-        raise refuse(value, f"at most {MOST_LETTERS} characters")
+        raise invalid_value(value, need, "" if value is None else "Put it in quotes.")
+    if len(value) > MAX_LETTERS:
+        raise invalid_value(value, f"at most {MAX_LETTERS} characters")
     if value.strip(" ") and all(letter in LETTERS for letter in value):
         return value
     upper = value.upper()
     hint = f"Write it in upper case: {upper}." if value.strip() and all(c in LETTERS for c in upper) else ""
-    raise refuse(value, need, hint)
+    raise invalid_value(value, need, hint)
 
 
 def _mesh_file(value: object, validation: ValidationInfo) -> Path:
     if not isinstance(value, str) or not value.lower().endswith(_MESH_SUFFIXES):
-        raise refuse(value, f"the name of a {' or '.join(_MESH_SUFFIXES)} file")
+        raise invalid_value(value, f"the name of a {' or '.join(_MESH_SUFFIXES)} file")
     path, problem = existing_file(value, config_folder(validation))
     made_by = validation.data.get("made_by")
-    if made_by and not path.exists():
+    if isinstance(made_by, str) and not path.exists():
         problem = f"got {value}, but there is no file at {path}. It is made by: {made_by}"
     if problem:
-        raise Fault((), problem).as_error()
+        raise InvalidValue(ValidationIssue((), problem))
     return path
 
 
@@ -95,9 +96,9 @@ class _FacingItem(_HiddenItem):
     up: Direction = (0.0, 1.0, 0.0)
     """direction of the item's y axis, made perpendicular to normal"""
 
-    def rules(self) -> Iterator[Fault]:
-        """Yield the fault of a pose without an up direction."""
-        yield from pose_faults(self.normal, self.up)
+    def rule_pose(self) -> Iterator[ValidationIssue]:
+        """An up direction is needed."""
+        yield from pose_issues(self.normal, self.up)
 
 
 class RectangleConfig(_FacingItem):
@@ -125,12 +126,11 @@ class LettersConfig(_FacingItem):
     spacing: LengthOrZero | None = None
     """m, gap between letters; null: 0.2 height"""
 
-    def rules(self) -> Iterator[Fault]:
-        """Yield the faults of the pose and of strokes as wide as the letter is high."""
-        yield from super().rules()
+    def rule_strokes(self) -> Iterator[ValidationIssue]:
+        """Strokes are narrower than the letter is high."""
         if self.stroke_width is not None and self.stroke_width >= 0.5 * self.height:
-            message = refusal(self.stroke_width, f"less than half the height of {self.height} m")
-            yield Fault(("stroke_width",), message, needs=(("stroke_width",), ("height",)))
+            need = f"less than half the height of {self.height} m"
+            yield ValidationIssue(("stroke_width",), mismatch(self.stroke_width, need))
 
 
 class FromFile(Section):
@@ -153,18 +153,17 @@ class MeshConfig(FromFile, _HiddenItem):
     """A triangle mesh from a file: scaled, then rotated about x, then y, then z, then translated."""
 
     type: Literal["mesh"]
-    normals: Literal["auto", "file", "flat", "smooth"] = "auto"
+    normals: Annotated[Literal["auto", "file", "flat", "smooth"], ONE_OF] = "auto"
     """auto: the file's vertex normals where it has some, else flat faces; file: it has to have them; flat: none;
     smooth: averaged from the faces around each vertex"""
     face_normals: Flag | None = None
     """as Mitsuba has it: true is normals: flat, false the file's or smooth ones; null: normals decides"""
 
-    def rules(self) -> Iterator[Fault]:
-        """Yield the fault of two keys that contradict each other."""
-        yield from super().rules()
+    def rule_normals(self) -> Iterator[ValidationIssue]:
+        """The two keys do not contradict each other."""
         if self.face_normals is not None and self.normals != "auto" and self.face_normals != (self.normals == "flat"):
             message = f"face_normals is {shown(self.face_normals)}, normals is {self.normals}. Remove one of the two."
-            yield Fault(("normals",), message, needs=(("normals",), ("face_normals",)))
+            yield ValidationIssue(("normals",), message)
 
     @property
     def shading_normals(self) -> Literal["auto", "file", "flat", "smooth", "mitsuba"]:
@@ -240,4 +239,5 @@ HiddenItemConfig = Annotated[
     | RoomConfig
     | MitsubaConfig,
     Field(discriminator="type"),
+    BY_TYPE,
 ]

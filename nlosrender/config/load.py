@@ -1,35 +1,30 @@
-"""A YAML file -> :class:`Config`, or every mistake in it at once."""
+"""A YAML file -> :class:`Config`, or every mistake in it at once.
+
+A file is read once: into a :class:`~nlosrender.config.yaml_tree.Document`, which is asked for captures, and for the
+places of what only the renderer finds wrong.
+"""
 
 from __future__ import annotations
 
-import copy
-import itertools
+import dataclasses
 import json
 import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
-
-from pydantic import ValidationError
-from pydantic_core import ErrorDetails
+from typing import Any, TypeVar
 
 from nlosrender.config.canonical import tree_hash
 from nlosrender.config.document import Config
+from nlosrender.config.encodable import encodable
+from nlosrender.config.issues import shown
 from nlosrender.config.overrides import apply_overrides
-from nlosrender.config.refusal import FAULT, shown
-from nlosrender.config.translate import locate, problem_from
+from nlosrender.config.section import Section, issues_in
+from nlosrender.config.unused_keys import without_unused_keys
 from nlosrender.config.yaml_tree import MAX_BYTES, Document, read_document
 from nlosrender.errors import ConfigError, KeyPath, ValidationIssue
 
-# What stands in for a required section that is wrong, so that the rules between the others still run.
-_STAND_INS: dict[KeyPath, Any] = {
-    ("scene", "relay_wall"): {"type": "rectangle", "width": 1.0, "height": 1.0},
-    ("capture", "scan_type"): "single",
-    ("capture", "sensor_grid"): {"nx": 1, "ny": 1},
-    ("capture", "laser_grid"): {"nx": 1, "ny": 1},
-}
-MOST_PROBLEMS = 100  # told at once; finding the nearest known key for each takes a while
-_MAX_PASSES = 20  # each one removes something from the tree; a tree of this schema is used up long before
+MAX_ISSUES = 100  # told at once; nobody reads more
+SectionT = TypeVar("SectionT", bound=Section)
 
 
 def load_config(path: Path, overrides: Sequence[str] = ()) -> Config:
@@ -45,43 +40,13 @@ def load_config(path: Path, overrides: Sequence[str] = ()) -> Config:
     Raises
     ------
     ConfigError
-        With every problem found: the file cannot be read, is no YAML, or breaks a rule.
+        With every issue found: the file cannot be read, is no YAML, or breaks a rule.
     """
-    path = Path(path)
-    return parse_config(read_text(path), str(path), path.absolute().parent, overrides)
-
-
-def read_text(path: Path) -> str:
-    """Return the text of a config file.
-
-    Raises
-    ------
-    ConfigError
-        It cannot be read, is no text or far too long.
-    """
-    try:
-        if path.is_fifo():  # a look for a sweep comes before the capture, and one for places after it
-            message = "is a pipe, and a config is read more than once. Save it as a file."
-            raise ConfigError.of_file(str(path), message)
-        with path.open("rb") as file:
-            content = file.read(MAX_BYTES + 1)
-        return content.decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        message = f"no UTF-8 text: byte 0x{content[error.start]:02x} at offset {error.start}. Save it as UTF-8."
-        if len(content) > MAX_BYTES:  # the cut may have split a character; size is the real mistake
-            message = f"larger than {MAX_BYTES // 1024} KiB, which no configuration needs."
-        raise ConfigError.of_file(str(path), message) from error
-    except FileNotFoundError as error:
-        message = f"there is no such file. nlosrender new {path} writes a starter."
-        raise ConfigError.of_file(str(path), message) from error
-    except IsADirectoryError as error:
-        raise ConfigError.of_file(str(path), "this is a folder, need a YAML file.") from error
-    except (OSError, ValueError) as error:
-        raise ConfigError.of_file(str(path), f"cannot be read: {getattr(error, 'strerror', error)}.") from error
+    return config_of(load_document(path, overrides))
 
 
 def parse_config(text: str, source: str, folder: Path, overrides: Sequence[str] = ()) -> Config:
-    """Validate the text of a config.
+    """Validate the text of a config; as ``load_config``.
 
     Parameters
     ----------
@@ -97,51 +62,126 @@ def parse_config(text: str, source: str, folder: Path, overrides: Sequence[str] 
     Raises
     ------
     ConfigError
-        With every problem found.
+        With every issue found.
     """
-    document = overridden_document(text, source, overrides)
-    if document.tree.get("sweep") is not None:
-        message = "this makes many captures, and a single one is needed here; remove it, or --set sweep=null."
-        document.problems.append(ValidationIssue(("sweep",), message, place=document.place(("sweep",), "key")))
-        document.tree = {key: value for key, value in document.tree.items() if key != "sweep"}
-    return validate_document(document, folder)
+    return config_of(parse_document(text, source, folder, overrides))
 
 
-def overridden_document(text: str, source: str, overrides: Sequence[str] = ()) -> Document:
+def load_document(path: Path, overrides: Sequence[str] = ()) -> Document:
+    """Return the values of a config file with the overrides put over them; a pipe will do.
+
+    Raises
+    ------
+    ConfigError
+        The file cannot be read, or is no YAML mapping. Other issues are those of the document.
+    """
+    path = Path(path)
+    try:
+        is_pipe = path.is_fifo()
+        with path.open("rb") as file:
+            content = file.read(MAX_BYTES + 1)
+        text = content.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        message = f"no UTF-8 text: byte 0x{content[error.start]:02x} at offset {error.start}. Save it as UTF-8."
+        if len(content) > MAX_BYTES:  # the cut may have split a character; size is the real mistake
+            message = f"larger than {MAX_BYTES // 1024} KiB, which no configuration needs."
+        raise ConfigError.of_file(str(path), message) from error
+    except FileNotFoundError as error:
+        message = f"there is no such file. nlosrender new {path} writes a starter."
+        raise ConfigError.of_file(str(path), message) from error
+    except IsADirectoryError as error:
+        raise ConfigError.of_file(str(path), "this is a folder, need a YAML file.") from error
+    except (OSError, ValueError) as error:
+        raise ConfigError.of_file(str(path), f"cannot be read: {getattr(error, 'strerror', error)}.") from error
+    document = parse_document(text, str(path), Path.cwd() if is_pipe else path.absolute().parent, overrides)
+    return dataclasses.replace(document, stem="capture") if is_pipe else document
+
+
+def parse_document(text: str, source: str, folder: Path, overrides: Sequence[str] = ()) -> Document:
     """Return the values of a config's text with the overrides put over them; the root is a mapping.
 
     Raises
     ------
     ConfigError
-        The text is no YAML or no mapping. Other problems are those of the document.
+        The text is no YAML or no mapping. Other issues are those of the document.
     """
-    document = read_document(text, source)
-    if document.tree is None and not document.problems and overrides:
+    document = read_document(text, source, folder)
+    if document.tree is None and not document.issues and overrides:
         document.tree = {}
     if not isinstance(document.tree, dict):
         found = "the file is empty" if document.tree is None else f"got {shown(document.tree)}"
         message = f"{found}, need a mapping with the keys {', '.join(Config.model_fields)}."
         place = document.place(()) if document.tree is not None else source
-        raise ConfigError(document.problems or ValidationIssue((), message, place=place))
+        raise ConfigError(document.issues or ValidationIssue((), message, place=place))
     apply_overrides(document, overrides)
     return document
 
 
-def validate_document(document: Document, folder: Path) -> Config:
-    """Validate the values of one capture; relative file names in them start at ``folder``.
+def config_of(document: Document) -> Config:
+    """Return the config of a document that describes one capture.
 
     Raises
     ------
     ConfigError
-        With every problem found, the document's own included.
+        With every issue found, the document's own included; a sweep is one.
     """
-    return _validate(document, {"folder": Path(folder).absolute(), "stem": default_name(document.source)})
+    if document.tree.get("sweep") is None:
+        return capture_config(document)
+    message = "this makes many captures, and a single one is needed here; remove it, or --set sweep=null."
+    sweep = document.issue(("sweep",), message, "key")
+    single = {key: value for key, value in document.tree.items() if key != "sweep"}
+    return capture_config(dataclasses.replace(document, tree=single, issues=[*document.issues, sweep]))
 
 
-def default_name(source: str) -> str:
-    """Return the name of a capture whose config gives none: that of its file, which may hold what a name may not."""
-    letters = (letter if letter.isprintable() and letter != "\\" else "-" for letter in Path(source).stem)
-    return "".join(letters).strip() or "capture"
+def capture_config(document: Document) -> Config:
+    """Validate the values of one capture, whatever their document says of sweeps.
+
+    Raises
+    ------
+    ConfigError
+        With every issue found, the document's own included.
+    """
+    tree, notes = without_unused_keys(document.tree)
+    config, found = validated(Config, tree, document)
+    if found or document.issues:
+        raise ConfigError(in_order(found, document))
+    return config.noting((*document.notes, *notes))
+
+
+def validated(
+    section: type[SectionT], tree: Any, document: Document, path: KeyPath = ()
+) -> tuple[SectionT, list[ValidationIssue]]:
+    """Return the section of the values that stand at ``path`` of a document, and every issue found in it.
+
+    With issues the section is good for nothing.
+    """
+    checked = section.model_validate(tree, context={"folder": document.folder, "stem": document.stem})
+    return checked, [*issues_in(checked, path, Config)]
+
+
+def in_order(found: Sequence[ValidationIssue], document: Document) -> list[ValidationIssue]:
+    """Return issues with their places, and those of the document, in the order of the file, overrides last."""
+    placed = [
+        document.issue(issue.path, encodable(issue.message), issue.at)
+        for issue in found
+        if not any(_overlap(issue.path, unread) for unread in document.unread)  # told already
+    ]
+    issues = sorted(dict.fromkeys([*document.issues, *placed]), key=_reading_order)
+    if len(issues) > MAX_ISSUES:
+        rest = f"{len(issues) - MAX_ISSUES} more mistakes are not listed."
+        issues = [*issues[:MAX_ISSUES], ValidationIssue((), rest, place=document.source)]
+    return issues
+
+
+def _overlap(a: KeyPath, b: KeyPath) -> bool:
+    return all(x == y for x, y in zip(a, b, strict=False))
+
+
+def _reading_order(issue: ValidationIssue) -> tuple[int, int]:
+    match = re.search(r":(\d+):(\d+)$", issue.place)
+    if match is None or issue.place.startswith("--set"):
+        return (MAX_BYTES + 1, 0)
+    return int(match[1]), int(match[2])
 
 
 def config_to_dict(config: Config) -> dict[str, Any]:
@@ -153,87 +193,3 @@ def config_to_dict(config: Config) -> dict[str, Any]:
 def config_hash(config: Config) -> str:
     """Return the SHA-256 (hex) of the config's canonical JSON: equal for configs that differ only in writing."""
     return tree_hash(config_to_dict(config))
-
-
-def _validate(document: Document, context: dict[str, Any]) -> Config:
-    """Validate; after mistakes, take them out and look again, so that rules over sound values still speak up."""
-    problems = list(document.problems)
-    broken, n_untold = set(document.unread), 0
-    tree = copy.deepcopy(document.tree)
-    for _ in range(_MAX_PASSES):
-        try:
-            config = Config.model_validate(tree, context=context)
-        except ValidationError as error:
-            details = error.errors(include_url=False)
-        else:
-            if problems:
-                break
-            return config.noting(document.notes)
-        fresh = [detail for detail in details if not _is_echo(detail, broken)]
-        problems += [problem_from(detail, document) for detail in fresh[:MOST_PROBLEMS]]
-        n_untold += len(fresh[MOST_PROBLEMS:])
-        culprits = {_culprit(detail, broken) for detail in details}
-        if not sum(_take_out(tree, culprit, broken) for culprit in sorted(culprits, key=str)):
-            break
-    told = sorted(dict.fromkeys(problems), key=_reading_order)
-    if n_untold or len(told) > MOST_PROBLEMS:
-        n_untold += len(told[MOST_PROBLEMS:])
-        told = [
-            *told[:MOST_PROBLEMS],
-            ValidationIssue((), f"{n_untold} more mistakes are not listed.", place=document.source),
-        ]
-    raise ConfigError(told)
-
-
-def _reading_order(problem: ValidationIssue) -> tuple[int, int]:
-    """Sort key: from the top of the file down, overrides last."""
-    match = re.search(r":(\d+):(\d+)$", problem.place)
-    if match is None or problem.place.startswith("--set"):
-        return (MAX_BYTES + 1, 0)
-    return int(match[1]), int(match[2])
-
-
-def _is_echo(detail: ErrorDetails, broken: set[KeyPath]) -> bool:
-    """Tell an error that only follows from something wrong already reported and taken out."""
-    path, _ = locate(detail["loc"])
-    context = detail.get("ctx", {})
-    if detail["type"] == FAULT and context["needs"]:
-        section = path[: len(path) - context["depth"]]
-        return any(_overlap((*section, *need), gone) for need in context["needs"] for gone in broken)
-    return any(_overlap(path, gone) for gone in broken)
-
-
-def _overlap(a: KeyPath, b: KeyPath) -> bool:
-    return all(x == y for x, y in zip(a, b, strict=False))
-
-
-def _culprit(detail: ErrorDetails, broken: set[KeyPath]) -> KeyPath:
-    """Return what to take out of the tree so that validation gets past this error."""
-    path, _ = locate(detail["loc"])
-    if path in _STAND_INS:
-        return path
-    return path[:-1] if detail["type"] == "missing" or path in broken else path
-
-
-def _take_out(tree: Any, path: KeyPath, broken: set[KeyPath]) -> bool:
-    """Put the stand-in at ``path``, or delete it where there is none or it did not do; tell whether the tree changed.
-
-    A whole list goes instead of one item, because the other items are told by their index.
-    """
-    container, done = tree, ()  # type: tuple[Any, KeyPath]
-    for step, following in itertools.zip_longest(path, path[1:]):
-        here = (*done, step)
-        if not isinstance(container, dict):
-            return False
-        if here == path and path in _STAND_INS and path not in broken:
-            container[step] = copy.deepcopy(_STAND_INS[path])
-            broken.add(path)
-            return True
-        if step not in container:
-            return False
-        if here == path or isinstance(following, int):
-            del container[step]
-            broken.add(here)
-            return True
-        container, done = container[step], here
-    return False

@@ -23,14 +23,14 @@ from nlosrender.config.bsdf_table import (
     TEXTURE_TYPES,
 )
 from nlosrender.config.fields import Checked
+from nlosrender.config.issues import InvalidValue, did_you_mean, invalid_value
 from nlosrender.config.plugin_check import config_folder, existing_file, mitsuba_file
-from nlosrender.config.refusal import Fault, listed, refuse
 from nlosrender.config.xml_expansion import LEFT_OUT, START, Expansion, told_by_place
 from nlosrender.config.xml_numbers import check_numbers
 from nlosrender.config.xml_shapes import check_xml_bsdf, check_xml_shape
 from nlosrender.config.xml_transforms import check_rotation
 from nlosrender.config.xml_tree import SceneElement
-from nlosrender.errors import nearest
+from nlosrender.errors import ValidationIssue
 
 DEFAULT_FILM = (768, 576)  # Mitsuba's
 _PLUGINS = {  # element: the types it may have
@@ -180,12 +180,11 @@ def _check(element: Element, folders: Sequence[Path]) -> None:
     """Refuse an element that is not supported or lacks something, and make the file it names absolute."""
     tag, kind, allowed = element.tag, element.get("type", ""), _PLUGINS.get(element.tag, ())
     if tag not in _PLUGINS and tag not in _PLAIN:
-        need = _ADVICE.get(tag) or f"need {listed(sorted((*_PLUGINS, *_PLAIN)))}"
+        need = _ADVICE.get(tag) or f"need {', '.join(sorted((*_PLUGINS, *_PLAIN)))}"
         raise ValueError(f"<{tag}> is not supported; {need}")
     if allowed and kind not in allowed:
-        close = nearest(kind, allowed)
-        hint = f". Did you mean {close}?" if close else ""
-        need = _ADVICE.get(kind) or f"need one of {listed(allowed)}{hint}"
+        hint = did_you_mean(kind, allowed)
+        need = _ADVICE.get(kind) or f"need one of {', '.join(allowed)}" + (f". {hint}" if hint else "")
         raise ValueError(f"<{tag} type={kind!r}> is not supported; {need}")
     if kind and not allowed:
         raise ValueError(f"<{tag}> has a type {kind!r}, which is not supported")
@@ -224,14 +223,14 @@ def _string(element: Element, name: str) -> str | None:
 
 def _xml_file(value: object, validation: ValidationInfo) -> Path:
     if not isinstance(value, str) or not value.lower().endswith(".xml"):
-        raise refuse(value, "the name of a Mitsuba .xml file")
+        raise invalid_value(value, "the name of a Mitsuba .xml file")
     path, problem = existing_file(value, config_folder(validation))
     if problem:
-        raise Fault((), problem).as_error()
+        raise InvalidValue(ValidationIssue((), problem))
     try:
         read_mitsuba_xml(path)
     except ValueError as error:
-        raise Fault((), f"{path}: {error}.").as_error() from error
+        raise InvalidValue(ValidationIssue((), f"{path}: {error}.")) from error
     return path
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from nlosrender.config.refusal import shown
+from nlosrender.config.issues import Wrong, shown
 from nlosrender.config.text_keys import takes_text
 from nlosrender.config.yaml_tree import MAX_DEPTH, Document, Place, read_document
 from nlosrender.errors import ConfigError, KeyPath, ValidationIssue
@@ -16,7 +16,7 @@ _LONGEST_PLACE = 80  # characters of an absurd override that still help
 
 
 def apply_overrides(document: Document, overrides: Sequence[str]) -> None:
-    """Put each ``a.b.c=VALUE`` into the document; mistakes become problems of the document.
+    """Put each ``a.b.c=VALUE`` into the document; mistakes become issues of the document.
 
     Parameters
     ----------
@@ -26,23 +26,24 @@ def apply_overrides(document: Document, overrides: Sequence[str]) -> None:
         Keys joined by dots, numbers index lists; the value is YAML, but as it stands where a key takes text. Missing
         mappings are created.
     """
+    document.overrides = tuple(overrides)
     for override in overrides:
         place = f"--set {override}"
         key, equals, text = override.partition("=")
         parts = [part.strip() for part in key.split(".")]
         if not equals or not all(parts):
             message = "need KEY=VALUE with dots between keys, such as --set capture.sensor_grid.nx=16."
-            document.problems.append(ValidationIssue((), message, place=place))
+            document.issues.append(ValidationIssue((), message, place=place))
             continue
         if len(parts) > MAX_DEPTH:
             message = f"got {len(parts)} keys, one inside the other; need at most {MAX_DEPTH}."
-            document.problems.append(ValidationIssue((), message, place=place[:_LONGEST_PLACE]))
+            document.issues.append(ValidationIssue((), message, place=place[:_LONGEST_PLACE]))
             continue
         try:
             value = _value(parts, key, text, place)
             put(document, parts, value, Place(place, place))
         except ConfigError as error:
-            document.problems.extend(error.issues)
+            document.issues.extend(error.issues)
 
 
 def _value(parts: Sequence[str], key: str, text: str, place: str) -> Any:
@@ -52,12 +53,10 @@ def _value(parts: Sequence[str], key: str, text: str, place: str) -> Any:
         return bare  # "{name}.hdf5", "a: b.ply" and "1e3" are names here: a shell has taken the quotes away
     try:
         read = read_document(text, place)
+        if read.issues:
+            raise ConfigError(read.issues)
     except ConfigError as error:
-        raise ConfigError(
-            [ValidationIssue((key,), problem.message, place=place) for problem in error.issues]
-        ) from error
-    if read.problems:
-        raise ConfigError([ValidationIssue((key,), problem.message, place=place) for problem in read.problems])
+        raise ConfigError([ValidationIssue((key,), found.message, place=place) for found in error.issues]) from error
     return read.tree
 
 
@@ -116,6 +115,8 @@ def _step(container: Any, part: str, path: KeyPath, place: str) -> str | int:
     where = ".".join(map(str, path))
     if isinstance(container, dict):
         return part
+    if isinstance(container, Wrong):
+        raise ConfigError(())  # told already
     if not isinstance(container, list):
         message = f"cannot set {part} in {where}, which holds {shown(container)}; need a mapping or a list there."
         raise ConfigError(ValidationIssue(path, message, place=place))

@@ -1,4 +1,4 @@
-"""What BSDF, texture and shape dictionaries share: file names, transforms, a list of faults found on the way down."""
+"""What BSDF, texture and shape dictionaries share: file names, transforms, a list of issues found on the way down."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from typing import Any
 from pydantic import ValidationInfo
 
 from nlosrender.config.encodable import is_encodable
-from nlosrender.config.fields import LONGEST, as_finite
+from nlosrender.config.fields import LONGEST, as_finite, finite_numbers
 from nlosrender.config.frozen import freeze
-from nlosrender.config.refusal import Fault, raise_faults, refusal, shown
-from nlosrender.errors import KeyPath, nearest
+from nlosrender.config.issues import InvalidValue, did_you_mean, mismatch, shown
+from nlosrender.errors import KeyPath, ValidationIssue, nearest
 
 TRANSFORM_KEYS = ("to_world", "to_uv")
 _OPERATIONS = "translate: [x, y, z], rotate: {axis: [x, y, z], angle_deg: a}, scale: s or [x, y, z]"
@@ -21,7 +21,7 @@ _OPERATIONS = "translate: [x, y, z], rotate: {axis: [x, y, z], angle_deg: a}, sc
 
 @dataclass
 class PluginCheck:
-    """One walk down a plugin dictionary; collects every fault instead of stopping at the first.
+    """One walk down a plugin dictionary; collects every issue instead of stopping at the first.
 
     Parameters
     ----------
@@ -30,28 +30,26 @@ class PluginCheck:
     """
 
     folder: Path
-    faults: list[Fault] = field(default_factory=list)
+    issues: list[ValidationIssue] = field(default_factory=list)
 
-    def fault(self, path: KeyPath, message: str, *, at_key: bool = False) -> None:
+    def note(self, path: KeyPath, message: str, *, at_key: bool = False) -> None:
         """Note one mistake at ``path`` below the dictionary."""
-        self.faults.append(Fault(path, message, "key" if at_key else "value"))
+        self.issues.append(ValidationIssue(path, message, "key" if at_key else "value"))
 
-    def refuse(self, path: KeyPath, value: object, need: str, advice: str = "") -> None:
+    def note_mismatch(self, path: KeyPath, value: object, need: str, advice: str = "") -> None:
         """Note that ``value`` at ``path`` is not what is needed."""
-        self.fault(path, refusal(value, need, advice))
+        self.note(path, mismatch(value, need, advice))
 
     def plugin_type(self, value: object, path: KeyPath, allowed: Sequence[str], what: str) -> str | None:
         """Return the plugin's type; None after noting why there is none."""
         if not isinstance(value, Mapping):
-            self.refuse(path, value, f"a mapping with a type, such as {{type: {allowed[0]}}}")
+            self.note_mismatch(path, value, f"a mapping with a type, such as {{type: {allowed[0]}}}")
             return None
         name = value.get("type")
         if "type" not in value:
-            self.fault((*path, "type"), f"missing, need the {what}: one of {', '.join(allowed)}.")
+            self.note((*path, "type"), f"missing, need the {what}: one of {', '.join(allowed)}.")
         elif name not in allowed:
-            close = nearest(str(name), allowed)
-            hint = f"Did you mean {close}?" if close else ""
-            self.refuse((*path, "type"), name, f"one of {', '.join(allowed)}", hint)
+            self.note_mismatch((*path, "type"), name, f"one of {', '.join(allowed)}", did_you_mean(str(name), allowed))
         else:
             return str(name)
         return None
@@ -66,24 +64,24 @@ class PluginCheck:
         if isinstance(value, Mapping):
             return {name: self.generic(item, (*path, name)) for name, item in value.items()}
         if value is None:
-            self.refuse(path, value, "a value")
+            self.note_mismatch(path, value, "a value")
         return value
 
     def numbers(self, value: Any, path: KeyPath, size: int, need: str) -> Any:
         """Return a list of ``size`` finite numbers as floats."""
-        found = _finite_list(value, (size,))
+        found = finite_numbers(value, size)
         if found is None or any(abs(number) > LONGEST for number in found):
-            self.refuse(path, value, need)
+            self.note_mismatch(path, value, need)
         return found
 
     def file(self, value: object, path: KeyPath) -> str:
         """Return the absolute name of an existing file."""
         if not isinstance(value, str) or not value.strip():
-            self.refuse(path, value, "the name of a file")
+            self.note_mismatch(path, value, "the name of a file")
             return ""
         absolute, problem = mitsuba_file(value, self.folder)
         if problem:
-            self.fault(path, problem)
+            self.note(path, problem)
         return str(absolute)
 
     def transform(self, value: Any, path: KeyPath) -> Any:
@@ -91,42 +89,42 @@ class PluginCheck:
         items = value if isinstance(value, (list, tuple)) else None
         if items and all(isinstance(item, Mapping) for item in items):
             return [self._operation(item, (*path, index)) for index, item in enumerate(items)]
-        rows = [_finite_list(row, (4,)) for row in items] if items is not None else []
+        rows = [finite_numbers(row, 4) for row in items] if items is not None else []
         if len(rows) != 4 or any(row is None for row in rows):
-            self.refuse(path, value, f"4 rows of 4 finite numbers, or a list of {_OPERATIONS}")
+            self.note_mismatch(path, value, f"4 rows of 4 finite numbers, or a list of {_OPERATIONS}")
             return value
         matrix = [row for row in rows if row is not None]
         if matrix[3] != [0, 0, 0, 1]:
-            self.refuse((*path, 3), value[3], "[0, 0, 0, 1] as last row")
+            self.note_mismatch((*path, 3), value[3], "[0, 0, 0, 1] as last row")
         elif abs(_determinant(matrix)) < 1e-30:
-            self.fault(path, "the matrix is singular: it flattens space, need one that can be inverted.")
+            self.note(path, "the matrix is singular: it flattens space, need one that can be inverted.")
         return matrix
 
     def _operation(self, item: Mapping[str, Any], path: KeyPath) -> dict[str, Any]:
         if len(item) != 1 or next(iter(item)) not in ("translate", "rotate", "scale"):
-            self.refuse(path, item, f"exactly one of {_OPERATIONS}")
+            self.note_mismatch(path, item, f"exactly one of {_OPERATIONS}")
             return dict(item)
         ((name, value),) = item.items()
         at = (*path, name)
         if name == "rotate":
             return {name: self._rotation(value, at)}
-        numbers = _finite_list(value, (3,))
+        numbers = finite_numbers(value, 3)
         if name == "scale" and as_finite(value) is not None:
             numbers = [as_finite(value) or 0.0] * 3
         need = "3 finite numbers [x, y, z]" if name == "translate" else "a number or [x, y, z], none of them 0"
         if numbers is None or (name == "scale" and 0.0 in numbers):
-            self.refuse(at, value, need)
+            self.note_mismatch(at, value, need)
         return {name: numbers}
 
     def _rotation(self, value: Any, path: KeyPath) -> Any:
         if not isinstance(value, Mapping) or set(value) != {"axis", "angle_deg"}:
-            self.refuse(path, value, "{axis: [x, y, z], angle_deg: a}")
+            self.note_mismatch(path, value, "{axis: [x, y, z], angle_deg: a}")
             return value
-        axis, angle = _finite_list(value["axis"], (3,)), as_finite(value["angle_deg"])
+        axis, angle = finite_numbers(value["axis"], 3), as_finite(value["angle_deg"])
         if axis is None or not any(axis):
-            self.refuse((*path, "axis"), value["axis"], "3 finite numbers [x, y, z], not all zero")
+            self.note_mismatch((*path, "axis"), value["axis"], "3 finite numbers [x, y, z], not all zero")
         if angle is None:
-            self.refuse((*path, "angle_deg"), value["angle_deg"], "a finite number in degrees")
+            self.note_mismatch((*path, "angle_deg"), value["angle_deg"], "a finite number in degrees")
         return {"axis": axis, "angle_deg": angle}
 
 
@@ -135,24 +133,23 @@ def checked_plugin(walk: Callable[[PluginCheck, Any], Any], value: Any, validati
 
     Raises
     ------
-    pydantic.ValidationError
-        With every fault found.
+    InvalidValue
+        With every issue found.
     """
     check = PluginCheck(config_folder(validation))
     result = walk(check, value)
-    raise_faults("plugin", check.faults)
+    if check.issues:
+        raise InvalidValue(*check.issues)
     return freeze(result)
 
 
 def config_folder(validation: ValidationInfo) -> Path:
     """Return the folder relative file names start from: the YAML's, else the current directory."""
-    return Path(
-        validation.context["folder"] if validation.context and "folder" in validation.context else "."
-    ).absolute()
+    return Path((validation.context or {}).get("folder", ".")).absolute()
 
 
 def existing_file(name: str, folder: Path, start: str = "the YAML's folder") -> tuple[Path, str]:
-    """Return the absolute path of ``name`` and the problem with it; the problem is empty for a readable file.
+    """Return the absolute path of ``name`` and what is wrong with it; empty for a readable file.
 
     ``start`` says in words where relative names start.
     """
@@ -176,13 +173,6 @@ def mitsuba_file(name: str, folder: Path, start: str = "the YAML's folder") -> t
         what = f"got {shown(name)}; Mitsuba opens files with names in UTF-8 only, not {path}."
         problem = f"{what} Rename it, or its folder."
     return path, problem
-
-
-def _finite_list(value: object, sizes: tuple[int, ...]) -> list[float] | None:
-    if not isinstance(value, (list, tuple)) or len(value) not in sizes:
-        return None
-    numbers = [as_finite(item) for item in value]
-    return None if None in numbers else [number for number in numbers if number is not None]
 
 
 def _determinant(m: list[list[float]]) -> float:

@@ -11,9 +11,10 @@ from pydantic import Field
 from nlosrender.config.bsdf import WHITE_DIFFUSE, BsdfMapping
 from nlosrender.config.fields import Direction, Flag, Length, Point3
 from nlosrender.config.hidden_geometry import FromFile, MeshFilename
-from nlosrender.config.refusal import Fault, shown
-from nlosrender.config.section import Section, pose_faults
+from nlosrender.config.issues import shown
+from nlosrender.config.section import BY_TYPE, Section, pose_issues
 from nlosrender.config.vectors import height_above
+from nlosrender.errors import ValidationIssue
 
 EDGE_TOLERANCE = 1e-9  # relative: a decimal such as 0.1 * 3 may pass the edge by its rounding
 
@@ -38,9 +39,9 @@ class RectangleWallConfig(_Wall):
     up: Direction = (0.0, 1.0, 0.0)
     """direction of the wall's y axis, made perpendicular to normal"""
 
-    def rules(self) -> Iterator[Fault]:
-        """Yield the fault of a pose without an up direction."""
-        yield from pose_faults(self.normal, self.up)
+    def rule_pose(self) -> Iterator[ValidationIssue]:
+        """An up direction is needed."""
+        yield from pose_issues(self.normal, self.up)
 
     @property
     def extent(self) -> tuple[float, float]:
@@ -65,12 +66,18 @@ class SphereWallConfig(_Wall):
     height: Length | None = None
     """m, default height of the grids along the polar axis; null: the whole diameter"""
 
-    def rules(self) -> Iterator[Fault]:
-        """Yield the faults of a default grid extent larger than the sphere."""
-        for key, given, largest in zip(("width", "height"), (self.width, self.height), self.extent, strict=True):
-            if given is not None and given > largest * (1 + EDGE_TOLERANCE):
-                message = f"got {shown(given)}, need at most {largest:.6g} m, the whole sphere's."
-                yield Fault((key,), message, needs=((key,), ("radius",)))
+    def rule_width(self) -> Iterator[ValidationIssue]:
+        """The default width of the grids is on the sphere."""
+        yield from self._too_large("width", self.width, self.extent[0])
+
+    def rule_height(self) -> Iterator[ValidationIssue]:
+        """The default height of the grids is on the sphere."""
+        yield from self._too_large("height", self.height, self.extent[1])
+
+    def _too_large(self, key: str, given: float | None, largest: float) -> Iterator[ValidationIssue]:
+        if given is not None and given > largest * (1 + EDGE_TOLERANCE):
+            message = f"got {shown(given)}, need at most {largest:.6g} m, the whole sphere's."
+            yield ValidationIssue((key,), message)
 
     @property
     def extent(self) -> tuple[float, float]:
@@ -119,5 +126,5 @@ class MeshWallConfig(FromFile):
 
 
 RelayWallConfig = Annotated[
-    RectangleWallConfig | SphereWallConfig | CylinderWallConfig | MeshWallConfig, Field(discriminator="type")
+    RectangleWallConfig | SphereWallConfig | CylinderWallConfig | MeshWallConfig, Field(discriminator="type"), BY_TYPE
 ]

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import model_validator
+from pydantic import ValidationInfo
 
 from nlosrender.config.fields import (
     BounceCount,
@@ -20,38 +20,29 @@ from nlosrender.config.fields import (
     Seed,
     memory_bytes,
 )
-from nlosrender.config.refusal import Fault, refuse, shown
-from nlosrender.config.section import Section
-from nlosrender.errors import nearest
+from nlosrender.config.issues import invalid_value, shown
+from nlosrender.config.section import ONE_OF, Section
+from nlosrender.errors import ValidationIssue
 
 _STOPPING = ("spp", "target_error", "time_limit_s")
-_ENGINES = ("auto", "path", "virtual_lights")
 DEFAULT_TARGET_ERROR = 0.05
-
-
-def _engine(value: object) -> str:
-    if not isinstance(value, str) or value not in _ENGINES:
-        close = nearest(value, _ENGINES) if isinstance(value, str) else None
-        raise refuse(value, f"one of {', '.join(_ENGINES)}", f"Did you mean {close}?" if close else "")
-    return value
 
 
 def _output_path(value: object) -> Path:
     if not isinstance(value, str) or not value.strip() or any(ord(character) < 32 for character in value):
-        raise refuse(value, "the name of the file to write", "Leave it out for <name>.hdf5.")
+        raise invalid_value(value, "the name of the file to write", "Leave it out for <name>.hdf5.")
     if value.endswith(("/", "\\")) or Path(value).name in ("", "..", "."):
-        raise refuse(value, "the name of a file, not of a folder")
+        raise invalid_value(value, "the name of a file, not of a folder")
     return Path(value)
 
 
-Engine = Annotated[Literal["auto", "path", "virtual_lights"], Checked(_engine, {"enum": list(_ENGINES)})]
 OutputPath = Annotated[Path, Checked(_output_path, {"type": "string", "minLength": 1})]
 
 
 class RenderConfig(Section):
     """What is computed, how well, and on what."""
 
-    engine: Engine = "auto"
+    engine: Annotated[Literal["auto", "path", "virtual_lights"], ONE_OF] = "auto"
     """auto: the cheapest engine right for the scene; path: path tracer; virtual_lights: third bounce without noise"""
     max_bounces: BounceCount | None = 7
     """highest bounce, counting both points on the wall: 3 is the third bounce; null: no limit; line_of_sight: number
@@ -74,29 +65,32 @@ class RenderConfig(Section):
     """end paths of low weight early, without bias; the walks of virtual lights always end so"""
     seed: Seed = 0
     """start of the random numbers; the same seed gives the same file"""
-    backend: Literal["auto", "llvm", "cuda"] = "auto"
+    backend: Annotated[Literal["auto", "llvm", "cuda"], ONE_OF] = "auto"
     """llvm: processor, cuda: NVIDIA GPU, auto: the GPU where there is one"""
-    color: Literal["auto", "grey", "rgb"] = "auto"
+    color: Annotated[Literal["auto", "grey", "rgb"], ONE_OF] = "auto"
     """auto: three channels only when the scene has colours"""
     polarized: Flag = False
     """four grey channels, the Stokes components I, Q, U, V, instead of colours"""
     memory_limit: MemoryLimit = "auto"
     """auto, or a size such as 600MB, 8GB, 2GiB"""
 
-    @model_validator(mode="before")
     @classmethod
-    def _default_target_error(cls, raw: Any) -> Any:
-        unbounded = isinstance(raw, Mapping) and all(raw.get(key) is None for key in _STOPPING)
+    def with_defaults(cls, raw: dict[str, Any], validation: ValidationInfo) -> dict[str, Any]:
+        """Stop at an error where nothing says when to stop."""
+        unbounded = all(raw.get(key) is None for key in _STOPPING)
         return {**raw, "target_error": DEFAULT_TARGET_ERROR} if unbounded else raw
 
-    def rules(self) -> Iterator[Fault]:
-        """Yield the fault of two goals at once."""
+    def rule_goals(self) -> Iterator[ValidationIssue]:
+        """There is one goal."""
         if self.spp is not None and self.target_error is not None:
             message = f"got {shown(self.target_error)} beside spp {self.spp}; they exclude each other, keep one."
-            yield Fault(("target_error",), message, "key", (("spp",), ("target_error",)))
+            yield ValidationIssue(("target_error",), message, "key")
+
+    def rule_polarized(self) -> Iterator[ValidationIssue]:
+        """Polarised light is grey."""
         if self.polarized and self.color == "rgb":
             message = "got true beside color rgb; polarised light is rendered in grey: use color auto or grey."
-            yield Fault(("polarized",), message, "key", (("color",), ("polarized",)))
+            yield ValidationIssue(("polarized",), message, "key")
 
     @property
     def memory_limit_bytes(self) -> int | None:
@@ -109,11 +103,11 @@ class OutputConfig(Section):
 
     path: OutputPath = Path("capture.hdf5")
     """default <name>.hdf5; relative to the current directory; {name} in it is the capture's name"""
-    format: Literal["znlos"] = "znlos"
+    format: Annotated[Literal["znlos"], ONE_OF] = "znlos"
     """znlos: the HDF5 layout of the Z-NLOS dataset"""
-    frame: Literal["znlos", "scene"] = "znlos"
+    frame: Annotated[Literal["znlos", "scene"], ONE_OF] = "znlos"
     """coordinates in the file: znlos: wall in y = 0, hidden scene at y < 0; scene: as in the config"""
-    compression: Literal["gzip", "none"] = "gzip"
+    compression: Annotated[Literal["gzip", "none"], ONE_OF] = "gzip"
     """gzip (with shuffle) or none"""
     variance: Flag = True
     """store the variance of the estimate per bin"""

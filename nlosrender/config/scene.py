@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from functools import cached_property
-from typing import Any
+from typing import Annotated, Any
 
-from pydantic import model_validator
+from pydantic import ValidationInfo
 
 from nlosrender.config.bsdf import is_colored
 from nlosrender.config.emitters import EmitterConfig, PointLamp, SpotLamp
 from nlosrender.config.hidden_geometry import HiddenItemConfig
+from nlosrender.config.issues import WrongValueRead
 from nlosrender.config.mitsuba_xml import MitsubaXml, is_colored_xml, read_mitsuba_xml
-from nlosrender.config.refusal import Fault
 from nlosrender.config.relay_wall import RelayWallConfig
-from nlosrender.config.section import Section
+from nlosrender.config.section import LIST, Section
+from nlosrender.errors import ValidationIssue
 
 
 class SceneConfig(Section):
@@ -22,34 +24,37 @@ class SceneConfig(Section):
 
     relay_wall: RelayWallConfig | None = None
     """the visible surface, told by its type; every scan but line_of_sight needs it"""
-    hidden_geometry: tuple[HiddenItemConfig, ...] = ()
+    hidden_geometry: Annotated[tuple[HiddenItemConfig, ...], LIST] = ()
     """a list of items, told apart by their types; empty: H is zero"""
-    emitters: tuple[EmitterConfig, ...] = ()
+    emitters: Annotated[tuple[EmitterConfig, ...], LIST] = ()
     """line_of_sight: what flashes at t = 0, a list of items told apart by their types"""
     mitsuba: MitsubaXml | None = None
     """line_of_sight: a Mitsuba scene as .xml, in m; its shapes, emitters and camera join what is given here"""
 
-    @model_validator(mode="before")
     @classmethod
-    def _name_items(cls, raw: Any) -> Any:
-        if not isinstance(raw, Mapping):
-            return raw
+    def with_defaults(cls, raw: dict[str, Any], validation: ValidationInfo) -> dict[str, Any]:
+        """Name the items."""
         lists = {key: raw[key] for key in ("hidden_geometry", "emitters") if isinstance(raw.get(key), (list, tuple))}
-        return {**raw, **{key: [_named(item, index) for index, item in enumerate(lists[key])] for key in lists}}
+        return raw | {key: [_named(item, index) for index, item in enumerate(lists[key])] for key in lists}
 
-    def rules(self) -> Iterator[Fault]:
-        """Yield the faults between items, and between items and the wall."""
+    def rule_names(self) -> Iterator[ValidationIssue]:
+        """Every item has a name of its own."""
         first_use: dict[str, int] = {}
         for index, item in enumerate(self.hidden_geometry):
-            first = first_use.setdefault(item.name, index)
-            path = ("hidden_geometry", index)
-            if first != index:
-                message = f"got {item.name}, the name of hidden_geometry.{first} as well, need a name of its own."
-                yield Fault((*path, "name"), message, needs=((*path, "name"), ("hidden_geometry", first, "name")))
-            wall = "no" if self.relay_wall is None else f"a {self.relay_wall.type}"
-            if item.type == "room" and wall != "a rectangle":
-                message = f"got a room in front of {wall} wall; a room needs a rectangle relay wall."
-                yield Fault((*path, "type"), message, needs=(path, ("relay_wall", "type")))
+            with suppress(WrongValueRead):
+                first = first_use.setdefault(item.name, index)
+                if first != index:
+                    message = f"got {item.name}, the name of hidden_geometry.{first} as well, need a name of its own."
+                    yield ValidationIssue(("hidden_geometry", index, "name"), message)
+
+    def rule_rooms(self) -> Iterator[ValidationIssue]:
+        """Rooms are open towards a rectangle."""
+        wall = "no" if self.relay_wall is None else f"a {self.relay_wall.type}"
+        for index, item in enumerate(self.hidden_geometry if wall != "a rectangle" else ()):
+            with suppress(WrongValueRead):
+                if item.type == "room":
+                    message = f"got a room in front of {wall} wall; a room needs a rectangle relay wall."
+                    yield ValidationIssue(("hidden_geometry", index, "type"), message)
 
     @cached_property  # a Mitsuba scene is read for it
     def is_colored(self) -> bool:

@@ -2,33 +2,196 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from typing import Self
+import typing
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from functools import cache
+from typing import TYPE_CHECKING, Any, Self
 
-from pydantic import BaseModel, ConfigDict, model_validator
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    GetCoreSchemaHandler,
+    ModelWrapValidatorHandler,
+    PrivateAttr,
+    ValidationInfo,
+    model_validator,
+)
+from pydantic_core import CoreSchema, core_schema
 
-from nlosrender.config.refusal import Fault, raise_faults, shown
+from nlosrender.config.issues import Wrong, WrongValueRead, did_you_mean, mismatch, one_of, shown, wrong_value
 from nlosrender.config.vectors import parallel
+from nlosrender.errors import KeyPath, ValidationIssue
 
 
 class Section(BaseModel):
-    """A mapping of the YAML; attribute names are its keys."""
+    """A mapping of the YAML; attribute names are its keys.
+
+    Every mistake in it is found in one validation: a value that is wrong does not raise, its key is left without a
+    value. ``load.validated`` makes sections and collects the issues.
+    """
 
     # Attribute docstrings feed the JSON Schema and the messages about missing keys: one text, one place.
     model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
 
-    def rules(self) -> Iterator[Fault]:
-        """Yield what is wrong in the combination of this section's values."""
-        yield from ()
+    _wrong: dict[str, Wrong] = PrivateAttr(default_factory=dict)
+    _unknown: tuple[str, ...] = PrivateAttr(default=())
 
-    @model_validator(mode="after")
-    def _obey_rules(self) -> Self:
-        raise_faults(type(self).__name__, self.rules())
-        return self
+    @classmethod
+    def with_defaults(cls, raw: dict[str, Any], validation: ValidationInfo) -> dict[str, Any]:
+        """Return the raw values with those added that depend on others; nothing in ``raw`` is known to be right."""
+        return raw
+
+    @model_validator(mode="wrap")
+    @classmethod
+    def _keep_what_is_right(cls, raw: Any, handler: ModelWrapValidatorHandler[Self], validation: ValidationInfo) -> Any:
+        if isinstance(raw, Wrong):
+            return raw
+        if not isinstance(raw, Mapping):
+            return wrong_value(raw, "a mapping of keys and values")
+        fields = cls.model_fields
+        raw = cls.with_defaults({**raw}, validation)
+        for key, field in fields.items():
+            if key not in raw and field.is_required():
+                raw[key] = Wrong(ValidationIssue((), f"missing, it is required: {field.description or 'no default'}."))
+        section = handler({key: value for key, value in raw.items() if key in fields})
+        section._unknown = tuple(key for key in raw if key not in fields)
+        section._wrong = {key: value for key, value in vars(section).items() if isinstance(value, Wrong)}
+        for key in section._wrong:
+            del vars(section)[key]
+        return section
+
+    if not TYPE_CHECKING:  # else every attribute would be known to exist
+
+        def __getattr__(self, name: str) -> Any:
+            """Tell a rule that it reads a wrong value."""
+            if name in type(self).model_fields:
+                raise WrongValueRead(name)
+            return super().__getattr__(name)
+
+    def issues(self, path: KeyPath, root: type[Section]) -> Iterator[ValidationIssue]:
+        """Yield what is wrong in this section and those in it; a method ``rule_...`` ends where it reads a wrong value.
+
+        Parameters
+        ----------
+        path
+            Where the section stands.
+        root
+            The section in which homes of unknown keys are looked for.
+        """
+        for key in type(self).model_fields:
+            value = self._wrong[key] if key in self._wrong else vars(self)[key]
+            yield from issues_in(value, (*path, key), root)
+        for key in self._unknown:
+            yield ValidationIssue((*path, key), _unknown_key(key, type(self), root), "key")
+        for name in _rule_names(type(self)):
+            with suppress(WrongValueRead):
+                for issue in getattr(self, name)():
+                    yield issue.below(path)
 
 
-def pose_faults(normal: tuple[float, ...], up: tuple[float, ...]) -> Iterator[Fault]:
-    """Yield the fault of an ``up`` that does not tell the pose's y axis."""
+def issues_in(value: Any, path: KeyPath, root: type[Section]) -> Iterator[ValidationIssue]:
+    """Yield what is wrong in the value of a field, or in a section."""
+    if isinstance(value, Section):
+        yield from value.issues(path, root)
+    elif isinstance(value, Wrong):
+        yield from (issue.below(path) for issue in value.issues)
+    elif type(value) in (tuple, dict):
+        for key, item in enumerate(value) if type(value) is tuple else value.items():
+            yield from issues_in(item, (*path, key), root)
+
+
+@cache
+def _rule_names(section: type[Section]) -> tuple[str, ...]:
+    return tuple(name for name in dir(section) if name.startswith("rule_"))
+
+
+def _unknown_key(key: str, section: type[Section], root: type[Section]) -> str:
+    known = list(section.model_fields)
+    if close := did_you_mean(key, known):
+        return f"unknown key. {close}"
+    homes = _homes(root, key, ())
+    return f"unknown key, known here: {', '.join(known)}." + (f" It belongs in {homes[0]}." if homes else "")
+
+
+def _homes(section: type[Section], key: str, path: tuple[str, ...]) -> list[str]:
+    """Return the sections, as dotted paths, where ``key`` is known."""
+    found = [".".join(path) or "the top level"] if key in section.model_fields else []
+    for name, field in section.model_fields.items():
+        options = sections_in(field.annotation)
+        if len(options) == 1:
+            found += _homes(options[0], key, (*path, name))
+    return found
+
+
+@dataclass(frozen=True)
+class Guard:
+    """Pydantic metadata: a look at the raw value before pydantic's own check, for messages in our words.
+
+    Parameters
+    ----------
+    look
+        Takes the value and the annotated type; returns what stands for a wrong value, else None.
+    """
+
+    look: Callable[[Any, Any], Wrong | None]
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+        """Return pydantic's schema behind the look."""
+
+        def check(value: Any, inner: core_schema.ValidatorFunctionWrapHandler) -> Any:
+            wrong = value if isinstance(value, Wrong) else self.look(value, source)
+            return inner(value) if wrong is None else wrong
+
+        return core_schema.no_info_wrap_validator_function(check, handler(source))
+
+
+def _look_for_list(value: Any, _: Any) -> Wrong | None:
+    advice = "Write [] for an empty one." if value is None else ""
+    return None if isinstance(value, (list, tuple)) else wrong_value(value, "a list", advice)
+
+
+def _look_for_mapping(value: Any, _: Any) -> Wrong | None:
+    return None if isinstance(value, Mapping) else wrong_value(value, "a mapping of keys and values")
+
+
+def _look_for_name(value: Any, literal: Any) -> Wrong | None:
+    known = typing.get_args(literal)
+    return None if value in known else wrong_value(value, one_of(known), did_you_mean(value, known))
+
+
+def _look_for_type(value: Any, union: Any) -> Wrong | None:
+    known = [type_of(section) for section in sections_in(union)]
+    if not isinstance(value, Mapping):
+        return _look_for_mapping(value, union)
+    if "type" not in value:
+        return Wrong(ValidationIssue(("type",), f"missing, need {one_of(known)}."))
+    given = value["type"]
+    if given in known:
+        return None
+    return Wrong(ValidationIssue(("type",), mismatch(given, one_of(known), did_you_mean(given, known))))
+
+
+LIST, MAPPING = Guard(_look_for_list), Guard(_look_for_mapping)
+ONE_OF = Guard(_look_for_name)  # of a Literal
+BY_TYPE = Guard(_look_for_type)  # of a union of sections
+
+
+def type_of(section: type[BaseModel]) -> str:
+    """Return the ``type`` that a member of a union is told by."""
+    return str(typing.get_args(section.model_fields["type"].annotation)[0])
+
+
+def sections_in(annotation: Any) -> list[type[Section]]:
+    """Return the sections in the annotation of a field: one, or the members of a union."""
+    if isinstance(annotation, type) and issubclass(annotation, Section):
+        return [annotation]
+    return [section for part in typing.get_args(annotation) for section in sections_in(part)]
+
+
+def pose_issues(normal: Sequence[float], up: Sequence[float]) -> Iterator[ValidationIssue]:
+    """Yield the issue of an ``up`` that does not tell the pose's y axis."""
     if parallel(normal, up):
         message = f"up {shown(up)} is parallel to normal {shown(normal)}, need two directions that span a plane."
-        yield Fault(("up",), message, needs=(("normal",), ("up",)))
+        yield ValidationIssue(("up",), message)

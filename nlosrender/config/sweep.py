@@ -10,9 +10,10 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
-from nlosrender.config.fields import Checked, Seed, as_finite
-from nlosrender.config.refusal import Fault, refusal, refuse
-from nlosrender.config.section import Section
+from nlosrender.config.fields import Checked, Seed, as_finite, finite_numbers
+from nlosrender.config.issues import invalid_value, mismatch
+from nlosrender.config.section import MAPPING, ONE_OF, Section
+from nlosrender.errors import ValidationIssue
 
 MAX_CAPTURES = 100_000  # of one sweep; beyond it a range is a slip of the pen
 _STEP_SLACK = 1e-9  # of a step: 0.1 * 3 is not 0.3
@@ -56,14 +57,14 @@ def _swept_values(value: object) -> tuple[Any, ...]:
     if isinstance(value, list) and value:
         return tuple(value)
     if not isinstance(value, Mapping) or len(value) != 1 or next(iter(value)) not in ("range", "log_range"):
-        raise refuse(value, _VALUES)
+        raise invalid_value(value, _VALUES)
     kind, ends = next(iter(value.items()))
     steps = ("n",) if kind == "log_range" else ("n", "step")
     if not isinstance(ends, Mapping) or set(ends) not in [{"start", "stop", step} for step in steps]:
-        raise refuse(ends, f"start, stop and {' or '.join(steps)}")
+        raise invalid_value(ends, f"start, stop and {' or '.join(steps)}")
     start, stop = as_finite(ends["start"]), as_finite(ends["stop"])
     if start is None or stop is None or (kind == "log_range" and min(start, stop) <= 0):
-        raise refuse(ends["stop" if start is not None else "start"], f"a number{' > 0' * (kind == 'log_range')}")
+        raise invalid_value(ends["stop" if start is not None else "start"], f"a number{' > 0' * (kind == 'log_range')}")
     n = _number_of_values(ends, start, stop)
     last = start + (n - 1) * float(ends["step"]) if "step" in ends else stop
     return _range(kind, start, last, n)
@@ -73,12 +74,12 @@ def _number_of_values(ends: Mapping[str, Any], start: float, stop: float) -> int
     if "step" in ends:
         step = as_finite(ends["step"])
         if not step or (stop - start) / step < 0:
-            raise refuse(ends["step"], "a step that leads from start to stop")
+            raise invalid_value(ends["step"], "a step that leads from start to stop")
         n = math.floor((stop - start) / step + _STEP_SLACK) + 1 if (stop - start) / step < MAX_CAPTURES else 0
     else:
         n = ends["n"] if isinstance(ends["n"], int) and not isinstance(ends["n"], bool) else 0
     if not 1 <= n <= MAX_CAPTURES:
-        raise refuse(ends.get("n", ends.get("step")), f"1 to {MAX_CAPTURES} values")
+        raise invalid_value(ends.get("n", ends.get("step")), f"1 to {MAX_CAPTURES} values")
     return n
 
 
@@ -94,20 +95,19 @@ def _range(kind: str, start: float, stop: float, n: int) -> tuple[float | int, .
 def _draw(value: object) -> Draw:
     kinds = ("uniform", "log_uniform", "integers", "choice")
     if not isinstance(value, Mapping) or len(value) != 1 or next(iter(value)) not in kinds:
-        raise refuse(value, _DRAW)
+        raise invalid_value(value, _DRAW)
     kind, among = next(iter(value.items()))
     if kind == "choice":
         if not isinstance(among, list) or not among:
-            raise refuse(among, "a list of values to choose from")
+            raise invalid_value(among, "a list of values to choose from")
         return Draw(kind, tuple(among))
-    ends = [as_finite(end) for end in among] if isinstance(among, list) else []
-    numbers = [end for end in ends if end is not None]
-    whole = kind != "integers" or all(isinstance(end, int) for end in among)
-    least = 0.0 if kind == "log_uniform" else -math.inf
-    if len(ends) != 2 or len(numbers) != 2 or not whole or not least < numbers[0] <= numbers[1]:
+    ends = finite_numbers(among, 2)
+    above = 0.0 if kind == "log_uniform" else -math.inf
+    whole = kind != "integers" or (ends and all(isinstance(end, int) for end in among))
+    if ends is None or not whole or not above < ends[0] <= ends[1]:
         need = {"integers": "two integers", "log_uniform": "two numbers > 0"}.get(kind, "two numbers")
-        raise refuse(among, f"{need} [a, b] with a <= b")
-    return Draw(kind, tuple(among) if kind == "integers" else tuple(numbers))
+        raise invalid_value(among, f"{need} [a, b] with a <= b")
+    return Draw(kind, tuple(among) if kind == "integers" else tuple(ends))
 
 
 _RANGE_SCHEMA = {"type": "object", "required": ["start", "stop"], "additionalProperties": {"type": "number"}}
@@ -152,7 +152,7 @@ RandomDraw = Annotated[
 
 def _count(value: object) -> int:
     if isinstance(value, bool) or not isinstance(value, int) or not 1 <= value <= MAX_CAPTURES:
-        raise refuse(value, f"an integer from 1 to {MAX_CAPTURES}")
+        raise invalid_value(value, f"an integer from 1 to {MAX_CAPTURES}")
     return value
 
 
@@ -166,42 +166,45 @@ class RandomSweep(Section):
     """draws of every key"""
     seed: Seed = 0
     """start of the draws; they do not depend on count or on other keys"""
-    keys: dict[str, RandomDraw]
+    keys: Annotated[dict[str, RandomDraw], MAPPING]
     """dotted key: {uniform: [a, b]}, {log_uniform: [a, b]}, {integers: [a, b]} or {choice: [...]}"""
 
 
 class SweepConfig(Section):
     """Many captures from one file: which keys take which values."""
 
-    mode: Literal["product", "zip"] = "product"
+    mode: Annotated[Literal["product", "zip"], ONE_OF] = "product"
     """product: every combination, with every random draw; zip: first values together, second values together, ..."""
-    keys: dict[str, Values] = Field(default_factory=dict)
+    keys: Annotated[dict[str, Values], MAPPING] = Field(default_factory=dict)
     """dotted key: a list of values, or {range: {start: 0.5, stop: 1.5, n: 5}} (or step; ends included), or log_range"""
     random: RandomSweep | None = None
     """further keys, at random"""
 
-    def rules(self) -> Iterator[Fault]:
-        """Yield what is wrong between the keys."""
-        drawn = self.random.keys if self.random else {}
-        if not self.keys and self.random is None:
-            yield Fault((), "sweeps nothing, need values in keys, or draws in random.keys.", "key")
-        if self.random and not drawn:
-            yield Fault(("random", "keys"), "draws nothing, need at least one key.", "key")
-        for key in sorted(set(self.keys) & set(drawn)):
-            yield Fault(("random", "keys", key), "stands in keys too; keep one of the two.", "key")
-        lengths = {key: len(values) for key, values in self.keys.items()}
-        if self.random and drawn:
-            lengths["random.count"] = self.random.count
+    def rule_something_is_swept(self) -> Iterator[ValidationIssue]:
+        """There are values, or draws."""
+        if self.random is None and not self.keys:
+            yield ValidationIssue((), "sweeps nothing, need values in keys, or draws in random.keys.", "key")
+        if self.random is not None and not self.random.keys:
+            yield ValidationIssue(("random", "keys"), "draws nothing, need at least one key.", "key")
+
+    def rule_one_way_for_a_key(self) -> Iterator[ValidationIssue]:
+        """A key is swept or drawn."""
+        for key in sorted(set(self.keys) & set(self.random.keys if self.random else ())):
+            yield ValidationIssue(("random", "keys", key), "stands in keys too; keep one of the two.", "key")
+
+    def rule_lengths(self) -> Iterator[ValidationIssue]:
+        """There are as many values as the mode takes."""
+        lengths = self._lengths
         if self.mode == "zip" and len(set(lengths.values())) > 1:
             listed = ", ".join(f"{key}: {n}" for key, n in lengths.items())
-            yield Fault(("mode",), f"zip takes as many values of every key, got {listed}.")
-        if self.n_captures > MAX_CAPTURES:
-            yield Fault(("keys",), refusal(self.n_captures, f"at most {MAX_CAPTURES} captures in all"), "key")
+            yield ValidationIssue(("mode",), f"zip takes as many values of every key, got {listed}.")
+        n_captures = math.prod(lengths.values()) if self.mode == "product" else max(lengths.values(), default=0)
+        if n_captures > MAX_CAPTURES:
+            message = mismatch(n_captures, f"at most {MAX_CAPTURES} captures in all")
+            yield ValidationIssue(("keys",), message, "key")
 
     @property
-    def n_captures(self) -> int:
-        """Number of captures."""
-        lengths = [len(values) for values in self.keys.values()]
-        if self.random and self.random.keys:
-            lengths.append(self.random.count)
-        return math.prod(lengths) if self.mode == "product" else max(lengths, default=0)
+    def _lengths(self) -> dict[str, int]:
+        """Number of values of every key, and of the draws."""
+        lengths = {key: len(values) for key, values in self.keys.items()}
+        return lengths | ({"random.count": self.random.count} if self.random and self.random.keys else {})

@@ -6,19 +6,16 @@ import copy
 import itertools
 import os
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from pydantic import ValidationError
-
 from nlosrender.config.document import Config
-from nlosrender.config.load import MOST_PROBLEMS, default_name, overridden_document, read_text, validate_document
+from nlosrender.config.issues import shown
+from nlosrender.config.load import MAX_ISSUES, capture_config, in_order, validated
 from nlosrender.config.overrides import put
-from nlosrender.config.refusal import shown
 from nlosrender.config.sweep import SweepConfig
-from nlosrender.config.translate import problem_from
 from nlosrender.config.yaml_tree import Document, Place
 from nlosrender.errors import ConfigError, KeyPath, ValidationIssue
 
@@ -42,7 +39,6 @@ class Sweep:
     """The captures of one file: how many, what differs between them, and the config of each."""
 
     document: Document  # without the sweep itself
-    folder: Path  # where relative file names in it start
     settings: tuple[tuple[_Setting, ...], ...]  # of every capture
     paths: tuple[Path, ...]  # output of every capture, all different
 
@@ -70,76 +66,43 @@ class Sweep:
         Raises
         ------
         ConfigError
-            It has mistakes; ``load_sweep`` has looked for them.
+            It has mistakes; ``sweep_of`` has looked for them.
         """
         # built when it is needed: a hundred thousand configs fill the memory
-        return validate_document(_capture_document(self.document, self.settings[index], index), self.folder)
+        return capture_config(_capture_document(self.document, self.settings[index], index))
 
 
-def load_sweep(path: Path, overrides: Sequence[str] = ()) -> Sweep | None:
-    """Read a config file and validate all captures of its sweep.
-
-    Parameters
-    ----------
-    path
-        The YAML file.
-    overrides
-        ``a.b.c=VALUE`` each, as given to ``--set``; they hold for all captures.
+def sweep_of(document: Document) -> Sweep | None:
+    """Validate all captures of a document's sweep.
 
     Returns
     -------
     Sweep
-        Or None when the file has no sweep: ``load_config`` is for those.
+        Or None when the document has no sweep: ``config_of`` is for those.
 
     Raises
     ------
     ConfigError
-        With every problem found.
+        With every issue found.
     """
-    path = Path(path)
-    return parse_sweep(read_text(path), str(path), path.absolute().parent, overrides)
-
-
-def parse_sweep(text: str, source: str, folder: Path, overrides: Sequence[str] = ()) -> Sweep | None:
-    """Validate the text of a config with a sweep; as ``load_sweep``.
-
-    Raises
-    ------
-    ConfigError
-        With every problem found.
-    """
-    document = overridden_document(text, source, overrides)
     if document.tree.get(_SWEEP) is None:
         return None
-    section = _section(document)
-    _refuse_swept_overrides(section, overrides)
-    settings = tuple(_settings(section))
+    section, found = validated(SweepConfig, document.tree[_SWEEP], document, (_SWEEP,))
+    if found or any(path[0] == _SWEEP for path in document.unread):
+        raise ConfigError(in_order(found, document))
+    _check_overrides(section, document)
     base = replace(document, tree={key: value for key, value in document.tree.items() if key != _SWEEP})
-    return _validated(base, folder, settings)
+    return _validated(base, tuple(_settings(section)))
 
 
-def _section(document: Document) -> SweepConfig:
-    """Validate the sweep itself."""
-    raw = document.tree[_SWEEP]
-    try:
-        return SweepConfig.model_validate(raw)
-    except ValidationError as error:
-        details = error.errors(include_url=False)
-    problems = [problem_from({**detail, "loc": (_SWEEP, *detail["loc"])}, document) for detail in details]
-    raise ConfigError([*document.problems, *problems])
-
-
-def _refuse_swept_overrides(section: SweepConfig, overrides: Sequence[str]) -> None:
+def _check_overrides(section: SweepConfig, document: Document) -> None:
     """Refuse ``--set`` of a key that the sweep sets: one of the two would be lost without a word."""
     swept = {*section.keys, *(section.random.keys if section.random else ())}
     message = "is swept; take it out of sweep, or leave --set away."
-    problems = [
-        ValidationIssue((key,), message, place=f"--set {override}")
-        for override in overrides
-        if (key := override.partition("=")[0].strip()) in swept
-    ]
-    if problems:
-        raise ConfigError(problems)
+    keys = [(override, override.partition("=")[0].strip()) for override in document.overrides]
+    issues = [ValidationIssue((key,), message, place=f"--set {override}") for override, key in keys if key in swept]
+    if issues:
+        raise ConfigError(issues)
 
 
 def _settings(section: SweepConfig) -> Iterator[tuple[_Setting, ...]]:
@@ -163,80 +126,60 @@ def _settings(section: SweepConfig) -> Iterator[tuple[_Setting, ...]]:
         yield tuple(itertools.chain.from_iterable(parts))
 
 
-def _validated(base: Document, folder: Path, settings: tuple[tuple[_Setting, ...], ...]) -> Sweep:
+def _validated(base: Document, settings: tuple[tuple[_Setting, ...], ...]) -> Sweep:
     """Look at every capture; a mistake that several share is told once, with the first of them."""
     found: dict[ValidationIssue, list[int]] = {}
     paths: dict[Path, int] = {}
     for index, own in enumerate(settings):
         try:
-            config = validate_document(_capture_document(base, own, index), folder)
+            path = capture_config(_capture_document(base, own, index)).output.path
         except ConfigError as error:
-            for problem in error.issues:
-                found.setdefault(problem, []).append(index)
-        else:
-            path = config.output.path
-            if path in paths:
-                place = base.place(("output", "path"))
-                message = f"captures {paths[path]} and {index} are both {path}; need {{index}} in it, as in "
-                message += f"{DEFAULT_PATTERN}."
-                raise ConfigError(ValidationIssue(("output", "path"), message, place=place))
-            paths[path] = index
-        if len(found) >= MOST_PROBLEMS:
-            break
+            for issue in error.issues:
+                found.setdefault(issue, []).append(index)
+            if len(found) >= MAX_ISSUES:
+                break
+            continue
+        first = paths.setdefault(path, index)
+        if first != index:
+            message = f"captures {first} and {index} are both {path}; need {{index}} in it, as in {DEFAULT_PATTERN}."
+            raise ConfigError(base.issue(("output", "path"), message))
     if found:
-        raise ConfigError([_told(problem, indices, settings) for problem, indices in found.items()])
-    return Sweep(base, folder, settings, tuple(paths))
+        raise ConfigError([_counted(issue, indices, settings) for issue, indices in found.items()])
+    return Sweep(base, settings, tuple(paths))
 
 
-def _told(problem: ValidationIssue, indices: list[int], settings: tuple[tuple[_Setting, ...], ...]) -> ValidationIssue:
+def _counted(issue: ValidationIssue, indices: list[int], settings: tuple[tuple[_Setting, ...], ...]) -> ValidationIssue:
     """Say which captures have a mistake that not all of them have."""
     if len(indices) == len(settings):
-        return problem
+        return issue
     first = ", ".join(f"{setting.key} = {shown(setting.value)}" for setting in settings[indices[0]])
     count = (
         f"{len(indices)} of {len(settings)} captures, the first one with" if len(indices) > 1 else "The capture with"
     )
-    return replace(problem, message=f"{problem.message} ({count} {first}.)")
+    return replace(issue, message=f"{issue.message} ({count} {first}.)")
 
 
 def _capture_document(base: Document, settings: tuple[_Setting, ...], index: int) -> Document:
     """Return the document of one capture: the base with the swept values in place and an output of its own."""
-    document = Document(
-        base.source,
-        copy.deepcopy(base.tree),
-        dict(base.places),
-        list(base.problems),
-        list(base.notes),
-        set(base.unread),
-    )
+    document = base.copy()
     for setting in settings:
         place = Place(base.place(setting.key_at, "key"), base.place(setting.at))
         try:
             put(document, setting.key.split("."), copy.deepcopy(setting.value), place)
         except ConfigError as error:
-            document.problems += error.issues
+            document.issues += error.issues
     _set_output(document, index)
     return document
 
 
 def _set_output(document: Document, index: int) -> None:
     """Fill in the pattern of the output's name; what is no text is left to the validation."""
-    name = document.tree.get("name", default_name(document.source))
+    name = document.tree.get("name", document.stem)
     output = document.tree.setdefault("output", {})
-    if not isinstance(output, dict) or not isinstance(name, str):
+    pattern = output.get("path", DEFAULT_PATTERN) if isinstance(output, dict) else None
+    if not isinstance(pattern, str) or not isinstance(name, str):
         return
-    pattern = output.get("path", DEFAULT_PATTERN)
-    if not isinstance(pattern, str):
-        return
-    filled = _filled(pattern, {"name": name}, index)
-    if "{" in filled or "}" in filled:
+    output["path"] = _PLACEHOLDER.sub(lambda match: name if match[1] else f"{index:{match[2] or ''}d}", pattern)
+    if "{" in output["path"] or "}" in output["path"]:
         message = f"got {shown(pattern)}; in a sweep only {{index}}, {{index:05d}} and {{name}} may stand in braces."
-        document.problems.append(ValidationIssue(("output", "path"), message, place=document.place(("output", "path"))))
-    output["path"] = filled
-
-
-def _filled(pattern: str, names: Mapping[str, str], index: int) -> str:
-    def fill(match: re.Match[str]) -> str:
-        return names["name"] if match[1] else f"{index:{match[2] or ''}d}"
-
-    return _PLACEHOLDER.sub(fill, pattern)
+        document.issues.append(document.issue(("output", "path"), message))

@@ -14,8 +14,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from xml.etree.ElementTree import Element
 
+from nlosrender.config.issues import shown
 from nlosrender.config.plugin_check import existing_file
-from nlosrender.config.refusal import shown
 from nlosrender.config.xml_tree import MAX_DEPTH, MAX_ELEMENTS, MAX_XML_BYTES, SceneElement, place_of, read_xml
 
 MAX_INCLUDE_DEPTH = 15  # Mitsuba's

@@ -66,9 +66,9 @@ def check_xml_bsdf(bsdf: Element, folder: Path) -> None:
 
 
 def _raise_first(check: PluginCheck, element: Element) -> None:
-    for fault in check.faults:
-        where = "".join(f"{key}: " for key in fault.path[:1])
-        raise ValueError(f"{named(element)}: {where}{fault.message.removesuffix('.')}")
+    for issue in check.issues:
+        where = "".join(f"{key}: " for key in issue.path[:1])
+        raise ValueError(f"{named(element)}: {where}{issue.message.removesuffix('.')}")
 
 
 def named(element: Element) -> str:

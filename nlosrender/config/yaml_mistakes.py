@@ -67,8 +67,8 @@ _WORDS: tuple[tuple[str, str], ...] = (
 )
 
 
-def syntax_problem(error: yaml.MarkedYAMLError, source: str) -> ValidationIssue:
-    """Return the problem of a text that PyYAML gave up on.
+def syntax_issue(error: yaml.MarkedYAMLError, source: str) -> ValidationIssue:
+    """Return the issue of a text that PyYAML gave up on.
 
     Parameters
     ----------

@@ -6,9 +6,15 @@ them: ``1e-3`` is a number, ``NO`` and ``12:30`` are text.
 
 from __future__ import annotations
 
+import copy
+import dataclasses
+import math
 import re
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import Any
+from pathlib import Path
+from typing import Any, Literal
 
 import yaml
 from yaml.composer import Composer
@@ -19,8 +25,8 @@ from yaml.resolver import BaseResolver
 from yaml.scanner import Scanner
 
 from nlosrender.config.encodable import joined
-from nlosrender.config.refusal import shown
-from nlosrender.config.yaml_mistakes import syntax_problem
+from nlosrender.config.issues import Wrong, shown
+from nlosrender.config.yaml_mistakes import syntax_issue
 from nlosrender.errors import ConfigError, KeyPath, ValidationIssue
 
 MAX_BYTES = 2**20
@@ -44,11 +50,41 @@ class Document:
     """The values of a YAML text, where they stand, and what is wrong with the text itself."""
 
     source: str
-    tree: Any
+    folder: Path  # where relative file names start
+    stem: str  # the default name of a capture
+    tree: Any = None
     places: dict[KeyPath, Place] = field(default_factory=dict)
-    problems: list[ValidationIssue] = field(default_factory=list)
+    issues: list[ValidationIssue] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)  # what of the text has no effect
-    unread: set[KeyPath] = field(default_factory=set)  # paths whose value is a stand-in for one that is no value
+    unread: set[KeyPath] = field(default_factory=set)  # paths whose value could not be read
+    overrides: tuple[str, ...] = ()  # as given to --set
+
+    def copy(self) -> Document:
+        """Return a document to change; what stands in the text is shared."""
+        return dataclasses.replace(
+            self, tree=copy.deepcopy(self.tree), places={**self.places}, issues=[*self.issues], notes=[*self.notes]
+        )
+
+    def issue(self, path: KeyPath, message: str, at: Literal["value", "key"] = "value") -> ValidationIssue:
+        """Return an issue with its place."""
+        return ValidationIssue(path, message, at, self.place(path, at))
+
+    @contextmanager
+    def placing_issues(self) -> Iterator[None]:
+        """Add the places to what the renderer raises, such as of a mesh file that cannot be read.
+
+        Raises
+        ------
+        ConfigError
+            With a place for every issue that has only a key so far.
+        """
+        try:
+            yield
+        except ConfigError as error:
+            raise ConfigError([self._placed(issue) for issue in error.issues]) from error
+
+    def _placed(self, issue: ValidationIssue) -> ValidationIssue:
+        return issue if issue.place or not issue.path else dataclasses.replace(issue, place=self.place(issue.path))
 
     def place(self, path: KeyPath, at: str = "value") -> str:
         """Return the place of ``path``, or of the nearest mapping around it that is in the text."""
@@ -102,7 +138,7 @@ for _name, _pattern, _first in (
     _Composer.add_implicit_resolver(_TAG + _name, re.compile(rf"(?:{_pattern})\Z"), _first)
 
 
-def read_document(text: str, source: str) -> Document:
+def read_document(text: str, source: str, folder: Path = Path()) -> Document:
     """Read one YAML document.
 
     Parameters
@@ -111,11 +147,13 @@ def read_document(text: str, source: str) -> Document:
         The YAML, at most 1 MiB, at most 100_000 values and 32 levels after aliases are written out.
     source
         What to call it in places, such as the file name.
+    folder
+        Where relative file names in it start.
 
     Returns
     -------
     Document
-        With problems that do not stop the reading (duplicate keys, numbers that are not finite, foreign tags).
+        With issues that do not stop the reading (duplicate keys, numbers that are not finite, foreign tags).
 
     Raises
     ------
@@ -129,17 +167,23 @@ def read_document(text: str, source: str) -> Document:
         if node is not None:
             _check_growth(node)
     except yaml.MarkedYAMLError as error:
-        raise ConfigError(syntax_problem(error, source)) from error
+        raise ConfigError(syntax_issue(error, source)) from error
     except ReaderError as error:
         before = text[: error.position]
         place = f"{source}:{before.count(chr(10)) + 1}:{len(before) - before.rfind(chr(10))}"
         message = f"character U+{error.character:04X} may not stand in YAML; remove it."
         raise ConfigError.of_file(place, message) from error
-    document = Document(source, None)
+    document = Document(source, Path(folder).absolute(), _default_name(source))
     if node is not None:
         document.places[()] = Place(_at(node, source), _at(node, source))
         document.tree = _Builder(document).build(node, ())
     return document
+
+
+def _default_name(source: str) -> str:
+    """Return the name of a capture whose config gives none: that of its file, which may hold what a name may not."""
+    letters = (letter if letter.isprintable() and letter != "\\" else "-" for letter in Path(source).stem)
+    return "".join(letters).strip() or "capture"
 
 
 def _check_growth(root: Node) -> None:
@@ -181,7 +225,7 @@ def _at(node: Node, source: str) -> str:
 
 
 class _Builder:
-    """Turns nodes into values, noting places and problems in the document."""
+    """Turns nodes into values, noting places and issues in the document."""
 
     def __init__(self, document: Document):
         self.document = document
@@ -211,12 +255,12 @@ class _Builder:
                 continue
             if not isinstance(key_node, ScalarNode) or key_node.tag != _TAG + "str":
                 found = shown(key_node.value) if isinstance(key_node, ScalarNode) else "a list or mapping"
-                self._problem(key_node, path, f"got {found} as a key, need text; put it in quotes.")
+                self._note(key_node, path, f"got {found} as a key, need text; put it in quotes.")
                 continue
             key, at = key_node.value, (*path, key_node.value)
             if key in values:
                 message = f"appears twice, first at {self.document.places[at].key}; keep one of them."
-                self._problem(key_node, at, message)
+                self._note(key_node, at, message)
                 continue
             self.document.places[at] = Place(_at(key_node, source), _at(value_node, source))
             values[key] = self.build(value_node, at)
@@ -229,7 +273,7 @@ class _Builder:
         parts = node.value if isinstance(node, SequenceNode) else [node]
         for part in parts:
             if not isinstance(part, MappingNode):
-                self._problem(part, path, "got no mapping after <<, need the alias of a mapping or a list of them.")
+                self._note(part, path, "got no mapping after <<, need the alias of a mapping or a list of them.")
                 continue
             # Only new keys are built: places of keys that win must stay.
             fresh = MappingNode(part.tag, [p for p in part.value if p[0].value not in values], part.start_mark)
@@ -248,25 +292,20 @@ class _Builder:
                 return int(text, 0) if text[:2] in ("0x", "0o") else int(text)
             if kind == "float":
                 number = float(text.replace(".inf", "inf").replace(".nan", "nan") if "." in text else text)
-                return self._finite(number, node, path)
+                if not math.isfinite(number):
+                    return self._unread(node, path, f"got {text}, need a finite number.")
+                return number
         except ValueError:
             return self._unread(node, path, f"got {shown(text)} with the tag !!{kind}, need a number.")
         return text
 
-    def _finite(self, number: float, node: ScalarNode, path: KeyPath) -> float:
-        # x - x is 0 for finite numbers only.
-        if number - number != 0:
-            self._unread(node, path, f"got {node.value}, need a finite number.")
-            return 0.0
-        return number
-
-    def _unread(self, node: Node, path: KeyPath, message: str) -> None:
+    def _unread(self, node: Node, path: KeyPath, message: str) -> Wrong:
         self.document.unread.add(path)
-        self._problem(node, path, message)
+        self._note(node, path, message)
+        return Wrong()
 
-    def _problem(self, node: Node, path: KeyPath, message: str) -> None:
-        place = _at(node, self.document.source)
-        self.document.problems.append(ValidationIssue(path, message, place=place))
+    def _note(self, node: Node, path: KeyPath, message: str) -> None:
+        self.document.issues.append(ValidationIssue(path, message, place=_at(node, self.document.source)))
 
 
 def _is_merge(key: Node) -> bool:

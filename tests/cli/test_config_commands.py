@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
+import threading
 from pathlib import Path
 
 import pytest
@@ -103,6 +105,25 @@ def test_validate_raises_the_problems_of_every_file(starter: Path, tmp_path: Pat
     assert f"{starter}: ok" in result.stdout
     assert isinstance(result.exception, ConfigError)
     assert [problem.place for problem in result.exception.issues] == [str(tmp_path / "no.yaml"), str(tmp_path)]
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs named pipes")
+@pytest.mark.parametrize(
+    ("mesh", "expected"), [("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "ok"), ("f 1 2 3\n", "pipe:7:15: scene.hidden")]
+)
+def test_a_pipe_is_read_once(mesh: str, expected: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What another program writes is a config, with places for what is found later; its files are looked for here."""
+    monkeypatch.chdir(tmp_path)
+    os.mkfifo("pipe")
+    Path("mesh.obj").write_text(mesh)
+    wall = "  relay_wall: {type: rectangle, width: 2, height: 2}\n"
+    item = "  hidden_geometry:\n  -\n    type: mesh\n    filename: mesh.obj\n"
+    capture = "capture: {scan_type: confocal, sensor_grid: {nx: 3, ny: 2}}\n"
+    writer = threading.Thread(target=Path("pipe").write_text, args=(f"# a\nscene:\n{wall}{item}{capture}",))
+    writer.start()
+    result = runner.invoke(app, ["validate", "pipe"])
+    writer.join()
+    assert expected in (str(result.exception) if result.exception else result.stdout)
 
 
 def test_validate_applies_overrides(starter: Path) -> None:

@@ -15,8 +15,8 @@ from support.commands import run
 
 from nlosrender.cli.progress import LogIntervals, ProgressLog, reporting
 from nlosrender.config.document import Config
-from nlosrender.config.load import load_config
-from nlosrender.config.sweep_load import load_sweep
+from nlosrender.config.load import load_config, load_document
+from nlosrender.config.sweep_load import sweep_of
 from nlosrender.pipeline import render_capture
 from nlosrender.readable import readable_duration
 from nlosrender.rendering.render_report import Progress, RenderReport, Standing, Warn
@@ -115,7 +115,7 @@ def test_a_batch_job_has_a_log(
             def render(own: Config, progress: Progress, warn: Warn, resume: bool | None) -> RenderReport:
                 return render_capture(own, progress, warn, resume=resume, watch=listeners.watch)
 
-            render_sweep(load_sweep(path), render, **listeners._asdict())
+            render_sweep(sweep_of(load_document(path)), render, **listeners._asdict())
         else:
             render_capture(load_config(path), **listeners._asdict())
     log, host = capsys.readouterr().err, re.escape(socket.gethostname())

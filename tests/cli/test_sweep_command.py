@@ -16,8 +16,8 @@ import numpy as np
 import pytest
 from support.commands import run
 
-from nlosrender.config.load import config_hash
-from nlosrender.config.sweep_load import load_sweep
+from nlosrender.config.load import config_hash, load_document
+from nlosrender.config.sweep_load import sweep_of
 from nlosrender.errors import EXIT_BAD_INPUT, EXIT_FAILURE, EXIT_INTERRUPTED, EXIT_OK, EXIT_USAGE
 
 BASE = """\
@@ -81,7 +81,7 @@ def test_the_index_tells_what_the_files_hold(dataset: Path) -> None:
     index = index_of(dataset)
     assert index["keys"] == ["capture.laser_point", "scene.hidden_geometry.0.center.2"]
     assert [entry["file"] for entry in index["captures"]] == [f"{i:05d}.hdf5" for i in range(4)]
-    sweep = load_sweep(dataset / "set.yaml")
+    sweep = sweep_of(load_document(dataset / "set.yaml"))
     assert sweep is not None
     for number, entry in enumerate(index["captures"]):
         assert entry["status"] == "done"

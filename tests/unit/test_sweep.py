@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import math
+import re
 from pathlib import Path
 from typing import Any
 
 import pytest
-from pydantic import ValidationError
 
+from nlosrender.config import sweep_load
 from nlosrender.config.document import Config
-from nlosrender.config.load import config_hash, config_to_dict, parse_config
+from nlosrender.config.load import config_hash, config_to_dict, parse_config, parse_document
 from nlosrender.config.sweep import MAX_CAPTURES, Draw, SweepConfig
-from nlosrender.config.sweep_load import Sweep, parse_sweep
+from nlosrender.config.sweep_load import Sweep
 from nlosrender.errors import ConfigError
 
 BASE = """\
@@ -28,7 +29,7 @@ N_LINES = BASE.count("\n")
 
 def sweep_of(text: str, *overrides: str, base: str = BASE) -> Sweep:
     """Parse a config with the sweep ``text``, which begins on line 7."""
-    sweep = parse_sweep(base + text, "z.yaml", Path("/tmp"), overrides)
+    sweep = sweep_load.sweep_of(parse_document(base + text, "z.yaml", Path("/tmp"), overrides))
     assert sweep is not None
     return sweep
 
@@ -47,8 +48,8 @@ def swept(values: Any) -> list[Any]:
 
 def test_a_file_without_a_sweep() -> None:
     """A file without a sweep, or with sweep: null, is none; and the key is in no config and no hash."""
-    assert parse_sweep(BASE, "z.yaml", Path("/tmp")) is None
-    assert parse_sweep(BASE + "sweep: null\n", "z.yaml", Path("/tmp")) is None
+    assert sweep_load.sweep_of(parse_document(BASE, "z.yaml", Path("/tmp"))) is None
+    assert sweep_load.sweep_of(parse_document(BASE + "sweep: null\n", "z.yaml", Path("/tmp"))) is None
     config = parse_config(BASE + "sweep: null\n", "z.yaml", Path("/tmp"))
     assert "sweep" not in config_to_dict(config)
     assert config_hash(config) == config_hash(parse_config(BASE, "z.yaml", Path("/tmp")))
@@ -182,8 +183,8 @@ def test_a_range_of_integers_is_one() -> None:
 )
 def test_values_that_are_none(value: Any, message: str) -> None:
     """Every wrong way to write values says what is allowed."""
-    with pytest.raises(ValidationError, match=message):
-        swept(value)
+    (issue,) = SweepConfig.model_validate({"keys": {"a": value}}).issues((), SweepConfig)
+    assert re.search(message, issue.message)
 
 
 @pytest.mark.parametrize(
@@ -203,8 +204,9 @@ def test_values_that_are_none(value: Any, message: str) -> None:
 )
 def test_draws_that_are_none(value: Any) -> None:
     """Every wrong way to write a draw says what is allowed."""
-    with pytest.raises(ValidationError, match=r"got .*, need "):
-        SweepConfig.model_validate({"random": {"count": 1, "keys": {"a": value}}})
+    section = SweepConfig.model_validate({"random": {"count": 1, "keys": {"a": value}}})
+    (issue,) = section.issues((), SweepConfig)
+    assert re.match(r"got .*, need ", issue.message)
 
 
 MISTAKES = {
@@ -282,7 +284,7 @@ def test_overrides() -> None:
     assert sweep.config(3).capture.sensor_grid.nx == 9
     for key in ("render.seed", "capture.laser_energy"):
         assert f"--set {key}=1: {key}: is swept" in problems_of(text, f"{key}=1")[0]
-    assert parse_sweep(BASE + text, "z.yaml", Path("/tmp"), ["sweep=null"]) is None
+    assert sweep_load.sweep_of(parse_document(BASE + text, "z.yaml", Path("/tmp"), ["sweep=null"])) is None
 
 
 def test_a_sweep_where_one_capture_is_needed() -> None:

@@ -14,7 +14,7 @@ from nlosrender.config.emitters import EmitterConfig
 from nlosrender.config.hidden_geometry import HiddenItemConfig
 from nlosrender.config.relay_wall import RelayWallConfig
 from nlosrender.config.render import RenderConfig
-from nlosrender.config.section import Section
+from nlosrender.config.section import Section, sections_in, type_of
 from nlosrender.errors import KeyPath
 
 _SCANS = typing.get_args(ScanType)
@@ -37,7 +37,7 @@ _PLACING = ("center", "translate", "rotate_deg", "scale")
 _NOTHING: tuple[object, ...] = (None, [], ())
 
 
-def without_idle_keys(raw: Mapping[str, Any]) -> tuple[dict[str, Any], tuple[str, ...]]:
+def without_unused_keys(raw: Mapping[str, Any]) -> tuple[dict[str, Any], tuple[str, ...]]:
     """Return the values of a config that have an effect, and a sentence for each choice that leaves some without.
 
     Parameters
@@ -114,8 +114,7 @@ def _of_type(item: Any, choice: Any, path: KeyPath) -> tuple[Any, list[str]]:
 
 def fields_by_type(choice: Any) -> dict[str, set[str]]:
     """Return the keys of every member of a union of sections, by its ``type``."""
-    members = typing.get_args(typing.get_args(choice)[0])
-    return {typing.get_args(member.model_fields["type"].annotation)[0]: {*member.model_fields} for member in members}
+    return {type_of(member): {*member.model_fields} for member in sections_in(typing.get_args(choice)[0])}
 
 
 def _note(idle: list[KeyPath], choice: str, others: list[str]) -> str:

@@ -13,10 +13,10 @@ import yaml
 
 from nlosrender.config.emitters import EmitterConfig
 from nlosrender.config.hidden_geometry import HiddenItemConfig
-from nlosrender.config.idle_keys import fields_by_type
-from nlosrender.config.load import config_to_dict, load_config, parse_config
+from nlosrender.config.load import config_to_dict, load_config, parse_config, parse_document
 from nlosrender.config.relay_wall import RelayWallConfig
-from nlosrender.config.sweep_load import parse_sweep
+from nlosrender.config.sweep_load import sweep_of
+from nlosrender.config.unused_keys import fields_by_type
 from nlosrender.config.warnings import config_warnings
 from nlosrender.errors import ConfigError
 
@@ -145,7 +145,7 @@ def test_a_sweep_goes_over_scan_types() -> None:
     """Each capture takes what its own scan type needs."""
     tree = config_of("single", OWN["single"], OWN["exhaustive"], {"capture.sensor_grid": {"nx": 3, "ny": 4}})
     tree["sweep"] = {"keys": {"capture.scan_type": ["single", "confocal", "exhaustive"]}}
-    sweep = parse_sweep(yaml.safe_dump(tree), "z.yaml", Path())
+    sweep = sweep_of(parse_document(yaml.safe_dump(tree), "z.yaml", Path()))
     assert sweep is not None
     captures = [sweep.config(index).capture for index in range(3)]
     assert [capture.laser_point is not None for capture in captures] == [True, False, False]
