@@ -62,12 +62,9 @@ def check_writable(path: str | Path, kind: FileKind, sources: Iterable[str | Pat
 
 @contextmanager
 def replacing(path: str | Path, kind: FileKind, sources: Iterable[str | Path] = ()) -> Iterator[Path]:
-    """Give the block an empty file beside ``path``; it takes its place when the block ends well, and else vanishes.
+    """Give the block an empty file that replaces ``path`` when the block ends well, and is removed otherwise.
 
-    Parameters
-    ----------
-    path, kind, sources
-        As for ``check_writable``.
+    Parameters are those of ``check_writable``.
 
     Raises
     ------
@@ -86,26 +83,14 @@ def replacing(path: str | Path, kind: FileKind, sources: Iterable[str | Path] = 
 
 
 def refuse_sources(path: str | Path, sources: Iterable[str | Path]) -> None:
-    """Make sure that what is written to ``path`` replaces nothing of what is read for it.
-
-    Raises
-    ------
-    FileError
-        It is one of ``sources``.
-    """
+    """Raise FileError where writing to ``path`` would replace one of ``sources``, which are read for it."""
     target = os.path.realpath(path)
     if any(os.path.realpath(source) == target for source in sources):
         raise FileError(f"{path}: is read for this and would be replaced. Name another output.")
 
 
 def new_partial(target: Path) -> Path:
-    """Create the empty file that ``target`` is until it is complete, under a name of its own.
-
-    Raises
-    ------
-    OSError
-        The system refuses.
-    """
+    """Create the empty file that ``target`` is until it is complete, under a name nobody else has (OSError)."""
     # not the number of the process, which another one may have, on another machine or in another container
     partial = target.with_name(f".{target.name}.{secrets.token_hex(4)}.partial")
     os.close(os.open(partial, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW, 0o666))
@@ -113,7 +98,7 @@ def new_partial(target: Path) -> Path:
 
 
 def partial_folder(target: Path) -> Path:
-    """Return the folder that holds a capture until it is complete; found again by a later render."""
+    """Return the folder that holds a capture until it is complete; a later render finds it again."""
     return target.with_name(f".{target.name}.partial")
 
 
@@ -135,13 +120,7 @@ def publish(path: str | Path, partial: Path, target: Path, kind: FileKind) -> No
 
 
 def synchronise(path: Path) -> None:
-    """Wait until a file, or a folder's list of names, has reached the disk.
-
-    Raises
-    ------
-    OSError
-        The disk is full or gone.
-    """
+    """Wait until a file, or a folder's list of names, has reached the disk; OSError where it is full or gone."""
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)
@@ -186,7 +165,7 @@ def filled_folder(folder: str | Path) -> Iterator[Path]:
 
 @contextmanager
 def explained_write(path: str | Path) -> Iterator[None]:
-    """Turn what the system or HDF5 says about a failed write to ``path`` into a FileError with advice.
+    """Turn a failed write to ``path`` inside the block into a FileError with advice.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""A file that never fails while HDF5 writes to it; what went wrong is kept and told afterwards.
+"""A file that never fails while HDF5 writes to it; the first error is raised when the writer asks for it.
 
 HDF5 cannot recover from a failed write: objects it closes later try again, fail again, and the process ends with a
 segmentation fault instead of a message about the full disk (seen with HDF5 2.0). So HDF5 writes through this
@@ -22,6 +22,11 @@ class DeferredErrorFile:
     keep
         Open an existing file as it is instead.
 
+    Attributes
+    ----------
+    writes
+        Position and length of all writes, until someone clears the list.
+
     Raises
     ------
     OSError
@@ -30,20 +35,14 @@ class DeferredErrorFile:
 
     def __init__(self, path: Path, keep: bool = False):
         self.error: OSError | None = None
-        self.writes: list[tuple[int, int]] = []  # position and length of all writes, until someone clears it
+        self.writes: list[tuple[int, int]] = []
         self._held: list[tuple[int, bytes]] = []  # position and content of what the disk did not take, oldest first
         self._position = 0
         flags = os.O_RDWR | os.O_NOFOLLOW | (0 if keep else os.O_CREAT | os.O_TRUNC)
         self._descriptor: int | None = os.open(path, flags, 0o666)
 
     def raise_error(self) -> None:
-        """Raise what went wrong, if anything did.
-
-        Raises
-        ------
-        OSError
-            The system refused to write.
-        """
+        """Raise the OSError of the first write that the system refused, if there was one."""
         if self.error is not None:
             raise self.error
 

@@ -1,4 +1,4 @@
-"""Samples held against the energies that the render summed up: light that was changed, lost or added later shows."""
+"""Checks samples against the energies that the render summed up: light that was changed, lost or added later shows."""
 
 from __future__ import annotations
 
@@ -27,10 +27,8 @@ def wrong_energies(
 
     Parameters
     ----------
-    samples
-        Dataset ``data``; all of it is read.
-    parts
-        What of it takes space, each sample once.
+    samples, parts
+        Dataset ``data``, all of which is read; what of it takes space, each sample once.
     attributes, data_attributes
         Of the file and of ``data``; a file that states no energies is not judged.
     """

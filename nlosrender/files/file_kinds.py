@@ -121,12 +121,10 @@ def same_capture(capture_hash: str, selection: str, config: Mapping[str, Any]) -
 
     Parameters
     ----------
-    capture_hash
-        Of the capture.
-    selection
-        Which part of it, in words.
+    capture_hash, selection
+        Of the capture; which part of it, in words.
     config
-        The configuration, to say what differs.
+        The configuration, to list what differs.
     """
 
     def objection(path: Path) -> str | None:

@@ -1,4 +1,4 @@
-"""What makes two renders the same capture: only then may one continue, or complete, the other."""
+"""Identity of a capture: what has to agree for one render to continue, or complete, another."""
 
 from __future__ import annotations
 
@@ -31,10 +31,8 @@ def capture_identity(resolved_config: Mapping[str, Any], part: str, variant: str
     ----------
     resolved_config
         The configuration with all defaults filled in, plain and JSON-able.
-    part
-        Which part of the capture is rendered, in words.
-    variant
-        Mitsuba variant.
+    part, variant
+        Which part of the capture is rendered, in words; Mitsuba variant.
     replicas
         Independent estimates behind each sensor point; for small grids the number of processors decides.
     """

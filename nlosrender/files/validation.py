@@ -1,6 +1,7 @@
 """Checks a file against the Z-NLOS layout as strictly as the strictest of its loaders.
 
-A file by another writer may deviate and still be read right: what it lacks of that is a violation, the rest is told.
+A file by another writer may deviate and still be read right: a violation is what makes it unreadable, all else is a
+deviation.
 """
 
 from __future__ import annotations
@@ -47,18 +48,6 @@ class FileCheck:
     is_ours: bool
     violations: tuple[str, ...]
     deviations: tuple[str, ...]
-
-
-def validate_file(path: str | Path) -> list[str]:
-    """Return every way in which a file deviates from the layout; an empty list for a flawless one.
-
-    Raises
-    ------
-    FileError
-        As ``check_file``.
-    """
-    check = check_file(path)
-    return [*check.violations, *check.deviations]
 
 
 def check_file(path: str | Path) -> FileCheck:

@@ -1,6 +1,6 @@
-"""The work items of a plan, rendered by the workers of a dask cluster and written by this process alone.
+"""Renders the work items of a plan on the workers of a dask cluster; this process alone writes them.
 
-dask hands out the work items, and hands out again those of workers that die; here their number on the way is bounded.
+dask hands out the items, also again those of workers that die; here the number on the way is bounded.
 """
 
 from __future__ import annotations
@@ -51,13 +51,11 @@ def render_on_cluster(
     items, job
         What is left to do, of which capture.
     budget
-        When to stop, settled; ``time_limit_s`` is dealt out to the work items as if all workers were always busy.
-    partial
-        Where they go; open.
+        When to stop, calibrated; ``time_limit_s`` is dealt out to the work items as if all workers were always busy.
+    partial, cluster
+        Where they go, open; who renders.
     stop
         When it comes no more work items are begun; those that are being rendered have ``STOP_SECONDS``.
-    cluster
-        Who renders.
     monitor
         Told the seconds (render and compress: summed over the workers), the share that is done, what is odd, and what
         is finished.

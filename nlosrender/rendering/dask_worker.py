@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Job:
-    """A capture, as workers are told of it."""
+    """Description of a capture for workers."""
 
     config: Config
     selection: Selection
@@ -54,7 +54,7 @@ class RemoteError:
 
 @dataclass
 class _WorkerState:
-    """The one capture that this process is set up for; a work item is rendered at a time, the one before is packed."""
+    """The capture this process is set up for; it renders one work item at a time while the one before is packed."""
 
     lock: threading.Lock = field(default_factory=threading.Lock)
     key: str = ""
@@ -88,7 +88,7 @@ def render_remotely(
     job, item
         What to render.
     budget
-        The fields of a settled ``Budget``: the class itself would import Dr.Jit.
+        The fields of a calibrated ``Budget``: the class itself would import Dr.Jit.
     threads
         Of Dr.Jit; None: as many as the dask worker has.
     """

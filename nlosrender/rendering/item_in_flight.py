@@ -1,4 +1,4 @@
-"""The work item that is being rendered: its state is kept on the disk now and then, and when the render has to stop."""
+"""The work item that is being rendered: its state is saved now and then, and when the render has to stop."""
 
 from __future__ import annotations
 

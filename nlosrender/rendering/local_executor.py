@@ -63,10 +63,8 @@ def render_items(
         What is left to do.
     engine, budget
         What renders them; when to stop, ``time_limit_s`` being the limit for all work items, earlier runs' included.
-    partial
-        Where they go; open.
-    stop
-        Looked at between passes: a work item that takes long is kept as it is.
+    partial, stop
+        Where they go, open; looked at between passes: a work item that takes long is saved as it is.
     monitor
         Told the seconds, the share that is done, that the user has to wait, and what is finished.
 

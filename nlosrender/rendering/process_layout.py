@@ -1,4 +1,4 @@
-"""How several processes share one capture: the memory of each, and the size of what one of them renders at a time."""
+"""How several processes share one capture: the memory of each, and the size of a work item."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class ProcessLayout:
     Parameters
     ----------
     workers
-        That render, each a work item at a time; 0: this process does.
+        Processes that render, each one work item at a time; 0: this process does.
     memory_shares
         Processes that share ``render.memory_limit``; 1: each may take all of it.
     """
@@ -55,17 +55,17 @@ class ProcessLayout:
 
     @contextmanager
     def named(self, limit: int | None) -> Iterator[None]:
-        """Say in issues of the memory limit that it is shared, and how large the share of one process is."""
+        """Add to issues of the memory limit that it is shared, and how large the share of one process is."""
         try:
             yield
         except ConfigError as error:
             if self.memory_shares == 1 or limit is None:
                 raise
             share = f"{limit // self.memory_shares / 1e6:.0f} MB"
-            told = f"It is shared by {self.workers} workers and this process, {share} each."
+            shared = f"It is shared by {self.workers} workers and this process, {share} each."
             raise ConfigError(
                 [
-                    replace(found, message=f"{found.message} {told}") if found.key == _KEY else found
+                    replace(found, message=f"{found.message} {shared}") if found.key == _KEY else found
                     for found in error.issues
                 ]
             ) from error

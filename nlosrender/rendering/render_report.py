@@ -1,4 +1,4 @@
-"""What a render tells while it runs and when it is done."""
+"""Progress, warnings and reports of a render."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from pathlib import Path
 
 from nlosrender.files.capture_results import CaptureResults
 
-Progress = Callable[[float], None]  # told the share of the work that is done, in [0, 1]
-Warn = Callable[[str], None]  # told one warning
+Progress = Callable[[float], None]  # share of the work that is done, in [0, 1]
+Warn = Callable[[str], None]  # one warning
 
 
 @dataclass(frozen=True)
@@ -24,14 +24,14 @@ class Standing:
     error: float | None = None  # relative L2 error of H over what is finished; None: nothing is, or it is not known
 
 
-Watch = Callable[[Standing], None]  # told after every work item
+Watch = Callable[[Standing], None]  # after every work item
 
 STAGES = ("scene", "compile", "render", "compress", "write")
 
 
 @dataclass
 class Stopwatch:
-    """Seconds spent per stage; compressing and writing go on while the next work item is rendered."""
+    """Seconds spent per stage; compressing and writing overlap with the rendering of the next work item."""
 
     seconds: dict[str, float] = field(default_factory=lambda: dict.fromkeys(STAGES, 0.0))
     begun: float = field(default_factory=time.perf_counter)
@@ -52,7 +52,7 @@ class Stopwatch:
 
 @dataclass(frozen=True)
 class Monitor:
-    """Who is told what while a render runs."""
+    """Where a render reports its seconds, progress, warnings and finished items."""
 
     stopwatch: Stopwatch
     progress: Progress
@@ -62,7 +62,7 @@ class Monitor:
 
 @dataclass(frozen=True, kw_only=True)
 class RenderReport(CaptureResults):
-    """What a finished render has to say for itself."""
+    """Report of a finished render."""
 
     output: Path
     engine: str
@@ -79,7 +79,7 @@ class RenderReport(CaptureResults):
 
 @dataclass(frozen=True)
 class Warnings:
-    """Warnings, each said once."""
+    """Warnings, each emitted once."""
 
     warn: Warn
     emitted: dict[str, None] = field(default_factory=dict)  # in the order they were emitted

@@ -30,7 +30,7 @@ Shard = tuple[int, int]  # I of N, counted from 1
 
 @dataclass(frozen=True)
 class SweepReport:
-    """What a finished sweep has to say for itself."""
+    """Report of a finished sweep."""
 
     index: Path  # the file that lists the captures
     captures: int  # of this run: all of the sweep, or of the shard

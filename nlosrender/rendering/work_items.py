@@ -26,14 +26,14 @@ if TYPE_CHECKING:
 
 
 def render_item(engine: Engine, item: WorkItem, budget: Budget, passes: Passes) -> Histogram:
-    """Render one work item: everything that is needed to do so in another process.
+    """Render one work item, here or in another process.
 
     Parameters
     ----------
     engine, item, budget
         What to render, and when to stop.
     passes
-        Told the share of the work item that is done, and asked for what an earlier render has kept of it.
+        Told the share of the work item that is done, and asked for what an earlier render has saved of it.
 
     Returns
     -------
@@ -69,12 +69,10 @@ def _snapshot(histogram: Histogram) -> Snapshot:
     return Snapshot(arrays, {"samples": histogram.samples})
 
 
-def _histogram(kept: Snapshot) -> Histogram:
+def _histogram(saved: Snapshot) -> Histogram:
     from nlosrender.engine.launch.histogram import Histogram
 
-    arrays = kept.arrays
-    samples = kept.numbers["samples"]
-    return Histogram(arrays["mean"], arrays["variance"], arrays["outside"], samples, arrays["contrasts"])
+    return Histogram(**saved.arrays, samples=saved.numbers["samples"])
 
 
 def joined_histogram(item: WorkItem, pieces: list[Histogram]) -> Histogram:
@@ -95,13 +93,8 @@ def joined_histogram(item: WorkItem, pieces: list[Histogram]) -> Histogram:
             values = getattr(piece, name)
             whole[(slice(None),) * 3 + inside] = values.reshape(*first.shape[:3], *tile.shape, *first.shape[4:])
         arrays[name] = whole.reshape(*first.shape[:3], rows * columns, *first.shape[4:])
-    return Histogram(
-        arrays["mean"],
-        arrays["variance"],
-        arrays["outside"],
-        min(piece.samples for piece in pieces),
-        sum((piece.contrasts for piece in pieces[1:]), pieces[0].contrasts),
-    )
+    contrasts = sum((piece.contrasts for piece in pieces[1:]), pieces[0].contrasts)
+    return Histogram(**arrays, samples=min(piece.samples for piece in pieces), contrasts=contrasts)
 
 
 @dataclass(frozen=True, eq=False)
@@ -168,16 +161,10 @@ def render_timed(
 
 
 class ItemWriter:
-    """Stores work items in a thread of its own, one at a time; the render waits when it is a whole work item ahead.
+    """Stores work items in a thread of its own, one at a time; the render waits when it is a whole item ahead.
 
-    Every call of HDF5 happens in one thread at a time: in this one until ``close``.
-
-    Parameters
-    ----------
-    capture
-        Where they go; open.
-    stopwatch
-        Told the seconds.
+    Every call of HDF5 happens in one thread at a time: in this one until ``close``. FileError or RenderError of an item
+    is raised by the next call.
     """
 
     def __init__(self, capture: PartialCapture, stopwatch: Stopwatch):
@@ -186,24 +173,12 @@ class ItemWriter:
         self._pending: Future[None] | None = None
 
     def store(self, finished: FinishedItem) -> None:
-        """Hand over a work item, once the one before is stored.
-
-        Raises
-        ------
-        FileError, RenderError
-            The work item before could not be stored.
-        """
+        """Hand over a work item, once the one before is stored."""
         self.wait()
         self._pending = self._thread.submit(self._store, finished)
 
     def wait(self) -> None:
-        """Wait until everything is stored.
-
-        Raises
-        ------
-        FileError, RenderError
-            It could not be.
-        """
+        """Wait until everything is stored."""
         pending, self._pending = self._pending, None
         if pending is not None:
             pending.result()

@@ -12,12 +12,12 @@ from typing import get_args, get_type_hints
 import pytest
 import yaml
 from support.commands import run
+from support.partial_captures import validate_file
 from support.point_captures import cells, points_header, write_points
 from support.rendering import flat_wall
 
 from nlosrender.cli.app import app
 from nlosrender.errors import EXIT_BAD_INPUT, EXIT_ENVIRONMENT, EXIT_OK, EXIT_USAGE
-from nlosrender.files.validation import validate_file
 
 TRIANGLE = "v -0.2 0.1 1.1\nv 0.2 0.1 1.1\nv 0 0.4 1.2\nf 1 3 2\n"
 

@@ -5,8 +5,7 @@ import json
 import h5py
 import pytest
 from support.commands import run
-
-from nlosrender.files.validation import validate_file
+from support.partial_captures import validate_file
 
 SCENE = """
 scene:

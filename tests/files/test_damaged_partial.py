@@ -9,13 +9,12 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-from support.partial_captures import CONFIG, Stopped, write_part
+from support.partial_captures import CONFIG, Stopped, validate_file, write_part
 
 from nlosrender.files.atomic_write import partial_folder
 from nlosrender.files.partial.journal import Journal, read_records
 from nlosrender.files.partial.partial_capture import PartialCapture
 from nlosrender.files.partial.work_item_log import JournalState
-from nlosrender.files.validation import validate_file
 
 SMALL_CHUNKS = 7 * 2 * 3  # tiles of 2 x 3 of the 4 x 5 sensors, so that there are units
 

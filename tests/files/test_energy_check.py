@@ -8,9 +8,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-from support.partial_captures import write_part
-
-from nlosrender.files.validation import validate_file
+from support.partial_captures import validate_file, write_part
 
 
 @pytest.mark.parametrize("scan_type", ["single", "confocal", "exhaustive"])

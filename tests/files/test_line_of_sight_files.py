@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from support.partial_captures import validate_file
 from support.rendering import configured
 from support.views import view_config
 
@@ -19,7 +20,6 @@ from nlosrender.errors import FileError, OptionError
 from nlosrender.files.export.export import export_capture
 from nlosrender.files.parts.merge import merge_captures
 from nlosrender.files.reading.reader import open_capture
-from nlosrender.files.validation import validate_file
 
 WALL = {"type": "rectangle", "width": 2, "height": 2, "center": [0, 0, 0], "normal": [0, 0, 1]}
 WALL |= {"bsdf": {"type": "diffuse", "reflectance": [0.5, 0.4, 0.1]}}

@@ -10,13 +10,12 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-from support.partial_captures import CONFIG, part_of, write_part
+from support.partial_captures import CONFIG, part_of, validate_file, write_part
 
 from nlosrender.capture.part import WHOLE, Part, Selection
 from nlosrender.errors import FileError, OptionError
 from nlosrender.files.partial.work_item_log import CHECKSUM_RANGE, placed_checksum
 from nlosrender.files.parts.merge import merge_captures
-from nlosrender.files.validation import validate_file
 
 SMALL_CHUNKS = 7 * 2 * 3  # tiles of 2 x 3 of the 4 x 5 sensors, so that there are units
 

@@ -12,7 +12,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-from support.partial_captures import CONFIG, Stopped, items_of, part_of, write_part
+from support.partial_captures import CONFIG, Stopped, items_of, part_of, validate_file, write_part
 
 from nlosrender.capture.part import WHOLE, Selection
 from nlosrender.errors import FileError
@@ -20,7 +20,6 @@ from nlosrender.files.atomic_write import partial_folder
 from nlosrender.files.partial.journal import read_records
 from nlosrender.files.partial.partial_capture import PartialCapture
 from nlosrender.files.partial.work_item_log import JournalState
-from nlosrender.files.validation import validate_file
 
 SMALL_CHUNKS = 7 * 2 * 3  # tiles of 2 x 3 of the 4 x 5 sensors, so that there are units
 

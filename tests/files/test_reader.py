@@ -10,12 +10,12 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
+from support.partial_captures import validate_file
 
 from nlosrender.analysis.plots import plot_capture
 from nlosrender.analysis.summary import summarise
 from nlosrender.errors import FileError
 from nlosrender.files.reading.reader import open_capture, read_header
-from nlosrender.files.validation import validate_file
 
 
 @pytest.mark.parametrize("scan_type", ["single", "confocal", "exhaustive"])

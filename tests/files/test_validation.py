@@ -9,9 +9,9 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
+from support.partial_captures import validate_file
 
 from nlosrender.files.layout import DATASETS
-from nlosrender.files.validation import validate_file
 
 
 @pytest.mark.parametrize("scan_type", ["single", "confocal", "exhaustive"])

@@ -9,12 +9,12 @@ from typing import Any
 import h5py
 import numpy as np
 import pytest
+from support.partial_captures import validate_file
 from support.rendering import configured, flat_wall
 
 from nlosrender.capture.part import WHOLE, Selection
 from nlosrender.errors import FileError, InterruptedRender, RenderError
 from nlosrender.files.parts.merge import merge_captures
-from nlosrender.files.validation import validate_file
 from nlosrender.pipeline import render_capture
 from nlosrender.rendering.render_report import RenderReport
 

@@ -12,12 +12,12 @@ import yaml
 from conftest import Ledger
 from containment import Containment
 from damage import damaged
+from support.partial_captures import validate_file
 from support.rendering import flat_wall
 
 from nlosrender.analysis.summary import summarise
 from nlosrender.errors import FileError
 from nlosrender.files.reading.reader import open_capture, read_header
-from nlosrender.files.validation import validate_file
 
 SHAPE = (1, 4, 6, 3, 5)  # of a confocal capture
 

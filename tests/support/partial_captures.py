@@ -20,6 +20,7 @@ from nlosrender.files.partial.partial_capture import PartialCapture
 from nlosrender.files.parts.part_attributes import part_attributes
 from nlosrender.files.provenance import provenance_attributes
 from nlosrender.files.sums import Sums, sums_of
+from nlosrender.files.validation import check_file
 
 Array = NDArray[np.float64]
 BOUNCES = BounceAxis(3, True)  # of the headers in tests/files/conftest.py
@@ -117,3 +118,9 @@ def write_capture(
         partial.store(everything, partial.chunker.pack(samples, (0, 0), (0, 0)), Sums())
         partial.publish({})
     return path
+
+
+def validate_file(path: str | Path) -> list[str]:
+    """Every way in which a file deviates from the layout; an empty list for a flawless one."""
+    check = check_file(path)
+    return [*check.violations, *check.deviations]

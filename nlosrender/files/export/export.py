@@ -30,7 +30,7 @@ from nlosrender.files.reading.scan import chosen_bounces, read_scan
 
 @dataclass(frozen=True)
 class ExportFormat:
-    """How a program has the points of a wall as one sees it: x to the right, y up, the hidden scene before it."""
+    """A program's format; a wall is seen with x to the right, y up and the hidden scene behind it."""
 
     suffix: str  # of a file's name
     kind: FileKind

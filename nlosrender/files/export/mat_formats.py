@@ -74,14 +74,8 @@ def write_lct(path: Path, ordered: OrderedCapture) -> list[str]:
     rect_data = np.zeros((*scan.sensors.shape[1::-1], n_bins), dtype=np.float32)
     for rows, light in ordered.bands():
         rect_data[:, rows, : move.n_bins] = move.apply(light, rows).swapaxes(0, 1)
-    _save(
-        path,
-        {
-            "rect_data": rect_data,
-            "width": max(_extent(ordered)) / 2,
-            "bin_resolution": opl_to_seconds(scan.bin_width_opl),
-        },
-    )
+    width, bin_width = max(_extent(ordered)) / 2, opl_to_seconds(scan.bin_width_opl)
+    _save(path, {"rect_data": rect_data, "width": width, "bin_resolution": bin_width})
     return _square_losses(scan) + _bin_losses(scan, LCT_BIN_PS) + shift_losses(move)
 
 
@@ -188,11 +182,9 @@ def _extent(ordered: OrderedCapture) -> tuple[float, float]:
     size, sensors = ordered.capture.header.sensor_grid_size, ordered.scan.sensors
     if size is not None and len(size) == 2 and min(size) > 0:
         return size[0], size[1]
-    width, height = (
-        float(np.ptp(sensors[..., axis])) * count / max(count - 1, 1)
-        for axis, count in zip((0, 1), sensors.shape[1::-1], strict=True)
-    )
-    return width, height
+    rows, columns = sensors.shape[:2]
+    width, height = (float(np.ptp(sensors[..., axis])) for axis in (0, 1))
+    return width * columns / max(columns - 1, 1), height * rows / max(rows - 1, 1)
 
 
 def _refuse_pairs(ordered: OrderedCapture, program: str) -> None:
@@ -248,9 +240,8 @@ def _bin_losses(scan: Scan, assumed_ps: float) -> list[str]:
 
 def shift_losses(move: Rectification) -> list[str]:
     """Say what counting time from the wall does to a capture."""
-    return (
-        [] if move.is_identity else ["time is counted from the wall: histograms are moved, and blurred by up to a bin"]
-    )
+    moved = "time is counted from the wall: histograms are moved, and blurred by up to a bin"
+    return [] if move.is_identity else [moved]
 
 
 def _save(path: Path, variables: dict[str, object]) -> None:

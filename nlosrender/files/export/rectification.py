@@ -1,4 +1,4 @@
-"""Histograms whose time is counted from the wall: legs taken off, bin 0 at the moment at which light is there."""
+"""Rectification: legs taken off the time axis, so that bin 0 is the moment at which light is at the wall."""
 
 from __future__ import annotations
 

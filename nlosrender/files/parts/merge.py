@@ -59,7 +59,7 @@ def merge_captures(
     output
         File to write; it appears when it is complete.
     progress
-        Told the share of the work done.
+        Called with the share of the work done.
     overwrite
         Whether a file that holds another capture, or a part, may be replaced.
 
@@ -93,13 +93,7 @@ def _whole(shard: Shard) -> FileKind:
 
 
 def _copy(shard: Shard, writer: HDF5Writer | None, output: Path) -> None:
-    """Copy a shard's chunks into ``output``, or without a writer only check that they are what was rendered.
-
-    Raises
-    ------
-    FileError
-        They are not.
-    """
+    """Copy a shard's chunks into ``output``, or without a writer only check them; FileError: they are damaged."""
     whole = set(shard.tiling.tiles())
     with open_hdf5(shard.path) as file, explained_read(shard.path):
         for name in layout.sample_names(shard.header.has_variance):

@@ -1,4 +1,4 @@
-"""What a file says about the part of a capture it holds."""
+"""Attributes of a file that holds a part of a capture."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ PART, SUMS, CHECKSUMS, NOTE = "part", "part_sums", "part_checksums", "incomplete
 
 @dataclass(frozen=True)
 class StoredPart:
-    """A part of a capture, as its file tells it."""
+    """Which part of a capture a file holds, its sums and checksums."""
 
     part: Part
     sums: Sums
@@ -42,15 +42,7 @@ class StoredPart:
 
 
 def part_attributes(part: Part, tiling: Tiling, finished: RenderState) -> dict[str, object]:
-    """Return the attributes of a file that holds a part of a capture.
-
-    Parameters
-    ----------
-    part, tiling
-        What it holds.
-    finished
-        What was rendered.
-    """
+    """Return the attributes of a file that holds a part of a capture."""
     tiles = joined(tiling.cells(part.strips), tiling.ny * tiling.nx)
     shown: dict[str, Any] = part.as_json() | {"sensor_tiles": [list(astuple(tile)) for tile in tiles]}
     return {

@@ -1,6 +1,6 @@
 """A capture seen from its wall: points in the wall's frame, legs, time axis, light of one laser point.
 
-What reconstruction and export share: neither wants to know how the file is laid out.
+Reconstruction and export share it: neither depends on the layout of the file.
 """
 
 from __future__ import annotations
@@ -109,12 +109,7 @@ def read_scan(capture: StoredCapture) -> Scan:
 def chosen_bounces(header: StoredHeader, bounces: str | None) -> tuple[int, ...]:
     """Return the indices on the file's bounce axis that are reconstructed from.
 
-    Parameters
-    ----------
-    header
-        Of the capture.
-    bounces
-        ``3`` (the third bounce), ``all``, or None: the third where the file keeps it apart, else all.
+    ``bounces`` is ``3`` (the third bounce), ``all``, or None: the third where the file keeps it apart, else all.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""What the axes of ``data`` are in a file by any writer: colour and laser axes may be missing, the order reversed.
+"""Axes of ``data`` in a file by any writer: colour and laser axes may be missing, the order reversed.
 
 MATLAB and h5py show a file's axes in opposite orders. Most files have them so that MATLAB sees (x, y, ..., bounce, t,
 channel); those whose attribute ``data order`` is ``row-major`` have them so that h5py does, in every dataset.
@@ -49,16 +49,7 @@ class StoredAxes:
 
 
 def stored_axes(file: h5py.File, path: Path, samples: h5py.Dataset, attributes: Mapping[str, object]) -> StoredAxes:
-    """Find out what the axes of ``data`` are.
-
-    Parameters
-    ----------
-    file, path
-        The open file and its path.
-    samples
-        Its dataset ``data``, of a rank in ``BY_RANK``.
-    attributes
-        Of the file.
+    """Find out what the axes of ``data``, of a rank in ``BY_RANK``, are.
 
     Raises
     ------

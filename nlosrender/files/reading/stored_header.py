@@ -1,4 +1,4 @@
-"""What a capture file says about itself, read without touching its samples; also from files by other writers."""
+"""Metadata of a capture file, also of one by another writer, read without touching its samples."""
 
 from __future__ import annotations
 

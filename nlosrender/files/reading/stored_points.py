@@ -42,16 +42,9 @@ def dataset_in(file: h5py.File, path: Path, name: str) -> h5py.Dataset | None:
 
 
 def small_numbers(file: h5py.File, path: Path, name: str, exact: bool = False) -> Numbers | None:
-    """Return the few numbers of the dataset ``name``; None when it is missing.
+    """Return the few numbers of the dataset ``name`` at the root of a file; None when it is missing.
 
-    Parameters
-    ----------
-    file, path
-        The open file and its path.
-    name
-        Dataset at the file's root.
-    exact
-        Prefer the float64 attribute ``exact`` to the float32 the layout asks for.
+    With ``exact`` the float64 attribute ``exact`` is preferred to the float32 that the layout asks for.
 
     Raises
     ------
@@ -77,10 +70,8 @@ def stored_points(
 
     Parameters
     ----------
-    file, path
-        The open file and its path.
-    name
-        Dataset at the file's root: (3, rows, columns), or (3, points) as the .mat files of 2018 have it.
+    file, path, name
+        The open file, its path, and the dataset: (3, rows, columns), or (3, points) as the .mat files of 2018 have it.
     sizes
         Length of every axis, of the laser's, too.
     row_major
@@ -133,14 +124,9 @@ def _unevenness(points: Float64) -> float:
 
 
 def plane_normal(points: Float64, towards: Numbers | None) -> Float64 | None:
-    """Return the unit normal (3,) of the plane that points (..., 3) lie in; None when they lie in none.
+    """Return the unit normal (3,) of the plane that points (..., 3) [m] lie in; None when they lie in none.
 
-    Parameters
-    ----------
-    points
-        Of sensor and laser, in the file's frame [m].
-    towards
-        (3,) a place before the wall; None: the normal is (0, -1, 0) as nearly as it can.
+    It points towards a place (3,) before the wall; without one it is as near to (0, -1, 0) as it can be.
     """
     flat = points.reshape(-1, 3)
     if not np.isfinite(flat).all():
