@@ -94,15 +94,15 @@ def render_capture(
     with stopwatch.stage("scene"):
         check_writable(output.path, CAPTURE, files_read(resolved))
         backend = started_backend(config)
-    sharing = ONE_PROCESS if cluster is None else cluster.sharing
+    processes = ONE_PROCESS if cluster is None else cluster.processes
     replicas = replicas_for(backend.lanes, config.capture.sensor_grid.n_points)
     identity = capture_identity(resolved, str(selection), backend.variant, replicas)
     with PartialCapture.claim(output.path, identity, resume) as partial:
         with stopwatch.stage("scene"):
-            plan, engine, header = set_up_engine(config, backend, selection, sharing)
+            plan, engine, header = set_up_engine(config, backend, selection, processes)
             unsampled = missing_light(engine, strict)
             warnings.emit(paths.warning for paths in unsampled)
-            warnings.emit(render_warnings(config, backend, plan, engine, header, sharing))
+            warnings.emit(render_warnings(config, backend, plan, engine, header, processes))
         with stopwatch.stage("render"):
             budget = calibrated_budget(config, engine)
         with resumable(partial) as stop:
@@ -118,7 +118,7 @@ def render_capture(
             if cluster is None:
                 render_items(items, engine, budget, partial, stop, monitor)
             else:
-                job = Job(config, selection, identity, backend.name, sharing)
+                job = Job(config, selection, identity, backend.name, processes)
                 render_on_cluster(items, job, budget, partial, stop, cluster, monitor)
             summed = summed_capture(engine, unsampled, partial.finished.sums)
             missed = missed_target(config.render, summed.stated_error)

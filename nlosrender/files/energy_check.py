@@ -19,7 +19,7 @@ SMALLEST = 2.0**-149
 
 def wrong_energies(
     samples: h5py.Dataset,
-    parts: Iterable[tuple[slice, ...]],
+    parts: Iterable[tuple[tuple[slice, ...], np.ndarray]],
     attributes: Mapping[str, object],
     data_attributes: Mapping[str, object],
 ) -> list[str]:
@@ -28,7 +28,7 @@ def wrong_energies(
     Parameters
     ----------
     samples, parts
-        Dataset ``data``, all of which is read; what of it takes space, each sample once.
+        Dataset ``data``; all samples in it that take space, once each, with their place.
     attributes, data_attributes
         Of the file and of ``data``; a file that states no energies is not judged.
     """
@@ -42,10 +42,10 @@ def wrong_energies(
     total, magnitude = np.zeros((2, samples.shape[axis]))
     # of Stokes components the intensity, as in the render
     intensity_only = attributes.get("channels") == layout.STOKES
-    for part in parts:
+    for part, stored in parts:
         if intensity_only and part[0].start > 0:
             continue
-        values = samples[(slice(0, 1), *part[1:]) if intensity_only else part].astype(np.float64)
+        values = (stored[:1] if intensity_only else stored).astype(np.float64)
         others = tuple(index for index in range(values.ndim) if index != axis)
         total[part[axis]] += values.sum(axis=others)
         magnitude[part[axis]] += np.abs(values).sum(axis=others)

@@ -106,12 +106,12 @@ def dataset_values(header: CaptureHeader) -> dict[str, object]:
     sizes = layout.grid_sizes(header.sizes, header.confocal)
     center, rotation, edges = _hidden_volume(header)
     return {
-        "cameraGridPositions": layout.axes_first(frame.positions(header.sensor_positions)),
-        "cameraGridNormals": layout.axes_first(frame.directions(header.sensor_normals)),
-        "laserGridPositions": layout.axes_first(frame.positions(header.laser_positions)),
-        "laserGridNormals": layout.axes_first(frame.directions(header.laser_normals)),
-        "cameraPosition": frame.positions(header.sensor_position),
-        "laserPosition": frame.positions(header.laser_position),
+        "cameraGridPositions": layout.axes_first(frame.to_scene(header.sensor_positions)),
+        "cameraGridNormals": layout.axes_first(frame.direction_to_scene(header.sensor_normals)),
+        "laserGridPositions": layout.axes_first(frame.to_scene(header.laser_positions)),
+        "laserGridNormals": layout.axes_first(frame.direction_to_scene(header.laser_normals)),
+        "cameraPosition": frame.to_scene(header.sensor_position),
+        "laserPosition": frame.to_scene(header.laser_position),
         "cameraGridSize": header.sensor_grid_size,
         "laserGridSize": header.laser_grid_size,
         "cameraGridPoints": (sizes["sensor_x"], sizes["sensor_y"]),
@@ -195,7 +195,7 @@ def _hidden_volume(header: CaptureHeader) -> tuple[np.ndarray, np.ndarray, np.nd
     if header.hidden_bounds is None:
         return np.zeros(3), np.zeros(3), np.zeros(3)
     low, high = header.hidden_bounds
-    center = layout.file_frame(header.frame, header.pose).positions((low + high) / 2)
+    center = layout.file_frame(header.frame, header.pose).to_scene((low + high) / 2)
     edges = high - low
     if header.frame == "znlos":
         return center, np.zeros(3), np.abs(layout.ZNLOS_FROM_LOCAL @ edges)

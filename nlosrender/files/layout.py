@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import TypeVar
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from nlosrender.capture.bounces import FILE_BOUNCES, LINE_OF_SIGHT
 from nlosrender.scene.pose import Pose
@@ -123,55 +123,29 @@ FRAME_TEXT = {
 }
 
 
-@dataclass(frozen=True)
-class FileFrame:
-    """The frame positions are written in, seen from the local frame: ``p_file = rotation @ p_local + origin``."""
-
-    rotation: Float64  # (3, 3)
-    origin: Float64  # (3,) m
-
-    def positions(self, local: ArrayLike) -> Float64:
-        """Take positions (..., 3) [m] of the local frame to the file's."""
-        return self.directions(local) + self.origin
-
-    def directions(self, local: ArrayLike) -> Float64:
-        """Take directions (..., 3) of the local frame to the file's."""
-        return np.asarray(local, dtype=np.float64) @ self.rotation.T
-
-
-def file_frame(frame: str, pose: Pose) -> FileFrame:
-    """Return the conversion from the local frame (wall in z = 0, normal +z), posed in the scene, to the file's frame.
+def file_frame(frame: str, pose: Pose) -> Pose:
+    """Return the pose of the local frame (wall in z = 0, normal +z) in the file's frame.
 
     Parameters
     ----------
     frame
         ``znlos``: wall in Y = 0 with normal (0, -1, 0), Z up; ``scene``: the scene's own coordinates.
+    pose
+        Pose of the local frame in the scene.
 
     Raises
     ------
     ValueError
         ``frame`` is neither of the two.
     """
-    if frame == "znlos":
-        return FileFrame(ZNLOS_FROM_LOCAL, np.zeros(3))
-    if frame == "scene":
-        return FileFrame(pose.rotation, pose.origin)
-    raise ValueError(f"frame: got {frame!r}, need one of {', '.join(FRAMES)}")
+    if frame not in FRAMES:
+        raise ValueError(f"frame: got {frame!r}, need one of {', '.join(FRAMES)}")
+    return pose if frame == "scene" else Pose(ZNLOS_FROM_LOCAL, np.zeros(3))
 
 
 def file_to_scene(frame: str, pose: Pose) -> Float64:
-    """Return the (4, 4) matrix from positions in the file to scene coordinates.
-
-    Raises
-    ------
-    ValueError
-        ``frame`` is unknown.
-    """
-    conversion = file_frame(frame, pose)
-    local_from_file = np.eye(4)
-    local_from_file[:3, :3] = conversion.rotation.T
-    local_from_file[:3, 3] = -conversion.rotation.T @ conversion.origin
-    return pose.matrix() @ local_from_file
+    """Return the (4, 4) matrix from positions in the file to scene coordinates; ValueError: ``frame`` is unknown."""
+    return pose.matrix() @ file_frame(frame, pose).inverse_matrix()
 
 
 def axes_last(array: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -6,7 +6,8 @@ deviation.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections import deque
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -65,13 +66,16 @@ def check_file(path: str | Path) -> FileCheck:
         samples = samples_of(file, path)
         attributes = get_attributes(file)
         found = _layout(file, path, samples)
-        damaged = _finite(samples, layout.DATA)
-        damaged = damaged or wrong_energies(samples, _stored_parts(samples), attributes, get_attributes(samples))
+        damaged: list[str] = []
+        parts = _finite_parts(samples, layout.DATA, damaged)
+        energies = wrong_energies(samples, parts, attributes, get_attributes(samples))
+        deque(parts, maxlen=0)  # to the end, also where no energies are stated
+        damaged = damaged or energies
         if dataset_in(file, path, layout.VARIANCE) is not None:
             variance = samples_of(file, path, layout.VARIANCE)
             if variance.shape != samples.shape:
                 damaged.append(f"variance: shape {variance.shape}, need that of data, {samples.shape}")
-            damaged += _finite(variance, layout.VARIANCE)
+            deque(_finite_parts(variance, layout.VARIANCE, damaged), maxlen=0)
         if attributes.get("engine") == layout.ROOT_TEXT["engine"]:
             return FileCheck(True, (*found, *damaged), ())
         unreadable = [text for text in _unreadable(file, path) if text not in found]
@@ -216,14 +220,18 @@ def _attributes(file: h5py.File, samples: h5py.Dataset) -> list[str]:
     return found
 
 
-def _finite(samples: h5py.Dataset, name: str) -> list[str]:
+def _finite_parts(
+    samples: h5py.Dataset, name: str, damaged: list[str]
+) -> Iterator[tuple[tuple[slice, ...], np.ndarray]]:
+    """Yield (place, samples) of all that is stored, up to the first part that holds a value that is not finite."""
     for part in _stored_parts(samples):
         values = samples[part]
         if not np.isfinite(values).all():
             first = np.argwhere(~np.isfinite(values))[0]
             at = tuple(int(index + axis.start) for index, axis in zip(first, part, strict=True))
-            return [f"{name}: {values[tuple(first)]} at index {at}"]
-    return []
+            damaged.append(f"{name}: {values[tuple(first)]} at index {at}")
+            return
+        yield part, values
 
 
 def _stored_parts(samples: h5py.Dataset) -> list[tuple[slice, ...]]:

@@ -29,7 +29,7 @@ class Cluster:
     """A connection to a dask scheduler with workers, made when it is first used."""
 
     connect: Callable[[], Client]  # the same one at every call
-    sharing: ProcessLayout
+    processes: ProcessLayout
     threads: int | None  # of Dr.Jit in each worker; None: as many as dask gave that worker
 
     @property

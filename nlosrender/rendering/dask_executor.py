@@ -69,7 +69,7 @@ def render_on_cluster(
     BackendError, RenderError, FileError
         A worker cannot render, a work item cannot be rendered or stored.
     """
-    workers = cluster.sharing.workers
+    workers = cluster.processes.workers
     if len(items) < workers:
         monitor.warn(
             f"--workers: the capture is cut into {len(items)} units, so that some of {workers} workers have no work."

@@ -37,7 +37,7 @@ class Job:
     selection: Selection
     identity: Mapping[str, Any]  # what the worker's own view of the capture has to agree with
     backend: BackendName
-    sharing: ProcessLayout
+    processes: ProcessLayout
 
 
 @dataclass(frozen=True)
@@ -69,7 +69,7 @@ class _WorkerState:
         if key != self.key or self.engine is None or self.chunker is None:
             self.key, self.engine, self.chunker = "", None, None  # only one fits the memory
             _refuse_other_capture(job, backend)
-            _, self.engine, header = set_up_engine(job.config, backend, job.selection, job.sharing)
+            _, self.engine, header = set_up_engine(job.config, backend, job.selection, job.processes)
             self.chunker = Chunker(header, job.config.output.compression, job.config.output.variance)
             self.key = key
         return self.engine, self.chunker

@@ -25,7 +25,7 @@ def render_warnings(
     plan: Plan,
     engine: Engine,
     header: CaptureHeader,
-    sharing: ProcessLayout = ONE_PROCESS,
+    processes: ProcessLayout = ONE_PROCESS,
 ) -> Iterator[str]:
     """Yield the warnings about scene, memory and disk; ``config_warnings`` has those that need the configuration only.
 
@@ -38,7 +38,7 @@ def render_warnings(
     from nlosrender.engine.preflight.scene_warnings import scene_warnings
 
     yield from scene_warnings(engine)
-    yield from memory_warnings(engine, plan, sharing.memory_limit(config.render.memory_limit_bytes), backend.lanes)
+    yield from memory_warnings(engine, plan, processes.memory_limit(config.render.memory_limit_bytes), backend.lanes)
     share = plan.part.share_of(plan.tiling.everything(header.sizes["laser_y"] * header.sizes["laser_x"]))
     size = expected_file_size(config, header, engine)
     yield from disk_warnings(

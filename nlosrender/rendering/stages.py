@@ -43,15 +43,15 @@ def started_backend(config: Config) -> Backend:
 
 
 def set_up_engine(
-    config: Config, backend: Backend, selection: Selection = WHOLE, sharing: ProcessLayout = ONE_PROCESS
+    config: Config, backend: Backend, selection: Selection = WHOLE, processes: ProcessLayout = ONE_PROCESS
 ) -> tuple[Plan, Engine, CaptureHeader]:
     """Stages 2 to 4 up to the first ray: scene, capture, plan, engine, and what the file will say of them."""
     from nlosrender.engine.preflight.omitted_work import shared_samples
 
     built = load_view(config) if config.capture.is_line_of_sight else load_scene(config)
     capture, time_axis = describe_capture(config, built.wall, built)
-    with sharing.named(config.render.memory_limit_bytes):
-        plan, engine = prepare(config, backend, built, capture, time_axis, selection, sharing)
+    with processes.named(config.render.memory_limit_bytes):
+        plan, engine = prepare(config, backend, built, capture, time_axis, selection, processes)
     return plan, engine, describe_file(config, built, capture, time_axis, shared_samples(engine))
 
 
@@ -118,7 +118,7 @@ def prepare(
     capture: Capture,
     time_axis: TimeAxis,
     selection: Selection = WHOLE,
-    sharing: ProcessLayout = ONE_PROCESS,
+    processes: ProcessLayout = ONE_PROCESS,
     replicas: int | None = None,
 ) -> tuple[Plan, Engine]:
     """Stages 3 and 4: cut the work into items and set up the engine; ``replicas`` other than the plan's on request."""
@@ -128,7 +128,7 @@ def prepare(
     render = config.render
     bounces = bounce_axis(config)
     channels = config.n_channels
-    limit, rows = sharing.memory_limit(render.memory_limit_bytes), bounces.n_slots * channels
+    limit, rows = processes.memory_limit(render.memory_limit_bytes), bounces.n_slots * channels
     memory = batch_memory(limit, built.n_triangles)
     refuse_impossible_samples(config.capture, rows_per_pair=rows, n_bins=time_axis.n_bins, memory_limit=memory)
     _, *storage_tile = sensor_tile(time_axis.n_bins, capture.sensor_grid.ny, capture.sensor_grid.nx)
@@ -140,8 +140,8 @@ def prepare(
         memory_limit=memory,
         storage_tile=(storage_tile[0], storage_tile[1]),
         selection=selection,
-        max_item_samples=sharing.max_item_samples,
-        min_items=sharing.min_items,
+        max_item_samples=processes.max_item_samples,
+        min_items=processes.min_items,
     )
     options = RenderOptions(
         bounces=bounces,

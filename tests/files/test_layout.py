@@ -15,8 +15,8 @@ POSE = Pose.from_normal_up([4.0, -2.0, 0.5], [0.3, 0.2, 1.0], [0.0, 1.0, 0.1])
 def test_znlos_frame_is_the_walls_with_depth_along_minus_y() -> None:
     """(X, Y, Z) = (x, -z, y): the wall lies in Y = 0, faces (0, -1, 0), and its y axis points up along Z."""
     frame = layout.file_frame("znlos", POSE)
-    assert frame.positions([0.1, 0.2, 0.7]).tolist() == [0.1, -0.7, 0.2]
-    assert frame.directions([0.0, 0.0, 1.0]).tolist() == [0.0, -1.0, 0.0]
+    assert frame.to_scene([0.1, 0.2, 0.7]).tolist() == [0.1, -0.7, 0.2]
+    assert frame.direction_to_scene([0.0, 0.0, 1.0]).tolist() == [0.0, -1.0, 0.0]
     assert np.linalg.det(frame.rotation) == 1.0  # a rotation: nothing is mirrored
 
 
@@ -24,7 +24,7 @@ def test_znlos_frame_is_the_walls_with_depth_along_minus_y() -> None:
 def test_file_to_scene_undoes_the_frame(name: str) -> None:
     """A point taken to the file's frame and on by ``file_to_scene`` is where the pose puts it in the scene."""
     local = np.random.default_rng(1).normal(size=(3, 5, 3))
-    points = layout.file_frame(name, POSE).positions(local)
+    points = layout.file_frame(name, POSE).to_scene(local)
     matrix = layout.file_to_scene(name, POSE)
     # a handful of float64 operations on numbers below 10
     np.testing.assert_allclose(points @ matrix[:3, :3].T + matrix[:3, 3], POSE.to_scene(local), atol=1e-14)

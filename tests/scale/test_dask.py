@@ -265,7 +265,7 @@ def test_a_worker_refuses_what_it_would_render_otherwise(folder: Path) -> None:
     there["config"]["scene"]["hidden_geometry"][1]["filename"] = "sha256:0"
     there["versions"]["drjit"] = "0.1"
     with joined_cluster(workers=1) as cluster:
-        job = Job(config, WHOLE, there, "llvm", cluster.sharing)
+        job = Job(config, WHOLE, there, "llvm", cluster.processes)
         everything = WorkItem(Tile(0, 3, 0, 5), Tile(0, 1, 0, 1), ())
         future = cluster.client.submit(render_remotely, job, everything, {}, None, pure=False)
         refusal = future.result(timeout=60)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 import zlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -94,20 +94,25 @@ def _whole(shard: Shard) -> FileKind:
 
 def _copy(shard: Shard, writer: HDF5Writer | None, output: Path) -> None:
     """Copy a shard's chunks into ``output``, or without a writer only check them; FileError: they are damaged."""
-    whole = set(shard.tiling.tiles())
+    header, tiling, (first, last) = shard.header, shard.tiling, shard.part.lasers
+    cells = {(cell.y0 // tiling.rows * tiling.rows, cell.x0): cell for cell in tiling.cells(shard.part.strips)}
+    whole = set(tiling.tiles())
+    axes = layout.file_axes(header.confocal)
     with open_hdf5(shard.path) as file, explained_read(shard.path):
-        for name in layout.sample_names(shard.header.has_variance):
+        for name in layout.sample_names(header.has_variance):
             samples: h5py.Dataset = file[name]
-            existing: set[tuple[int, ...]] = set()
+            chunks: list[tuple[int, ...]] = []
             # not one by one: HDF5 goes through all chunks for each
-            samples.id.chunk_iter(lambda chunk, existing=existing: existing.add(chunk.chunk_offset))
-            checksum = found = 0
-            for cell, chunk in _places(shard):
-                if chunk not in existing:
-                    continue
+            samples.id.chunk_iter(lambda chunk, chunks=chunks: chunks.append(chunk.chunk_offset))
+            checksum = 0
+            for chunk in chunks:
+                at = dict(zip(axes, chunk, strict=True))
+                cell = cells.get((at["sensor_y"], at["sensor_x"]))
+                laser = at.get("laser_y", 0) * header.sizes["laser_x"] + at.get("laser_x", 0)
+                if cell is None or not first <= laser < last or at["bounce"] not in header.bounce_indices:
+                    raise _damaged(shard, name)
                 _, content = samples.id.read_direct_chunk(chunk)
                 checksum += placed_checksum(chunk, zlib.crc32(content))
-                found += 1
                 if writer is None:
                     continue
                 target: h5py.Dataset = writer.file[name]
@@ -119,26 +124,12 @@ def _copy(shard: Shard, writer: HDF5Writer | None, output: Path) -> None:
                     light = np.asarray(samples[where], dtype=np.float32)
                     with explained_write(output):
                         writer.fill(target, where, light)
-            damaged = checksum % CHECKSUM_RANGE != shard.stored.checksum.get(name, 0)
-            if damaged or found != len(existing):
-                message = f"{shard}: is damaged: its {name} is not what was rendered."
-                raise FileError(f"{message} Copy it again, or render it again.")
+            if checksum % CHECKSUM_RANGE != shard.stored.checksum.get(name, 0):
+                raise _damaged(shard, name)
 
 
-def _places(shard: Shard) -> Iterator[tuple[Tile, tuple[int, ...]]]:
-    """Yield where a shard may have chunks: the sensor points it has of them, and where they start in file order."""
-    header, part, sizes = shard.header, shard.part, shard.header.sizes
-    tiling, steps = shard.tiling, dict(zip(layout.file_axes(header.confocal), header.chunks or (), strict=True))
-    for laser in range(*part.lasers):
-        laser_y, laser_x = divmod(laser, sizes["laser_x"])
-        for cell in tiling.cells(part.strips):
-            corner = {"sensor_y": cell.y0 // tiling.rows * tiling.rows, "sensor_x": cell.x0, "laser_y": laser_y}
-            corner["laser_x"] = laser_x
-            for channel in range(sizes["channel"]):
-                for bounce in header.bounce_indices:
-                    for time_bin in range(0, sizes["bin"], steps["bin"]):
-                        place = corner | {"channel": channel, "bounce": bounce, "bin": time_bin}
-                        yield cell, layout.in_file_order(place, header.confocal)
+def _damaged(shard: Shard, name: str) -> FileError:
+    return FileError(f"{shard}: is damaged: its {name} is not what was rendered. Copy it again, or render it again.")
 
 
 def _selection(shard: Shard, cell: Tile, chunk: tuple[int, ...]) -> tuple[slice, ...]:
