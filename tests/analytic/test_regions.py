@@ -9,6 +9,8 @@ from support.varied_scenes import Stage
 
 from nlosrender.capture.plan import Batch, Tile
 
+pytestmark = pytest.mark.usefixtures("backend")
+
 ROOM = {"type": "room", "size": [2.0, 1.6, 1.2], "bsdf": {"type": "diffuse", "reflectance": 0.5}}
 PLATE = {"type": "rectangle", "width": 0.8, "height": 0.6, "center": [0, 0, 1.0], "normal": [0, 0, -1]}
 TOUCHING = PLATE | {"center": [0.2, 0.1, 0.3], "normal": [1, 0, 0]}  # its edge lies on the wall
