@@ -1,4 +1,4 @@
-"""The tree of the triangles that may hide something: nothing is lost in it, and a walk comes by every leaf."""
+"""The bounding volume hierarchy: nothing is lost in it, and a stackless traversal comes by every leaf."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ pytestmark = pytest.mark.usefixtures("backend")
 Array = NDArray[np.float64]
 
 
-def tree_of(triangles: Array) -> Any:
-    """Return the tree of triangles (n, 3, 3)."""
+def bvh_of(triangles: Array) -> Any:
+    """Return the BVH of triangles (n, 3, 3)."""
     from nlosrender.engine.virtual_lights.visibility.bvh import Bvh
 
     return Bvh.of([mesh_of(triangles)])
@@ -33,7 +33,7 @@ def test_every_triangle_is_in_a_leaf_and_every_box_holds_its_children(count: int
     """A walk down from the root may pass over nothing but what lies outside a box."""
     from nlosrender.engine.virtual_lights.visibility.bvh import BOX, LEAF
 
-    triangles, tree = soup(count).astype(np.float32), tree_of(soup(count))
+    triangles, tree = soup(count).astype(np.float32), bvh_of(soup(count))
     n_leaves, boxes = int(tree.n_leaves[0]), np.array(tree.boxes).reshape(-1, BOX)
     low, high = boxes[:, 0:3], boxes[:, 3:6]
     assert len(boxes) == 2 * n_leaves
@@ -56,7 +56,7 @@ def test_a_walk_through_all_boxes_visits_every_leaf_once(count: int) -> None:
     """Down to the left where there is more below, else on to the box that follows: depth first, and then the end."""
     import mitsuba as mi
 
-    tree = tree_of(soup(count))
+    tree = bvh_of(soup(count))
     n_leaves, node, visited = int(tree.n_leaves[0]), 1, []
     following = np.array(tree.following(mi.UInt32(np.arange(2 * n_leaves, dtype=np.uint32))))
     while node:
@@ -76,7 +76,7 @@ def test_normals_of_slivers_and_of_no_area() -> None:
     triangles[:, 2] = triangles[:, :2].mean(axis=1) + 1e-4 * generator.normal(size=(200, 3))
     triangles[::5, 2] = triangles[::5, 0]
     triangles = triangles.astype(np.float32)
-    rows = np.array(tree_of(triangles).triangles).reshape(-1, 3, 4)
+    rows = np.array(bvh_of(triangles).triangles).reshape(-1, 3, 4)
     a, b, c = (rows[:, k, :3].astype(np.float64) for k in range(3))
     normals = np.cross(b - a, c - a)
     lengths = np.linalg.norm(normals, axis=1)
@@ -88,5 +88,5 @@ def test_normals_of_slivers_and_of_no_area() -> None:
 def test_the_smallest_triangles_have_normals() -> None:
     """A millionth of a millionth of a wall: the squares of its areas are no numbers of float32."""
     corners = np.array([[[0, 0, 0], [1, 0, 0], [0, 1, 0]]]) * 1e-12 + [0, 0, 0.5]
-    rows = np.array(tree_of(corners).triangles).reshape(-1, 3, 4)
+    rows = np.array(bvh_of(corners).triangles).reshape(-1, 3, 4)
     np.testing.assert_allclose(np.abs(rows[:, :, 3]), np.tile([0, 0, 1.0], (len(rows), 1)), atol=1e-6)

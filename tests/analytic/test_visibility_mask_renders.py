@@ -82,9 +82,9 @@ def both(stage: Stage, patch_scale: float) -> list[NDArray[np.float64]]:
 def assert_same(stage: Stage, patch_scale: float = 0.6) -> None:
     """Check that masks change nothing."""
     assert stage.engine.settings.needs_visibility
-    cleared, full = both(stage, patch_scale)
+    masked, full = both(stage, patch_scale)
     assert full.sum() > 0
-    assert relative_l2(cleared - full, full) <= SAME
+    assert relative_l2(masked - full, full) <= SAME
 
 
 def stage_of(*hidden: Item, scan: str, folder: Path | None = None, **more: Any) -> Stage:
