@@ -26,7 +26,6 @@ class PointGrid:
     wall_coordinates: Float64  # (ny, nx, 2) m
     positions: Float64  # (ny, nx, 3) m
     normals: Float64  # (ny, nx, 3), unit
-    uvs: Float64  # (ny, nx, 2), Mitsuba's texture coordinates
     size: tuple[float, float]  # extent the cells cover (width, height) [m]; (0, 0) for a single point
 
     @property
@@ -194,7 +193,7 @@ def _device_position(scene_position: ArrayLike | None, wall: RelayWall) -> Float
 
 
 def _grid_at(wall: RelayWall, xy: Float64, size: tuple[float, float]) -> PointGrid:
-    arrays = (xy, wall.positions(xy), wall.normals(xy), wall.uv(xy))
+    arrays = (xy, wall.positions(xy), wall.normals(xy))
     for array in arrays:
         array.flags.writeable = False
     return PointGrid(*arrays, size)

@@ -7,7 +7,7 @@ scene, of millimetres or kilometres, to the same size without rounding anything;
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -34,20 +34,26 @@ MIN_EXTENT = 1e-12  # hidden geometry over the wall's size: the squares of areas
 EXACT_PLUGINS = ("Rectangle", "Disk", *ROUND_PLUGINS)  # intersections in closed form, as those of meshes
 
 
-@dataclass(frozen=True, eq=False)
-class BuiltScene:
-    """A scene ready to be traced."""
+@dataclass(frozen=True, eq=False, kw_only=True)
+class EngineScene:
+    """A scene ready to be traced, seen by a relay wall's points or a camera."""
 
     scene: mi.Scene
-    wall: RelayWall
-    wall_shape: mi.Shape
-    surfaces: tuple[Surface, ...]
-    hidden_shapes: tuple[mi.Shape, ...]  # one per surface
-    hidden_bounds: Bounds | None  # box around the hidden geometry [m, local frame]; None when there is none
+    wall: RelayWall  # a camera's image plane
+    surfaces: tuple[Surface, ...]  # configured ones; a Mitsuba scene has more
+    hidden_shapes: tuple[mi.Shape, ...]  # one per surface, then those of a Mitsuba scene
+    hidden_bounds: Bounds | None  # box around these and all lamps [m, local frame]; None when there is none
     unit: float  # metres per engine unit of length, a power of two
-    n_triangles: int  # of the hidden geometry; analytic shapes count as none
+    n_triangles: int  # of the hidden shapes; analytic shapes count as none
     warnings: tuple[str, ...] = ()  # about what was left out, or is likely a mistake
     meshes: tuple[MeshReport, ...] = ()  # of mesh files
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class BuiltScene(EngineScene):
+    """The scene of a capture with a relay wall, whose local frame is the engine's."""
+
+    wall_shape: mi.Shape
 
     @property
     def all_flat(self) -> bool:
@@ -122,12 +128,17 @@ def build_scene(wall: RelayWall, wall_bsdf: Mapping[str, object], surfaces: Sequ
         hidden_shapes=tuple(shapes),
         hidden_bounds=joined_bounds(boxes),
         unit=unit,
-        n_triangles=sum(int(shape.face_count()) for shape in shapes if shape.is_mesh()),
+        n_triangles=count_triangles(shapes),
         warnings=read.warnings + warnings + medium_warnings(zip(keys, shapes, strict=True)),
         meshes=read.meshes,
     )
     _ = built.curvatures  # now, not while a kernel is recorded
     return built
+
+
+def count_triangles(shapes: Iterable[mi.Shape]) -> int:
+    """Return the number of triangles of the meshes among shapes."""
+    return sum(int(shape.face_count()) for shape in shapes if shape.is_mesh())
 
 
 def _check_reach(surfaces: Sequence[Surface], boxes: Sequence[Bounds | None], wall: RelayWall) -> None:

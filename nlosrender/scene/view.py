@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 from nlosrender.config.emitters import PointLamp, SpotLamp
 from nlosrender.errors import ConfigError
 from nlosrender.scene.bounding_box import Bounds, box_corners, joined_bounds
+from nlosrender.scene.build import EngineScene, count_triangles
 from nlosrender.scene.loading.materials import check_surface, medium_warnings, mitsuba_spectrum
 from nlosrender.scene.loading.mitsuba_shapes import load_surface, shape_bounds
 from nlosrender.scene.loading.xml_loading import WHERE, load_xml_scene
@@ -32,20 +33,12 @@ if TYPE_CHECKING:
     from nlosrender.config.scene import SceneConfig
 
 
-@dataclass(frozen=True, eq=False)
-class BuiltView:
-    """A scene ready to be seen by a camera. The local frame is that of the image plane."""
+@dataclass(frozen=True, eq=False, kw_only=True)
+class BuiltView(EngineScene):
+    """A scene seen by a camera. The local frame is that of the image plane."""
 
-    scene: mi.Scene
     wall: ImagePlane
-    surfaces: tuple[Surface, ...]  # configured ones; a Mitsuba scene has more
-    hidden_shapes: tuple[mi.Shape, ...]  # everything that can be seen
-    hidden_bounds: Bounds | None  # box around all surfaces and lamps [m, local frame]; None when there is none
     frame: Pose  # of the engine, in the scene
-    unit: float  # metres per engine unit of length, a power of two
-    n_triangles: int
-    warnings: tuple[str, ...] = ()  # about likely mistakes
-    meshes: tuple[MeshReport, ...] = ()  # of mesh files
 
     def to_engine(self, positions: ArrayLike) -> Float64:
         """Take positions (..., 3) [m] of the local frame to the engine's [engine units]."""
@@ -70,7 +63,9 @@ def build_view(scene_config: SceneConfig, capture_config: CaptureConfig) -> Buil
         Mitsuba rejects a shape, a BSDF or the scene's file, a mesh cannot be read, or a pose is degenerate; the item is
         named.
     """
-    whole, of_whole, left_out = None, (), ()  # type: tuple[mi.Scene | None, tuple[MeshReport, ...], tuple[str, ...]]
+    whole: mi.Scene | None = None
+    of_whole: tuple[MeshReport, ...] = ()
+    left_out: tuple[str, ...] = ()
     if scene_config.mitsuba is not None:
         whole, of_whole, left_out = load_xml_scene(scene_config.mitsuba)
     try:
@@ -107,7 +102,7 @@ def build_view(scene_config: SceneConfig, capture_config: CaptureConfig) -> Buil
         hidden_bounds=_in_frame_of(plane, frame, joined_bounds(boxes)),
         frame=frame,
         unit=unit,
-        n_triangles=sum(int(shape.face_count()) for shape in shapes if shape.is_mesh()),
+        n_triangles=count_triangles(shapes),
         warnings=left_out + read.warnings + medium_warnings(zip(keys, shapes, strict=True)),
         meshes=read.meshes + of_whole,
     )

@@ -255,7 +255,7 @@ WALLS = {
 
 @pytest.mark.parametrize("name", WALLS)
 def test_a_picture_lies_the_right_way_up_on_the_relay_wall(name: str, picture: dict[str, Any]) -> None:
-    """Rays meet the texel, and laser and sensor points have the texture coordinates that rays find there."""
+    """Rays meet the texel."""
     wall, height = WALLS[name]
     config = flat_wall()
     config["scene"]["relay_wall"] = {**wall, "center": CENTER.tolist(), "bsdf": picture}
@@ -266,14 +266,6 @@ def test_a_picture_lies_the_right_way_up_on_the_relay_wall(name: str, picture: d
         place = round_about(wall.get("axis", Y), Z, 0.7, height, inside=wall.get("inside", True))
     to_local = built.wall.pose.to_local
     np.testing.assert_allclose(seen(built, built.wall_shape, place, to_local), TEXELS, rtol=1e-6)
-
-    import mitsuba as mi
-
-    xy = np.array([[0.3, -0.2], [-0.5, 0.4], [0.1, 0.6]])
-    points, normals = built.wall.positions(xy), built.wall.normals(xy)
-    start = mi.Point3f(((points + 1e-3 * normals) / built.unit).T)
-    met = built.scene.ray_intersect(mi.Ray3f(start, mi.Vector3f(-normals.T)))
-    np.testing.assert_allclose(np.array(met.uv).T, built.wall.uv(xy), atol=1e-5)  # float32 over 1 m
 
 
 @pytest.mark.parametrize("name", ["rectangle", "cylinder", "relay wall"])

@@ -81,34 +81,11 @@ def test_longitude_starts_at_z_and_grows_towards_x():
 
 @every_wall
 def test_points_keep_the_leading_shape(wall):
-    """(3, 5, 2) wall coordinates give (3, 5, 3) positions and normals and (3, 5, 2) texture coordinates."""
+    """(3, 5, 2) wall coordinates give (3, 5, 3) positions and normals."""
     xy = wall_points(wall, 15).reshape(3, 5, 2)
     assert wall.positions(xy).shape == (3, 5, 3)
     assert wall.normals(xy).shape == (3, 5, 3)
-    assert wall.uv(xy).shape == (3, 5, 2)
     np.testing.assert_array_equal(wall.positions(xy)[2, 4], wall.positions(xy[2, 4]))
-
-
-@every_wall
-def test_texture_coordinates_stay_in_the_unit_square(wall):
-    """uv lie in [0, 1], u < 1 on a curved wall, also where the azimuth wraps."""
-    edge = np.array([wall.width, wall.height]) / 2
-    seam = np.array([edge, -edge, [0.0, edge[1]], [-1e-20, 0.0]])
-    uv = wall.uv(np.concatenate([wall_points(wall), seam]))
-    assert np.all((uv >= 0) & (uv <= 1))
-    if not wall.is_planar:
-        assert np.all(uv[:, 0] < 1)
-
-
-@pytest.mark.parametrize("kind", ["sphere-inside", "cylinder-outside"])
-def test_texture_coordinates_are_those_of_the_described_shape(kind):
-    """uv follow from the position in the Mitsuba shape's own frame: azimuth from its x axis, polar axis z."""
-    wall = WALLS[kind]
-    xy = wall_points(wall)
-    own = wall.positions(xy) @ wall.shape_description()["to_world"][:3, :3]  # inverse of a rotation
-    u = np.mod(np.arctan2(own[:, 1], own[:, 0]) / (2 * np.pi), 1.0)
-    v = np.arccos(own[:, 2] / 0.8) / np.pi if kind.startswith("sphere") else own[:, 2] / 1.3 + 0.5
-    np.testing.assert_allclose(wall.uv(xy), np.column_stack([u, v]), atol=1e-14)
 
 
 def test_rectangle_description_spans_the_wall():
@@ -116,7 +93,6 @@ def test_rectangle_description_spans_the_wall():
     wall = WALLS["rectangle"]
     to_world = wall.shape_description()["to_world"]
     np.testing.assert_allclose(to_world @ [1, -1, 0, 1], [0.6, -0.35, 0, 1], atol=1e-15)
-    np.testing.assert_allclose(wall.uv([[0.6, -0.35], [0, 0]]), [[1, 0], [0.5, 0.5]], atol=1e-15)
 
 
 @every_wall
@@ -125,7 +101,7 @@ def test_points_off_the_wall_are_refused(wall, axis):
     """No position is made up beyond the wall's edge, for x, for y, or for NaN."""
     xy = np.zeros((3, 2))
     xy[1, axis] = 0.51 * (wall.width, wall.height)[axis]
-    for method in (wall.positions, wall.normals, wall.uv):
+    for method in (wall.positions, wall.normals):
         with pytest.raises(ValueError, match="off the wall"):
             method(xy)
     xy[1, axis] = np.nan

@@ -12,10 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nlosrender.scene.meshes.file_mesh import BYTE_ORDER_MARK, NO_UVS, FileMesh
+from nlosrender.scene.meshes.ply_body import Lists, PlyRecords, PlyRows, read_records
 from nlosrender.scene.meshes.ply_faces import TriangleCorners, polygon_corners, strip_corners, with_corner_uvs
 from nlosrender.scene.meshes.ply_header import PlyHeader, read_header
-from nlosrender.scene.meshes.ply_records import Lists, PlyRecords, read_records
-from nlosrender.scene.meshes.ply_rows import PlyRows
 from nlosrender.scene.meshes.triangle_mesh import TriangleMesh
 from nlosrender.scene.pose import Float64
 

@@ -7,8 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from nlosrender.scene.meshes.ply_records import Lists
-from nlosrender.scene.meshes.ply_rows import PlyRows
+from nlosrender.scene.meshes.ply_body import Lists, PlyRows
 from nlosrender.scene.meshes.polygons import cut_polygons
 from nlosrender.scene.meshes.triangle_mesh import Int64, TriangleMesh, distinct_columns
 from nlosrender.scene.pose import Float64

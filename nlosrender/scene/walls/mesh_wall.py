@@ -98,18 +98,12 @@ class MeshWall(RelayWall):
         return (self._locate(xy)[1].min(axis=1) < share).reshape(xy.shape[:-1])
 
     def _positions(self, xy: Float64) -> Float64:
-        return self._interpolated(xy, self.mesh.vertices)
+        faces, weights = self._locate(xy)
+        corners = self.mesh.vertices[self.mesh.faces[faces]]
+        return np.einsum("nk,nkx->nx", weights, corners).reshape(*xy.shape[:-1], 3)
 
     def _normals(self, xy: Float64) -> Float64:
         return self._face_normals[self._locate(xy)[0]].reshape(*xy.shape[:-1], 3)
-
-    def _uv(self, xy: Float64) -> Float64:
-        return self._interpolated(xy, np.asarray(self.mesh.uvs))
-
-    def _interpolated(self, xy: Float64, per_vertex: Float64) -> Float64:
-        faces, weights = self._locate(xy)
-        values = np.einsum("nk,nkx->nx", weights, per_vertex[self.mesh.faces[faces]])
-        return values.reshape(*xy.shape[:-1], values.shape[-1])
 
     def _locate(self, xy: Float64) -> tuple[NDArray[np.int64], Float64]:
         """Return face (n,) and barycentric coordinates (n, 3) of points; ConfigError in a hole or on a sliver."""

@@ -44,15 +44,8 @@ class _RoundWall(RelayWall):
     def _normals(self, xy: Float64) -> Float64:
         return -self._outward(xy) if self.inside else self._outward(xy)
 
-    @property
-    def _sense(self) -> int:
-        """Whether u grows along the wall coordinate x, 1, or against it, -1: a picture's, seen from within."""
-        return -1 if self.inside and self.has_picture else 1
-
-    def _turns(self, xy: Float64) -> Float64:
-        """Return u (...,) in [0, 1): 1/2 at wall coordinate x = 0."""
-        turns = np.mod(0.5 + self._sense * xy[..., 0] / (2 * np.pi * self.radius), 1.0)
-        return np.where(turns < 1.0, turns, 0.0)  # mod of a tiny negative number rounds up to 1.0
+    def _plugin(self, height: float | None) -> dict[str, object]:
+        return round_plugin(self.radius, height, inside=self.inside, turned=self.inside and self.has_picture)
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,21 +75,13 @@ class SphereWall(_RoundWall):
         return 4 * np.pi * self.radius**2
 
     def shape_description(self) -> dict[str, object]:
-        return round_plugin(self.radius, None, inside=self.inside, turned=self._sense < 0)
+        return self._plugin(None)
 
     def _outward(self, xy: Float64) -> Float64:
         longitude = xy[..., 0] / self.radius
         sine = np.clip(xy[..., 1] / self.radius, -1.0, 1.0)
         cosine = np.sqrt((1.0 - sine) * (1.0 + sine))
         return np.stack([cosine * np.sin(longitude), sine, cosine * np.cos(longitude)], axis=-1)
-
-    def _uv(self, xy: Float64) -> Float64:
-        """Return u = 1/2 + longitude / 2 pi in [0, 1), v = 0 at the +y pole, 1 at -y.
-
-        Of a picture seen from within u runs the other way.
-        """
-        v = np.arccos(np.clip(xy[..., 1] / self.radius, -1.0, 1.0)) / np.pi
-        return np.stack([self._turns(xy), v], axis=-1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,7 +107,7 @@ class CylinderWall(_RoundWall):
         return self.width * self.height
 
     def shape_description(self) -> dict[str, object]:
-        return round_plugin(self.radius, self.height, inside=self.inside, turned=self._sense < 0)
+        return self._plugin(self.height)
 
     def _outward(self, xy: Float64) -> Float64:
         azimuth = xy[..., 0] / self.radius
@@ -132,10 +117,3 @@ class CylinderWall(_RoundWall):
         points = super()._positions(xy)
         points[..., 1] = xy[..., 1]
         return points
-
-    def _uv(self, xy: Float64) -> Float64:
-        """Return u = 1/2 + azimuth / 2 pi in [0, 1), v from 0 at -y to 1 at +y.
-
-        Of a picture seen from within both run the other way; others ``picture_orientation.upright_bsdf`` turns over.
-        """
-        return np.stack([self._turns(xy), self._sense * xy[..., 1] / self.height + 0.5], axis=-1)

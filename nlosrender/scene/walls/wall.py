@@ -62,10 +62,6 @@ class RelayWall(ABC):
         """Return unit normals (..., 3) of the lit side at wall coordinates (..., 2) [m]; ValueError off the wall."""
         return self._normals(self.on_wall(xy))
 
-    def uv(self, xy: ArrayLike) -> Float64:
-        """Return Mitsuba's texture coordinates (..., 2) at wall coordinates (..., 2) [m]; ValueError off the wall."""
-        return self._uv(self.on_wall(xy))
-
     def on_wall(self, xy: ArrayLike) -> Float64:
         """Return wall coordinates as an array (..., 2) [m]; ValueError for a wrong shape or a point off the wall."""
         xy = np.asarray(xy, dtype=np.float64)
@@ -88,9 +84,6 @@ class RelayWall(ABC):
     @abstractmethod
     def _normals(self, xy: Float64) -> Float64: ...
 
-    @abstractmethod
-    def _uv(self, xy: Float64) -> Float64: ...
-
 
 def require_positive(**sizes: float) -> None:
     """Raise ValueError for a size of a relay wall [m] that is not finite and positive."""
@@ -101,11 +94,7 @@ def require_positive(**sizes: float) -> None:
 
 @dataclass(frozen=True, eq=False)
 class RectangleWall(RelayWall):
-    """A flat wall in z = 0 of its local frame, lit on the +z side; ValueError for a size that is not positive.
-
-    Texture coordinates run from 0 to 1 along x and y. v grows along y, and pictures lie the other way up
-    (``picture_orientation.upright_bsdf``).
-    """
+    """A flat wall in z = 0 of its local frame, lit on the +z side; ValueError for a size that is not positive."""
 
     pose: Pose  # of the wall's centre, axes and normal in the scene
     width: float  # along the local x axis [m], > 0
@@ -136,6 +125,3 @@ class RectangleWall(RelayWall):
 
     def _normals(self, xy: Float64) -> Float64:
         return np.broadcast_to([0.0, 0.0, 1.0], (*xy.shape[:-1], 3)).copy()
-
-    def _uv(self, xy: Float64) -> Float64:
-        return xy / self._extent + 0.5

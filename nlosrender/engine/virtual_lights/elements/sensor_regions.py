@@ -92,7 +92,5 @@ def regions_of(
 def _part_of(capture: Capture, chosen: tuple[NDArray[np.intp], ...]) -> Capture:
     """Return the capture with a part of its sensor points, and of its laser points where they are the same."""
     grid = capture.sensor_grid
-    part = PointGrid(
-        grid.wall_coordinates[chosen], grid.positions[chosen], grid.normals[chosen], grid.uvs[chosen], grid.size
-    )
+    part = PointGrid(grid.wall_coordinates[chosen], grid.positions[chosen], grid.normals[chosen], grid.size)
     return replace(capture, sensor_grid=part, laser_grid=part if capture.laser_grid is grid else capture.laser_grid)
