@@ -1,4 +1,4 @@
-"""Ctrl-C waits: for Mitsuba's import and for HDF5, which an exception would leave in ruins, and for units to finish."""
+"""Signals that end the program, deferred: past imports and HDF5 calls, and until a work item is finished."""
 
 from __future__ import annotations
 
@@ -9,23 +9,23 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from types import FrameType
 
-SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)  # Ctrl-C, a batch system's notice, a terminal that is gone
+SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)  # Ctrl-C, a batch system's notice, a closed terminal
 
 
 @dataclass
 class StopRequest:
-    """Whether the user, or the system, wants the program to end."""
+    """Whether the user or the system has asked the program to end."""
 
     signal_name: str | None = None  # of the first signal that came
 
     @property
     def came(self) -> bool:
-        """Whether there was one."""
+        """Whether a signal came."""
         return self.signal_name is not None
 
 
-class _Noting:
-    """A signal handler that notes the first signal and lets the second one interrupt."""
+class _RequestHandler:
+    """Records the first signal; the second one interrupts."""
 
     def __init__(self) -> None:
         self.request = StopRequest()
@@ -38,7 +38,7 @@ class _Noting:
 
 @contextmanager
 def stop_request() -> Iterator[StopRequest]:
-    """Note the first of ``SIGNALS`` inside the block instead of acting on it; the second one interrupts.
+    """Record the first of ``SIGNALS`` inside the block instead of acting on it; the second one interrupts.
 
     A block inside another one shares its request. Outside the main thread no signal ever comes.
 
@@ -51,12 +51,12 @@ def stop_request() -> Iterator[StopRequest]:
         yield StopRequest()
         return
     outer = signal.getsignal(signal.SIGINT)
-    if isinstance(outer, _Noting):
+    if isinstance(outer, _RequestHandler):
         yield outer.request
         return
-    noting = _Noting()
-    with _handled_by(noting):
-        yield noting.request
+    handler = _RequestHandler()
+    with _handled_by(handler):
+        yield handler.request
 
 
 @contextmanager
@@ -88,8 +88,7 @@ def uninterrupted() -> Iterator[None]:
 @contextmanager
 def _handled_by(handler: Callable[[int, FrameType | None], None]) -> Iterator[None]:
     handlers = {number: signal.getsignal(number) for number in SIGNALS}
-    # None: installed by something other than Python, and not to be restored by it. Ignored: as shells do for jobs in
-    # the background, which a Ctrl-C is not meant for.
+    # None: not installed by Python, which could not restore it. SIG_IGN: a background job of a shell ignores Ctrl-C.
     mine = [number for number in SIGNALS if handlers[number] not in (None, signal.SIG_IGN)]
     for number in mine:
         signal.signal(number, handler)

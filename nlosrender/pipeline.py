@@ -89,6 +89,7 @@ def render_capture(
         The render stopped half-way; the same call goes on from there.
     """
     stopwatch, warnings = Stopwatch(), Warnings(warn)
+    # --- configuration: refuse what can be refused before anything takes time ---
     warnings.emit(config_warnings(config))
     resolved, output = config_to_dict(config), config.output
     with stopwatch.stage("scene"):
@@ -98,6 +99,7 @@ def render_capture(
     replicas = replicas_for(backend.lanes, config.capture.sensor_grid.n_points)
     identity = capture_identity(resolved, str(selection), backend.variant, replicas)
     with PartialCapture.claim(output.path, identity, resume) as partial:
+        # --- scene -> capture and plan -> engine ---
         with stopwatch.stage("scene"):
             plan, engine, header = set_up_engine(config, backend, selection, processes)
             unsampled = missing_light(engine, strict)
@@ -105,6 +107,7 @@ def render_capture(
             warnings.emit(render_warnings(config, backend, plan, engine, header, processes))
         with stopwatch.stage("render"):
             budget = calibrated_budget(config, engine)
+        # --- work items -> chunks in the partial capture; an earlier run's are kept ---
         with resumable(partial) as stop:
             provenance = provenance_attributes(
                 resolved, config_hash(config), engine=engine.name, seed=config.render.seed, meshes=engine.built.meshes
@@ -120,6 +123,7 @@ def render_capture(
             else:
                 job = Job(config, selection, identity, backend.name, processes)
                 render_on_cluster(items, job, budget, partial, stop, cluster, monitor)
+            # --- results -> attributes, and the partial capture becomes the file ---
             summed = summed_capture(engine, unsampled, partial.finished.sums)
             missed = missed_target(config.render, summed.stated_error)
             warnings.emit([f"H is zero everywhere: {'; '.join(summed.zero_because)}."] if summed.zero_because else [])

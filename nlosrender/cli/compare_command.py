@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -14,41 +14,23 @@ if TYPE_CHECKING:
     from nlosrender.analysis.comparison.captures import Tolerances
     from nlosrender.analysis.comparison.dataset import CheckedFile
 
-MaxRelL2 = Annotated[
-    float | None,
-    typer.Option(
-        "--max-rel-l2",
-        metavar="X",
-        min=0,
-        help="Largest relative L2 of the difference, such as 0.01.",
-        show_default=False,
-    ),
-]
+
+def _tolerance(text: str, metavar: str = "X") -> Any:
+    return typer.Option(metavar=metavar, min=0, help=text, show_default=False)
+
+
+MaxRelL2 = Annotated[float | None, _tolerance("Largest relative L2 of the difference, such as 0.01.")]
 MaxEnergy = Annotated[
-    float | None,
-    typer.Option(
-        metavar="X",
-        min=0,
-        help="Largest relative difference of the energy, in total and of every bounce.",
-        show_default=False,
-    ),
+    float | None, _tolerance("Largest relative difference of the energy, in total and of every bounce.")
 ]
 MaxShift = Annotated[
-    float | None,
-    typer.Option(
-        metavar="BINS",
-        min=0,
-        help="Largest shift in time, in total and of every laser point, such as 0.1.",
-        show_default=False,
-    ),
+    float | None, _tolerance("Largest shift in time, in total and of every laser point, such as 0.1.", "BINS")
 ]
 ZTestWanted = Annotated[
-    bool,
-    typer.Option("--z-test", help="Allow what noise explains, by the stored variances (of one file or of both)."),
+    bool, typer.Option("--z-test", help="Allow what noise explains, by the stored variances (of one file or of both).")
 ]
 Significance = Annotated[
-    float,
-    typer.Option(metavar="P", help="Chance that the Z-test raises an alarm where both files show the same."),
+    float, typer.Option(metavar="P", help="Chance that the Z-test raises an alarm where both files show the same.")
 ]
 
 
@@ -97,12 +79,7 @@ def check(
     ],
     reference: Annotated[
         Path,
-        typer.Option(
-            "--reference",
-            metavar="DIR",
-            help="Folder with captures of the same names to judge them by.",
-            readable=False,
-        ),
+        typer.Option(metavar="DIR", help="Folder with captures of the same names to judge them by.", readable=False),
     ],
     max_rel_l2: MaxRelL2 = None,
     max_energy: MaxEnergy = None,
@@ -125,11 +102,12 @@ def check(
     from nlosrender.cli.comparison_table import check_line
     from nlosrender.errors import ComparisonError, FileError
 
-    def say(file: CheckedFile) -> None:
+    def print_line(file: CheckedFile) -> None:
         if not as_json:
             typer.echo(check_line(file))
 
-    found = check_dataset(folder, reference, _tolerances(max_rel_l2, max_energy, max_shift, z_test, significance), say)
+    tolerances = _tolerances(max_rel_l2, max_energy, max_shift, z_test, significance)
+    found = check_dataset(folder, reference, tolerances, print_line)
     failed = [file for file in found.files if file.status != "ok"]
     failure = FileError if found.with_status("unreadable") else ComparisonError
     if as_json:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import dataclasses
+from collections.abc import Iterator
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -74,25 +75,36 @@ def validate(
             document = load_document(path, overrides or ())
             sweep = sweep_of(document)
             config = config_of(document) if sweep is None else sweep.config(0)
-            with document.placing_issues():
-                own_meshes, lines, doubts = _meshes_of(config)
+            found, lines = list(config_warnings(config)), []  # type: list[str], list[str]
+            if config.scene.has_mesh_files:  # numpy is loaded only for these
+                from nlosrender.scene.meshes.mesh_report import mesh_lines
+                from nlosrender.scene.read_surfaces import describe_meshes
+
+                with document.placing_issues():
+                    read = describe_meshes(config.scene)
+                meshes += read.meshes
+                lines += mesh_lines(read.meshes)
+                found += read.warnings
         except ConfigError as error:
             issues += error.issues
             continue
-        found = [f"{path}: {warning}" for warning in (*config_warnings(config), *doubts)]
-        warnings += found
-        meshes += own_meshes
+        warnings += [f"{path}: {warning}" for warning in found]
         if not as_json:
             captures = "" if sweep is None else f"a sweep of {len(sweep)} captures in {sweep.output_folder}, such as "
             typer.echo(f"{path}: ok ({captures}{_summary(config)})")
             for line in lines:
                 typer.echo(f"  mesh {line}")
             for warning in found:
-                typer.echo(f"warning: {warning}", err=True)
+                typer.echo(f"warning: {path}: {warning}", err=True)
     if as_json:
-        _print_verdict(issues, warnings, meshes)
-    if issues and as_json:
-        raise typer.Exit(EXIT_BAD_INPUT)
+        verdict = {
+            "valid": not issues,
+            "problems": [issue_as_json(issue) for issue in issues],
+            "warnings": warnings,
+            "meshes": [dataclasses.asdict(mesh) for mesh in meshes],
+        }
+        OUTPUT.print(verdict, EXIT_BAD_INPUT if issues else EXIT_OK, indent=2)
+        raise typer.Exit(EXIT_BAD_INPUT if issues else EXIT_OK)
     if issues:
         raise ConfigError(issues)
 
@@ -108,35 +120,6 @@ def schema() -> None:
 
     document = {"$schema": "https://json-schema.org/draft/2020-12/schema", **Config.model_json_schema()}
     typer.echo(json.dumps(document, indent=2))
-
-
-def _meshes_of(config: Config) -> tuple[Sequence[MeshReport], Sequence[str], Sequence[str]]:
-    """Return what there is to say of a scene's meshes, in lines, too, and warnings; numpy is loaded only for meshes.
-
-    Raises
-    ------
-    ConfigError
-        One cannot be used.
-    """
-    if not config.scene.has_mesh_files:
-        return (), (), ()
-    from nlosrender.scene.meshes.mesh_report import mesh_lines
-    from nlosrender.scene.read_surfaces import describe_meshes
-
-    read = describe_meshes(config.scene)
-    return read.meshes, list(mesh_lines(read.meshes)), read.warnings
-
-
-def _print_verdict(issues: list[ValidationIssue], warnings: list[str], meshes: list[MeshReport]) -> None:
-    from dataclasses import asdict
-
-    verdict = {
-        "valid": not issues,
-        "problems": [issue_as_json(issue) for issue in issues],
-        "warnings": warnings,
-        "meshes": [asdict(mesh) for mesh in meshes],
-    }
-    OUTPUT.print(verdict, EXIT_BAD_INPUT if issues else EXIT_OK, indent=2)
 
 
 def _summary(config: Config) -> str:
