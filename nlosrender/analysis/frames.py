@@ -20,11 +20,11 @@ from nlosrender.readable import readable_size
 
 Float32 = NDArray[np.float32]
 
-FRAMES_AIM = 120  # without --every: about so many pictures for the part of the time axis that holds light
-MAX_FRAMES = 20_000
-MAX_BYTES = 4 * 2**30  # of all pictures together
-BRIGHTEST = 99.0  # percentile of the lit pixels of all frames that becomes white ...
-BRIGHTEST_STEADY = 97.0  # ... and of the steady picture, whose emitters outshine all they light
+DEFAULT_FRAMES = 120  # without --every, of the part of the time axis that holds light: 10 s at 12 pictures per second
+MAX_FRAMES = 20_000  # 28 minutes at 12 pictures per second: more is a mistaken --every
+MAX_BYTES = 4 * 2**30  # of all pictures together, which are held in memory
+WHITE = 99.0  # percentile of the lit pixels of all frames that becomes white
+WHITE_STEADY = 97.0  # of those of the steady picture, whose emitters outshine all they light
 
 
 @dataclass(frozen=True)
@@ -105,14 +105,14 @@ def write_frames(path: str | Path, output: str | Path, options: FrameOptions) ->
         ranges = _frame_ranges(capture, options)
         frames, steady = _pictures(capture, ranges)
     if is_animation(output):
-        _write_animation(_shown(frames, stokes, options.exposure), output, options.frames_per_second)
+        with replacing(output, GIF) as partial:
+            save_animation(_shown(frames, stokes, options.exposure), partial, options.frames_per_second)
         return [output]
     with filled_folder(output) as folder:
-        written = _write_all(frames, folder, options, stokes)
-        written += [folder / "steady.exr", folder / "steady.png"]
-        save_exr(steady, written[-2], stokes)
-        save_png(_shown(steady[None], stokes, options.exposure, BRIGHTEST_STEADY)[0], written[-1])
-    names = [file.name for file in written]
+        names = _write_all(frames, folder, options, stokes)
+        save_exr(steady, folder / "steady.exr", stokes)
+        save_png(_shown(steady[None], stokes, options.exposure, WHITE_STEADY)[0], folder / "steady.png")
+    names += ["steady.exr", "steady.png"]
     _remove_earlier(output, SUFFIXES[options.kind], set(names))
     return [output / name for name in names]
 
@@ -130,11 +130,6 @@ def _check_output(output: Path, source: str | Path, options: FrameOptions) -> No
             f"--output: got {str(output)!r}, the name of one picture, but there are many; need a folder, or a name "
             "that ends in .gif for an animation"
         )
-
-
-def _write_animation(shown: NDArray[np.uint8], output: Path, frames_per_second: float) -> None:
-    with replacing(output, GIF) as partial:
-        save_animation(shown, partial, frames_per_second)
 
 
 def _remove_earlier(folder: Path, suffix: str, written: set[str]) -> None:
@@ -160,7 +155,7 @@ def _frame_ranges(capture: StoredCapture, options: FrameOptions) -> list[slice]:
     if first > last:
         window = f"{header.start_opl:g} to {header.end_opl:g} m"
         raise OptionError(f"--from, --to: no bin of the file lies between them; its time axis is {window}")
-    every = options.every or max(1, round((last + 1 - first) / FRAMES_AIM))
+    every = options.every or max(1, round((last + 1 - first) / DEFAULT_FRAMES))
     count = -(-(last + 1 - first) // every)
     n_bytes = count * 4 * header.sizes["channel"] * header.sizes["sensor_y"] * header.sizes["sensor_x"]
     if count > MAX_FRAMES or n_bytes > MAX_BYTES:
@@ -190,26 +185,26 @@ def _pictures(capture: StoredCapture, ranges: list[slice]) -> tuple[Float32, Flo
     return frames[:, ::-1], steady[::-1]
 
 
-def _shown(frames: Float32, stokes: bool, exposure: float, brightest: float = BRIGHTEST) -> NDArray[np.uint8]:
+def _shown(frames: Float32, stokes: bool, exposure: float, white_percentile: float = WHITE) -> NDArray[np.uint8]:
     """Return frames (frame, row, column, 3) as they are shown, all on one scale."""
     light = frames[..., :1] if stokes else frames
     lit = light[light > 0]
-    white = float(np.percentile(lit, brightest)) if lit.size else 1.0
+    white = float(np.percentile(lit, white_percentile)) if lit.size else 1.0
     scale = 2.0**exposure / white
     return stokes_panels(frames, scale) if stokes else tone_mapped(frames * scale)
 
 
-def _write_all(frames: Float32, folder: Path, options: FrameOptions, stokes: bool) -> list[Path]:
-    names = [folder / f"frame-{index:05d}{SUFFIXES[options.kind]}" for index in range(len(frames))]
+def _write_all(frames: Float32, folder: Path, options: FrameOptions, stokes: bool) -> list[str]:
+    """Write the frames, or the animation of them, and return the names."""
+    names = [f"frame-{index:05d}{SUFFIXES[options.kind]}" for index in range(len(frames))]
     if options.kind == "exr":
         for frame, name in zip(frames, names, strict=True):
-            save_exr(frame, name, stokes)
+            save_exr(frame, folder / name, stokes)
         return names
     shown = _shown(frames, stokes, options.exposure)
-    if options.kind == "png":
-        for picture, name in zip(shown, names, strict=True):
-            save_png(picture, name)
-        return names
-    animation = folder / "frames.gif"
-    save_animation(shown, animation, options.frames_per_second)
-    return [animation]
+    if options.kind == "gif":
+        save_animation(shown, folder / "frames.gif", options.frames_per_second)
+        return ["frames.gif"]
+    for picture, name in zip(shown, names, strict=True):
+        save_png(picture, folder / name)
+    return names

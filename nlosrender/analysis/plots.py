@@ -158,16 +158,16 @@ def _draw_frames(figure: SubFigure, capture: StoredCapture, view: LaserView, pix
     bins = frame_bins(view.time)
     windows = [slice(max(index - half, 0), index + half + 1) for index in bins]
     frames = wall_frames(capture, view.laser, windows)
-    extent, xlabel, ylabel = _wall_extent(header)
+    (left, right, bottom, top), xlabel, ylabel = _wall_extent(header)
+    rows, columns = header.sensor_grid
+    at_pixel = (left + (pixel[1] + 0.5) / columns * (right - left), bottom + (pixel[0] + 0.5) / rows * (top - bottom))
+    extent = (left, right, bottom, top)
     all_axes = np.ravel(figure.subplots(1, len(bins), sharex=True, sharey=True, squeeze=False))
     for axes, frame, index in zip(all_axes, frames, bins, strict=True):
         opl = header.start_opl + (index + 0.5) * header.bin_width_opl
         style(axes, f"{opl:.3f} m   {opl_to_seconds(opl) * 1e9:.2f} ns", xlabel, ylabel if axes is all_axes[0] else "")
-        axes.imshow(
-            frame, origin="lower", extent=extent, cmap=COLORMAP, vmin=0, vmax=max(frame.max(), 0) or 1, aspect="equal"
-        )
-        x, y = _wall_position(header, pixel, extent)
-        axes.plot(x, y, marker="+", markersize=9, markeredgewidth=1.2, color=MARK, clip_on=False)
+        axes.imshow(frame, origin="lower", extent=extent, cmap=COLORMAP, vmin=0, vmax=max(frame.max(), 0) or 1)
+        axes.plot(*at_pixel, marker="+", markersize=9, markeredgewidth=1.2, color=MARK, clip_on=False)
 
 
 def _draw_histogram(axes: Axes, capture: StoredCapture, view: LaserView, pixel: tuple[int, int]) -> None:
@@ -180,7 +180,7 @@ def _draw_histogram(axes: Axes, capture: StoredCapture, view: LaserView, pixel: 
     factor, power = (1.0, "") if logarithmic else power_of_ten(float(histograms.max()))
     top = float(histograms.max()) / factor
     title = f"{'pixel' if _is_view(header) else 'sensor point'} in row {pixel[0]}, column {pixel[1]} (+)"
-    style(axes, title, "optical path length [m]", f"{_quantity(header)} per bin [{power}{_unit(header)}]")
+    style(axes, title, "optical path length [m]", _per_bin(header, power))
     for slot, color in zip(shown, line_colors(len(shown)), strict=True):
         label = _bounce_label(header, slot)
         axes.stairs(histograms[slot] / factor, edges, baseline=None, color=color, lw=1.3, label=label)
@@ -199,12 +199,8 @@ def _draw_bounces(axes: Axes, header: StoredHeader, view: LaserView) -> None:
     energy = view.bounces
     slots = range(len(energy))
     lit = [slot for slot in slots if energy[slot] > 0]
-    style(
-        axes,
-        "light of each bounce",
-        "bounce",
-        f"sum over {'pixels' if _is_view(header) else 'wall'} and time [{_unit(header)}]",
-    )
+    summed = f"sum over {'pixels' if _is_view(header) else 'wall'} and time [{_unit(header)}]"
+    style(axes, "light of each bounce", "bounce", summed)
     axes.bar(lit, energy[lit], color=line_colors(len(lit)), width=0.7)
     axes.set_xticks(slots, [_bounce_label(header, slot).removeprefix("bounce ") for slot in slots])
     axes.set_xlim(-1, len(energy))
@@ -215,8 +211,8 @@ def _draw_bounces(axes: Axes, header: StoredHeader, view: LaserView) -> None:
     for slot in lit:
         percent = 100 * energy[slot] / energy[lit].sum()
         share = f"{percent:.0f} %" if percent >= 10 else f"{percent:.2g} %"
-        at = (slot, float(energy[slot]))
-        axes.annotate(share, at, (0, 3), textcoords="offset points", ha="center", color=INK, size=TICK_SIZE)
+        place = (slot, float(energy[slot]))
+        axes.annotate(share, place, (0, 3), textcoords="offset points", ha="center", color=INK, size=TICK_SIZE)
 
 
 def _draw_row(axes: Axes, capture: StoredCapture, view: LaserView) -> None:
@@ -236,15 +232,15 @@ def _draw_row(axes: Axes, capture: StoredCapture, view: LaserView) -> None:
     image = axes.imshow(
         light / factor, origin="lower", extent=extent, aspect="auto", cmap=COLORMAP, norm=scale, interpolation="nearest"
     )
-    color_bar(axes.figure, image, axes, f"{_quantity(header)} per bin [{power}{_unit(header)}]")
+    color_bar(axes.figure, image, axes, _per_bin(header, power))
 
 
 def _is_view(header: StoredHeader) -> bool:
     return header.scan_type == LINE_OF_SIGHT
 
 
-def _quantity(header: StoredHeader) -> str:
-    return "radiance" if _is_view(header) else "H"
+def _per_bin(header: StoredHeader, power: str) -> str:
+    return f"{'radiance' if _is_view(header) else 'H'} per bin [{power}{_unit(header)}]"
 
 
 def _unit(header: StoredHeader) -> str:
@@ -264,14 +260,6 @@ def _wall_extent(header: StoredHeader) -> tuple[tuple[float, float, float, float
         return (-width / 2, width / 2, -height / 2, height / 2), "wall x [m]", "wall y [m]"
     rows, columns = header.sensor_grid
     return (-0.5, columns - 0.5, -0.5, rows - 0.5), "column", "row"
-
-
-def _wall_position(
-    header: StoredHeader, pixel: tuple[int, int], extent: tuple[float, float, float, float]
-) -> tuple[float, float]:
-    left, right, bottom, top = extent
-    rows, columns = header.sensor_grid
-    return left + (pixel[1] + 0.5) / columns * (right - left), bottom + (pixel[0] + 0.5) / rows * (top - bottom)
 
 
 def _at_most(light: Float64, lines: int) -> Float64:
