@@ -146,12 +146,12 @@ def test_an_interrupted_export_leaves_nothing(tmp_path: Path, monkeypatch: pytes
 
 STOPPED = {  # commands, and a function each that is called while their output is half-written
     ("frames", "view.hdf5"): "analysis.frames.save_exr",
-    ("frames", "view.hdf5", "-o", "view.gif"): "files.replacement.publish",
-    ("plot", "wall.hdf5"): "files.replacement.publish",
+    ("frames", "view.hdf5", "-o", "view.gif"): "files.atomic_write.publish",
+    ("plot", "wall.hdf5"): "files.atomic_write.publish",
     ("export", "wall.hdf5", "--format", "tal"): "files.export.tal_format._write_enum",
-    ("export", "wall.hdf5", "--format", "fk"): "files.replacement.publish",
+    ("export", "wall.hdf5", "--format", "fk"): "files.atomic_write.publish",
     ("reconstruct", "wall.hdf5", "--voxels", "8"): "analysis.reconstruction.volume_file.set_attributes",
-    ("merge", "part1.hdf5", "part2.hdf5", "-o", "merged.hdf5"): "files.merge._copy",
+    ("merge", "part1.hdf5", "part2.hdf5", "-o", "merged.hdf5"): "files.parts.merge._copy",
 }
 
 
