@@ -28,7 +28,7 @@ FLATNESS = 4.0  # gaps that the corners of a triangle may be off the plane of th
 EDGE = 1e-3  # barycentric distance from an edge within which float32 may meet a neighbour in the same plane
 MIN_POINTS = 2**16  # tried on all meshes of a scene: 65 of them lie in an overlap of 1e-3 of the area
 DISK_POINTS = 4096  # tried on each disk
-MIN_DISK_SHARE = 0.01  # of these within the gap: of surfaces that cross the disk it is a strip of about 1e-5
+MIN_DISK_SHARE = 0.01  # of these within the gap: of surfaces that cross the disk only a thin strip is
 MAX_LAYERS = 32  # in one place that are moved apart: each takes a pass, which loads the scene anew
 
 

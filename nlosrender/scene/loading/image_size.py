@@ -37,7 +37,7 @@ def _bitmap_size(path: Path) -> tuple[int, int] | None:
     except Image.DecompressionBombError as error:
         raise ValueError(f"{path} is too large an image: {error}") from error
     except (OSError, UnidentifiedImageError, SyntaxError, ValueError):
-        return None  # Mitsuba says what is wrong with it
+        return None  # Mitsuba reports what is wrong with it
 
 
 def _exr_size(path: Path) -> tuple[int, int] | None:

@@ -1,4 +1,4 @@
-"""BSDFs, emitters and the values in them: configuration -> Mitsuba."""
+"""Loads BSDFs and emitters of a configuration into Mitsuba, and checks what it does not."""
 
 from __future__ import annotations
 

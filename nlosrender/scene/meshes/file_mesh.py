@@ -1,4 +1,4 @@
-"""What a mesh file holds: its triangles, and a few words for everything else in it."""
+"""The content of a mesh file: its triangles, and a few words for everything else in it."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class FileMesh:
     mesh: TriangleMesh  # in the file's coordinates; a normal is zero where a corner of a face has none
     materials: tuple[str, ...] = ()  # names of the materials that faces have, in the order of the file
     dropped: tuple[str, ...] = ()  # what the file has and the mesh has not, in a few words each: lines, colours
-    doubts: tuple[str, ...] = ()  # sentences about what its author may not have meant
+    doubts: tuple[str, ...] = ()  # sentences about likely mistakes
     no_uvs: str = NO_UVS  # why ``mesh`` has no texture coordinates; empty when it has some
 
 

@@ -1,4 +1,4 @@
-"""One line per mesh: what has been read of its file, and what about it its author may not have meant."""
+"""Reports one line per mesh: what has been read of its file, and warnings about likely mistakes in it."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """Reads .ply meshes: ASCII and binary, triangles, polygons and triangle strips, in float64.
 
-Every count and index is held against what the file has before anything of its size is made: a wrong number in a file
-is a message, never a crash.
+Every count and index is checked against the size of the file before anything of its size is allocated: a wrong number
+in a file is a message, never a crash.
 """
 
 from __future__ import annotations

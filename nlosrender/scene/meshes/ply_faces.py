@@ -91,7 +91,7 @@ def strip_corners(runs: Lists, n_vertices: int) -> TriangleCorners:
 def with_corner_uvs(mesh: TriangleMesh, uvs: Float64) -> TriangleMesh:
     """Return a mesh with texture coordinates (m, 3, 2) for each corner of its faces: a vertex for each that differ."""
     vertices, flat = mesh.faces.ravel().astype(np.int64), uvs.reshape(-1, 2)
-    first, which = distinct_columns(np.stack([flat[:, 1], flat[:, 0], vertices]))
+    first, which = distinct_columns([flat[:, 1], flat[:, 0], vertices])
     return replace(mesh.reindexed(vertices[first], which.reshape(-1, 3)), uvs=flat[first])
 
 

@@ -1,4 +1,4 @@
-"""The header of a .ply file: which elements there are, how many of each, and how their values are laid out."""
+"""The header of a .ply file: its elements, their counts, and the layout of their values."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ class PlyElement:
 
 @dataclass(frozen=True)
 class PlyHeader:
-    """A header that makes sense."""
+    """A header, understood and checked."""
 
     is_ascii: bool
     elements: tuple[PlyElement, ...]
@@ -89,7 +89,7 @@ def read_header(content: bytes) -> PlyHeader:
     Raises
     ------
     ValueError
-        It is none, or a line of it means nothing.
+        It is no header, or a line of it is not understood.
     """
     first = re.match(rb"ply[ \t]*(\r\n|\n|\r)", content)
     if first is None:

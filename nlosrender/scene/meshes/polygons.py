@@ -30,7 +30,7 @@ def cut_polygons(groups: Sequence[Float64], named: Callable[[int, int], str]) ->
     Returns
     -------
     tuple
-        A cut per group; and sentences about polygons that are far from flat. The triangles of a convex polygon are
+        A cut per group; and a sentence about polygons that are far from flat. The triangles of a convex polygon are
         the fan from its first corner.
 
     Raises
@@ -82,7 +82,7 @@ def _fan_starts(local: Float64, normals: Float64) -> Int64:
         spokes = spokes[:, 1:] - spokes[:, :1]
         cross = np.cross(spokes[:, :-1], spokes[:, 1:])
         areas = np.einsum("nkx,nx->nk", cross, normals[left])
-        # more than a full turn about the first corner: the triangles overlap, although each runs the right way round
+        # more than a full turn about the first corner: the triangles overlap, although each is counter-clockwise
         turns = np.arctan2(np.maximum(areas, 0), np.einsum("nkx,nkx->nk", spokes[:, :-1], spokes[:, 1:])).sum(axis=1)
         no_area = ~normals[left].any(axis=1) & (np.linalg.norm(cross, axis=-1) <= SLIVER).all(axis=1)
         right = normals[left].any(axis=1) & (areas >= -SLIVER).all(axis=1) & (turns < 2 * np.pi)

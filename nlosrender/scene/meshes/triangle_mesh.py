@@ -146,16 +146,16 @@ def unit_rows(vectors: Float64, min_length: float = 0.0) -> Float64:
     return np.divide(vectors, length, out=np.zeros_like(vectors), where=length > min_length)
 
 
-def equal_columns(keys: NDArray) -> Int64:
+def equal_columns(keys: NDArray | Sequence[NDArray]) -> Int64:
     """Return for each column of ``keys`` (k, n) its number among the different columns, in order of the last key."""
     order = np.lexsort(keys)
-    is_new = (np.diff(keys[:, order], axis=1) != 0).any(axis=0)
+    is_new = np.any([np.diff(key[order]) != 0 for key in keys], axis=0)
     numbers = np.empty(len(order), np.int64)
     numbers[order] = np.append(0, np.cumsum(is_new))[: len(order)]
     return numbers
 
 
-def distinct_columns(keys: NDArray) -> tuple[Int64, Int64]:
+def distinct_columns(keys: NDArray | Sequence[NDArray]) -> tuple[Int64, Int64]:
     """Return the index of one column of ``keys`` (k, n) of each kind, and which of these each column equals, (n,)."""
     numbers = equal_columns(keys)
     first = np.empty(int(numbers.max(initial=-1)) + 1, np.int64)

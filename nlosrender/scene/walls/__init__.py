@@ -1,1 +1,1 @@
-"""Relay walls: wall coordinates, positions, normals and texture coordinates of every type."""
+"""Relay walls: wall coordinates, positions and normals of every type."""

@@ -1,4 +1,4 @@
-"""A triangle mesh as relay wall: laser and sensor points are named by the file's texture coordinates."""
+"""A triangle mesh as relay wall: wall coordinates are the file's texture coordinates."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ UV_ROUNDING = 1e-6  # texture coordinates of a few decimals or in float32 may pa
 class MeshWall(RelayWall):
     """A mesh as relay wall, lit on the side of its faces' normals; wall coordinates are its texture coordinates.
 
-    What other walls raise as ValueError off the wall is a ConfigError here, that names the hole.
+    Off the wall it raises ConfigError, which names the hole, where other walls raise ValueError.
 
     Raises
     ------

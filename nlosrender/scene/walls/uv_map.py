@@ -1,4 +1,4 @@
-"""From texture coordinates back to the triangle of a mesh: which face covers a point (u, v), and where in it."""
+"""Inverse of a mesh's texture coordinates: the face that covers a point (u, v), and barycentric coordinates in it."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import numpy as np
 from nlosrender.scene.meshes.triangle_mesh import Int64
 from nlosrender.scene.pose import Float64
 
-EDGE = 1e-6  # barycentric: points so near to an edge belong to the faces on both sides; ten times float32's rounding
+EDGE = 1e-6  # barycentric: points nearer to an edge belong to the faces on both sides; ten times float32's rounding
 MAX_PAIRS = 4_000_000  # of points and faces looked at at once: 0.5 GB
 NOWHERE = -1
 # Barycentric coordinates of the points of a face that no other face may cover: its middle, and one near each corner.
@@ -89,7 +89,7 @@ class UvMap:
         return point, face, np.where(np.isfinite(inside), inside, -np.inf)
 
     def _counts(self, uv: Float64) -> tuple[Int64, Int64]:
-        """Return where the faces in the box of each point begin, and how many there are."""
+        """Return the first entry of ``_faces`` in the box of each point, and the number of entries there."""
         key = self._key(self._box(uv))
         return self._starts[key], self._starts[key + 1] - self._starts[key]
 
