@@ -121,10 +121,10 @@ def test_every_bounce_of_a_sphere_has_its_energy(russian_roulette: bool) -> None
 
 @pytest.mark.parametrize("scan", ["single", "confocal", pytest.param("exhaustive", marks=pytest.mark.slow)])
 def test_virtual_lights_give_every_bounce_of_a_sphere_its_energy(scan: str) -> None:
-    """The wall's own cells and walks from the wall: H_k = rho^k / (4 pi^2 R^2) with nothing else in the sphere.
+    """The wall's own patches and VPLs on the wall: H_k = rho^k / (4 pi^2 R^2) with nothing else in the sphere.
 
     In a sphere every pair of cells exchanges the same, so that the third bounce has no discretisation error at all.
-    Bounces above come from walks that all sensor points share: their errors go together, and the mean has them in full.
+    Bounces above come from VPLs that all sensor points share: their errors go together, and the mean has them in full.
     """
     config = sphere_room(scan=scan, bins=(0.0, 50.0, 1), spp=None, target_error=0.02, max_bounces=5)
     config["render"]["engine"] = "virtual_lights"
@@ -169,7 +169,7 @@ def test_the_third_bounce_of_a_pair_in_a_sphere_is_that_of_quadrature() -> None:
 
 
 def test_the_third_bounce_of_virtual_lights_in_a_sphere_is_that_of_quadrature() -> None:
-    """Per bin, to the error asked for of all bounces, of a wall that is cut into cells itself."""
+    """Per bin, to the error asked for of all bounces, of a wall that is cut into elements itself."""
     config = sphere_room(bins=(0.0, 0.1, 40), spp=None, target_error=0.01, max_bounces=3)
     config["render"]["engine"] = "virtual_lights"
     config["capture"]["laser_point"] = [0.4, 0.3]

@@ -17,7 +17,7 @@ from nlosrender.bench.generated_meshes import grid_faces, write_ply
 pytestmark = pytest.mark.usefixtures("backend")
 
 Array = NDArray[np.float64]
-N_FINE = 70  # rows of squares of a fine sheet: 15 mm of 0.8 m, far below the size allowed at coarseness 1, 0.2 m
+N_FINE = 70  # rows of squares of a fine sheet: 15 mm of 0.8 m, far below the size allowed at scale 1, 0.2 m
 
 
 def sheet(folder: Path, n: int, waves: float = 0.05, name: str = "sheet.ply") -> dict[str, Any]:
@@ -127,7 +127,7 @@ def test_what_a_cluster_is_made_of_does_not_matter(tmp_path: Path) -> None:
 
 
 def test_the_number_of_patches_follows_the_accuracy_not_the_triangles(tmp_path: Path) -> None:
-    """Sheets of one shape, 15 times apart in triangles, are as many patches at the same coarseness: as counted."""
+    """Sheets of one shape, 15 times apart in triangles, are as many patches at the same scale: as counted."""
     few, many = (tessellated(sheet(tmp_path, n), folder=tmp_path) for n in (50, 195))
     for patch_scale in (1.0, 0.7, 0.5):
         assert len(many.patches(patch_scale)) == pytest.approx(len(few.patches(patch_scale)), rel=0.1)

@@ -134,7 +134,7 @@ def test_points_on_the_edges_of_a_mesh_wall_are_said(tmp_path: Path) -> None:
     ("name", "engine"), [("in a sphere", "virtual_lights"), ("on a tube", "virtual_lights"), ("waves", "path")]
 )
 def test_auto_takes_the_engine_that_is_quicker(name: str, engine: str, tmp_path: Path) -> None:
-    """Round walls are cut into few cells; the edges of a mesh wall take very many, and a reason is given."""
+    """Round walls are cut into few elements; the edges of a mesh wall take very many, and a reason is given."""
     write_uv_ply(tmp_path / "waves.ply", *sheet(wavy(2.0, 1.6, 0.1), 12, 10))
     chosen = Stage.of(scene(name, "single", "auto"), tmp_path).engine
     assert chosen.name == engine
@@ -143,7 +143,7 @@ def test_auto_takes_the_engine_that_is_quicker(name: str, engine: str, tmp_path:
 
 @pytest.mark.parametrize("engine", ["auto", "virtual_lights"])
 def test_a_needle_is_not_cut_into_millions_of_patches(engine: str) -> None:
-    """The cells of a tube of 1 micrometre are as long as it is wide: 76 million in 1.5 m, more than memory holds."""
+    """The elements of a tube of 1 micrometre are as long as it is wide: 76 million in 1.5 m, more than memory holds."""
     config = flat_wall(sensors=(3, 2), scan="confocal", max_bounces=4, engine=engine, spp=None)
     config["scene"]["relay_wall"] = {"type": "cylinder", "radius": 1e-6, "height": 1.5, "bsdf": diffuse(0.7)}
     chosen = Stage.of(config).engine

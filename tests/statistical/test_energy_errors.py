@@ -1,4 +1,4 @@
-"""The stated error of a capture's energy is the scatter of the energy over seeds, whoever shares walks or paths."""
+"""The stated error of a capture's energy is the scatter of the energy over seeds, whoever shares VPLs or paths."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from nlosrender import pipeline
 GREY = {"type": "diffuse", "reflectance": 0.5}
 ROOM = {"type": "room", "size": [2.0, 1.6, 2.0], "bsdf": GREY}
 BALL = {"type": "sphere", "center": [0.2, 0, 0.8], "radius": 0.3, "bsdf": GREY}
-# a plate that sensor points see and the laser does not, lit by one round the corner: few walks bring all the light
+# a plate that sensor points see and the laser does not, lit by one round the corner: few subpaths bring all the light
 CORNER = (
     {"type": "rectangle", "width": 0.8, "height": 1.5, "center": [0.2, 0, 0.5], "normal": [1, 0, 0],
      "bsdf": {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": 0.0}}},
@@ -24,12 +24,12 @@ CORNER = (
 SEEDS = 24  # the scatter itself is known to 1 / sqrt(2 * 23) = 15 %
 
 CASES: dict[str, tuple[tuple[Scene, ...], dict[str, Any]]] = {
-    "walks": ((ROOM, BALL), {"engine": "virtual_lights", "spp": None, "target_error": 0.1}),
-    "walks of one round": (
+    "VPLs": ((ROOM, BALL), {"engine": "virtual_lights", "spp": None, "target_error": 0.1}),
+    "VPLs of one round": (
         (ROOM, BALL),
         {"engine": "virtual_lights", "spp": None, "target_error": 0.3, "sensors": (12, 9)},
     ),
-    "walks round a corner": (CORNER, {"engine": "virtual_lights", "spp": None, "target_error": 0.05}),
+    "VPLs round a corner": (CORNER, {"engine": "virtual_lights", "spp": None, "target_error": 0.05}),
     "paths": ((ROOM, BALL), {"spp": 256}),
     "paths that lasers share": ((ROOM, BALL), {"spp": 256, "scan": "exhaustive", "lasers": (3, 2)}),
 }

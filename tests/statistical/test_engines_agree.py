@@ -55,7 +55,7 @@ def test_engines_agree(name: str, tmp_path: Path) -> None:
 
 
 def cut_scene(scan: str, max_bounces: int) -> Item:
-    """Return a small capture with shadows and interreflections; settled by a pilot to a coarse target."""
+    """Return a small capture with shadows and interreflections; calibrated by a pilot to a coarse target."""
     return flat_wall(
         SLANTED,
         SIDE,
@@ -82,7 +82,7 @@ def cut_scene(scan: str, max_bounces: int) -> Item:
     ],
 )
 def test_how_a_capture_is_cut_changes_no_bit(scan: str, max_bounces: int) -> None:
-    """One batch, or many: patches, walks and rays are those of the capture, not of the batch."""
+    """One batch, or many: patches, VPLs and rays are those of the capture, not of the batch."""
     whole = render(cut_scene(scan, max_bounces), batch_bytes=10**9)
     pieces = render(cut_scene(scan, max_bounces), batch_bytes=whole.plan.bytes_per_batch // 2)
     assert len(whole.plan.batches) == 1 < len(pieces.plan.batches)

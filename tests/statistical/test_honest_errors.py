@@ -17,9 +17,11 @@ from nlosrender.engine.backend.start import start_backend
 
 Array = NDArray[np.float64]
 N_SCENES = 44
-QUICK_SCENES = (9, 17, 26, 37)  # legs, shadows, confocal in a room, walks
+QUICK_SCENES = (9, 17, 26, 37)  # legs, shadows, confocal in a room, VPLs
 TRUTH_SEED, SEED = 1000, 1
-FINER = 4.0  # coarseness of the truth: its third bounce is 16 times better, or 4 times where it converges slowly
+FINER = (
+    4.0  # patch scale over that of the truth: its third bounce is 16 times better, or 4 times where it converges slowly
+)
 MOST_OPTIMISTIC, MOST_PESSIMISTIC = 2.0, 4.0
 CHECKED_BY_PATHS = (3, 7, 9, 19, 28, 31)
 LONGER = 40  # rounds, or paths, of the truth: a noise 6 times smaller
@@ -229,8 +231,8 @@ def test_noise_falls_as_the_square_root_of_the_rounds(scene: Callable[[], Trap],
         further = repeated.means[:, :, stage.bounces.slot(4) :]
         noise = further - further.mean(axis=0)
         errors.append(math.sqrt((noise**2).sum() / (n_seeds - 1) / (further.mean(axis=0) ** 2).sum()))
-        # A sampled site brings no sensor point more than a few shares of its round: after n rounds no bin is off by
-        # more than the largest of all / sqrt(n). Sites by area alone would miss it by (distance / 1.5 cm)^2, 1000.
+        # A VPL brings no sensor point more than a few shares of its round: after n rounds no bin is off by
+        # more than the largest of all / sqrt(n). VPLs by area alone would miss it by (distance / 1.5 cm)^2, 1000.
         assert np.abs(noise).max() <= further.mean(axis=0).max() / math.sqrt(n)
     # The square of an error is a sum over 8 seeds of at least 3 independent parts each (bins of a row go together):
     # its logarithm has a deviation of sqrt(2 / 24) / 2 = 0.14, the slope over 4 points ln 4 apart of 0.14 / 3.1.

@@ -126,7 +126,7 @@ def test_how_a_capture_is_cut_changes_no_bit_of_late_light(engine: str, scan: st
 
 
 def test_kernels_do_not_know_where_the_window_ends() -> None:
-    """A window that ends elsewhere is data: paths and walks are compiled once."""
+    """A window that ends elsewhere is data: paths and subpaths are compiled once."""
     stage = Stage.of(scene(ROOM, engine="virtual_lights"))
     import drjit as dr
 
@@ -139,10 +139,10 @@ def test_kernels_do_not_know_where_the_window_ends() -> None:
         for start in (0.0, -1.0, 0.5):
             axis = replace(engine.time_axis, start_opl=start)
             paths = type(engine)(engine.built, engine.capture, axis, engine.options)
-            walks = type(lights.further)(paths, lights.tessellator, lights.further.masks)
+            further = type(lights.further)(paths, lights.tessellator, lights.further.masks)
             dr.kernel_history_clear()
             paths.render(stage.batch, Budget(spp=16))
-            walks.accumulate(stage.batch, walks.histogram(stage.batch, 2), 0)
+            further.accumulate(stage.batch, further.histogram(stage.batch, 2), 0)
             hashes.append({kernel["hash"] for kernel in dr.kernel_history((dr.KernelType.JIT,))})
     finally:
         dr.set_flag(dr.JitFlag.KernelHistory, False)
@@ -170,15 +170,15 @@ def test_a_path_is_late_when_the_straight_way_to_the_laser_ends_after_the_window
 @pytest.mark.parametrize("engine", ["path", "virtual_lights"])
 @pytest.mark.parametrize("scan", ["single", "confocal"])
 def test_without_survivors_no_light_comes_after_the_window(engine: str, scan: str, monkeypatch: Any) -> None:
-    """Every path and walk is stopped before the first connection that ends after the window, legs included.
+    """Every path and subpath is stopped before the first connection that ends after the window, legs included.
 
-    One sensor point and one laser point: the bound is exact. The third bounce of the virtual lights is no walk's.
+    One sensor point and one laser point: the bound is exact. The third bounce of the virtual lights is no subpath's.
     """
     stage = Stage.of(scene(ROOM, engine=engine, scan=scan, sensors=(1, 1), capture=LEGS, width=0.2))
     from nlosrender.engine.launch import time_gate as deadline
     from nlosrender.engine.path.engine import Budget
-    from nlosrender.engine.virtual_lights.vpls import sampler as sites
-    from nlosrender.engine.virtual_lights.vpls import subpaths as walks
+    from nlosrender.engine.virtual_lights.vpls import sampler
+    from nlosrender.engine.virtual_lights.vpls import subpaths
 
     def outside_and_inside() -> tuple[float, float]:
         result = stage.seeded(3).render(stage.batch, Budget(**BUDGETS[engine]))
@@ -186,7 +186,7 @@ def test_without_survivors_no_light_comes_after_the_window(engine: str, scan: st
         return float(result.outside[:, further].sum()), float(result.mean[:, further].sum())
 
     usual = outside_and_inside()
-    for module in (deadline, sites, walks):
+    for module in (deadline, sampler, subpaths):
         monkeypatch.setattr(module, "GATE_SURVIVAL", 0.0)
     outside, inside = outside_and_inside()
     assert usual[0] > 0.1 * usual[1] > 0
@@ -245,18 +245,18 @@ def test_one_late_path_in_eight_carries_the_light_of_all() -> None:
 
 
 def share_in_time(has_time_gate: bool) -> float:
-    """Return the share of a round's impulses that could reach some sensor point within the window."""
+    """Return the share of a round's contributions that could reach some sensor point within the window."""
     stage = Stage.of(scene(ROOM, engine="virtual_lights"))
     from nlosrender.engine.virtual_lights.vpls import gather as further_bounces
 
     engine = with_options(stage.engine, has_time_gate=has_time_gate)
     shares, vpl_contributions = [], further_bounces.vpl_contributions
 
-    def recorded(plan: Any, transport: Any, sites: Any, *rest: Any) -> Any:
-        impulses = vpl_contributions(plan, transport, sites, *rest)
-        heights = sites.positions[impulses.vpls][:, 2] * engine.built.unit  # over the wall, with its sensor points
-        shares.append((np.array(impulses.delays) + heights / 0.1 < SHORT).mean())
-        return impulses
+    def recorded(plan: Any, params: Any, vpls: Any, *rest: Any) -> Any:
+        contributions = vpl_contributions(plan, params, vpls, *rest)
+        heights = vpls.positions[contributions.vpls][:, 2] * engine.built.unit  # over the wall, with its sensor points
+        shares.append((np.array(contributions.delays) + heights / 0.1 < SHORT).mean())
+        return contributions
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(further_bounces, "vpl_contributions", recorded)
@@ -265,7 +265,7 @@ def share_in_time(has_time_gate: bool) -> float:
 
 
 def test_walks_are_spent_on_light_in_the_window() -> None:
-    """Late impulses are an eighth of what they would be beside the others, so that most of a round come in time."""
+    """Late contributions are an eighth of what they would be beside the others: most of a round come in time."""
     # a share s becomes s / (s + (1 - s) / 8): 0.72 of 0.24
     assert share_in_time(True) > 0.65 > 2 * share_in_time(False)
 
@@ -276,20 +276,20 @@ def test_sites_that_only_late_light_reaches_are_few() -> None:
     unit, ratios, areas = stage.engine.built.unit, [], []
     for has_time_gate in (False, True):
         sampler = with_options(stage.engine, has_time_gate=has_time_gate).further.sampler
-        sites = sampler.sample(2**15, np.random.default_rng(5))
-        heights = sites.positions[:, 2] * unit
+        vpls = sampler.sample(2**15, np.random.default_rng(5))
+        heights = vpls.positions[:, 2] * unit
         far = heights > 1.999
-        assert stage.engine.paths.capture_gate.is_beyond(sites.positions[far]).all()
+        assert stage.engine.paths.capture_gate.is_beyond(vpls.positions[far]).all()
         ratios.append(far.mean() / (heights < 0.5).mean())
-        areas.append(sites.areas[far].sum() * unit**2)
-    # 5 sigma of the fewest sites; they are stratified, which makes it less
+        areas.append(vpls.areas[far].sum() * unit**2)
+    # 5 sigma of the fewest VPLs; they are stratified, which makes it less
     fewest = ratios[1] * 2**14
     assert ratios[1] == pytest.approx(ratios[0] / 8, rel=5 / fewest**0.5)
     np.testing.assert_allclose(areas, 2.0 * 1.6, rtol=5 / fewest**0.5)
 
 
 def test_what_is_thinned_out_is_said() -> None:
-    """The plan names it where paths or walks may end after the window, and only there."""
+    """The plan names it where paths or subpaths may end after the window, and only there."""
     from nlosrender.engine.preflight.omitted_work import omitted_work
 
     what = "most paths on which light can only arrive after the time window"

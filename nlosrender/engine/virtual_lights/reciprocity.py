@@ -19,19 +19,8 @@ def is_reciprocal(
 ) -> bool:
     """Return whether an exhaustive capture that fits one batch is the same with laser and sensor points exchanged.
 
-    The grids have to be the same, and so have the legs. Lambertian surfaces are reciprocal unless their shading normals
-    are interpolated: those are used towards the lasers only.
-
-    Parameters
-    ----------
-    built, capture
-        The scene and its points.
-    n_bins
-        Of each of them.
-    is_lambertian
-        Whether wall and hidden surfaces are.
-    tuning
-        How large a capture may be.
+    The grids have to be the same, and so have the legs. Lambertian surfaces (``is_lambertian``: wall and hidden ones)
+    are reciprocal unless their shading normals are interpolated: those are used towards the lasers only.
     """
     if capture.scan_type != "exhaustive" or not is_lambertian:
         return False

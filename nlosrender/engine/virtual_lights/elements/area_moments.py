@@ -21,20 +21,11 @@ PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))  # axes of the second m
 PLACE = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])  # in PAIRS
 
 # Multiplicative hashing: one step in each key of a box adds this to its code; odd numbers without a pattern.
-STEPS = np.array(
-    [
-        0xFAE9076D258CBCB7,
-        0xCC5D0BBFAE913FFF,
-        0xF3DA18809D1114C1,
-        0xA924D528141826C7,
-        0x9F99406924734ED7,
-        0xAD92C5AD6764D11D,
-        0x978BC24DBD49645F,
-        0xD43DBFB0CF4541BD,
-        0x8F3C6E5B1D27A94B,
-    ],
-    np.uint64,
+HASH = (
+    "FAE9076D258CBCB7 CC5D0BBFAE913FFF F3DA18809D1114C1 A924D528141826C7 9F99406924734ED7 "
+    "AD92C5AD6764D11D 978BC24DBD49645F D43DBFB0CF4541BD 8F3C6E5B1D27A94B"
 )
+STEPS = np.array([int(code, 16) for code in HASH.split()], np.uint64)
 
 Int64 = NDArray[np.int64]
 UInt64 = NDArray[np.uint64]
@@ -223,14 +214,7 @@ def _numbered(keys: list[NDArray]) -> tuple[UInt64, Int64]:
 def _without_slivers(codes: UInt64, is_sliver: NDArray[np.bool_], offsets: Float64) -> Int64:
     """Return the number (m,) of each box's group when slivers join the box across the side that they lie along.
 
-    Parameters
-    ----------
-    codes
-        (m,) sorted codes of the boxes.
-    is_sliver
-        (m,) which boxes are nearly empty.
-    offsets
-        (2, m) of the centre of what is in a box from the box's own, in the two directions across.
+    ``codes`` (m,) are sorted; ``offsets`` (2, m) lead across from the middle of a box to that of what is in it.
     """
     slivers = np.flatnonzero(is_sliver)
     offsets = offsets[:, slivers]

@@ -32,16 +32,12 @@ class Merger:
 
     Parameters
     ----------
-    elements
-        Elements of all shapes.
-    normals, areas
-        (n, 3) and (n,) of the elements.
+    elements, normals, areas
+        Elements of all shapes, their unit normals (n, 3) and areas (n,).
     allowed
         (n,) size a patch may have at scale 1 [engine units].
     light
         (3,) mean of the laser points [engine units].
-    tuning
-        Size of the boxes, and what is sorted out of them.
     """
 
     def __init__(
@@ -62,17 +58,7 @@ class Merger:
         self._moments_of(2.0**-self.tuning.moment_halvings)
 
     def clusters(self, chosen: NDArray[np.bool_], patch_scale: float, seed: int = 0) -> Patches:
-        """Return the clusters of the elements that are ``chosen``.
-
-        Parameters
-        ----------
-        chosen
-            (n,) which elements; at least one.
-        patch_scale
-            Scales the sizes allowed.
-        seed
-            Of the draw of the members that shadow rays end on.
-        """
+        """Return the clusters of the ``chosen`` elements (n,), at least one; ``seed`` draws representatives."""
         level = 2.0 ** (math.floor(math.log2(patch_scale)) - self.tuning.moment_halvings)
         moments = self._moments_of(level) if chosen.all() else self._element_moments.select(chosen)
         merged = moments.merged(patch_scale, np.random.default_rng(seed), self.tuning)

@@ -40,18 +40,10 @@ class Regions:
 def regions_of(
     capture: Capture, unit: float, distance: WallDistance, triangles: Elements, whole: SizedElements
 ) -> Regions | None:
-    """Return the regions that make the gather cheaper, or None where one set of patches suffices.
+    """Return the regions that make the gather cheaper, or None where one set of patches, of ``whole``, suffices.
 
-    Parameters
-    ----------
-    capture, unit
-        Where the points are, and metres per engine unit.
-    distance
-        Distance from all of them.
-    triangles
-        Triangles of the meshes as elements, not quartered yet.
-    whole
-        The elements cut for all points at once; its tuning decides what is worth while.
+    ``distance`` is that from all points, ``triangles`` are those of the meshes before subdivision, ``unit`` is metres
+    per engine unit.
     """
     if capture.n_lasers > 1 and capture.scan_type != "confocal":
         return None  # what is near to a laser point has to be fine for all

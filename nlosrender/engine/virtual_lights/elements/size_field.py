@@ -35,15 +35,7 @@ class SizeField:
 
 
 class SizedElements:
-    """Elements that are cut into equal parts, or merged where they are far smaller than need be.
-
-    Parameters
-    ----------
-    elements
-        No longer than their distance from the points that the patches are for.
-    size_field
-        Decides the size of the patches.
-    """
+    """Subdivided elements, to be cut into equal parts, or merged where they are far smaller than need be."""
 
     def __init__(self, elements: Elements, size_field: SizeField):
         self.elements, self.size_field = elements, size_field
@@ -95,17 +87,7 @@ class SizedElements:
 
 
 class _PatchCount:
-    """Number of patches that elements make, by binary search: it is asked for many scales.
-
-    Parameters
-    ----------
-    ratios
-        (n,) sizes of the elements over the sizes allowed.
-    boxes
-        (n,) ``covered_boxes``.
-    merge_ratio
-        As in the tuning.
-    """
+    """Number of patches that elements (n,) make, by binary search over their sizes per size allowed."""
 
     def __init__(self, ratios: Float64, boxes: Float64, merge_ratio: float):
         order = np.argsort(ratios)

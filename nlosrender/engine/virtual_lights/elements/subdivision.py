@@ -77,15 +77,7 @@ class RegularPoints:
 
 
 class WallDistance:
-    """Distance from the nearest laser or sensor point of a capture.
-
-    Parameters
-    ----------
-    capture
-        Where the points are.
-    unit
-        Metres per engine unit.
-    """
+    """Distance from the nearest laser or sensor point of a capture; ``unit``: metres per engine unit."""
 
     def __init__(self, capture: Capture, unit: float):
         grids = {id(grid): grid for grid in (capture.sensor_grid, capture.laser_grid)}.values()
@@ -162,18 +154,9 @@ def partition_by_size(
 
 
 def subdivide(elements: Elements, distance: WallDistance, wall_index: int | None, min_size: float = 0.0) -> Elements:
-    """Quarter elements until none is longer than its distance from the nearest point.
+    """Quarter elements until none is longer than its distance from the nearest point, found anew, or than ``min_size``.
 
-    Parameters
-    ----------
-    elements
-        Triangles or parts of them; their distances are found anew.
-    distance
-        From the laser and sensor points.
-    wall_index
-        Of the wall among the scene's shapes. On it, only points in the planes of other triangles count.
-    min_size
-        Elements up to this size are not quartered [engine units].
+    On the wall, shape ``wall_index`` of the scene, only points in the planes of other triangles count.
     """
     done: list[Elements] = []
     while True:

@@ -14,7 +14,7 @@ Cf. Iseringhausen & Hullin 2020; Tsai et al. 2019.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import drjit as dr
@@ -56,13 +56,8 @@ class Delays:
     def of_either(cls, is_parallelogram: mi.Bool, delays: mi.Vector4f) -> Delays:
         """Return those of parallelograms, elsewhere of the triangles of the first three corners."""
         a, b, c, d = delays
-        triangle, whole = cls.of_triangle(a, b, c), cls.of_parallelogram(a, b, c, d)
-        return cls(
-            dr.select(is_parallelogram, whole.t0, triangle.t0),
-            dr.select(is_parallelogram, whole.t1, triangle.t1),
-            dr.select(is_parallelogram, whole.t2, triangle.t1),
-            dr.select(is_parallelogram, whole.t3, triangle.t3),
-        )
+        triangle = cls.of_triangle(a, b, c)
+        return dr.select(is_parallelogram, cls.of_parallelogram(a, b, c, d), replace(triangle, t2=triangle.t1))
 
     def later(self, delay: mi.Float | int) -> Delays:
         """Return the delays that begin so much later."""
@@ -105,17 +100,7 @@ def deposit_patch(
     value: mi.Spectrum,
     active: mi.Bool,
 ) -> None:
-    """Deposit ``value`` over the bins that a patch covers.
-
-    Parameters
-    ----------
-    histogram, lane, laser
-        Which row.
-    delays, whole
-        Delays of the patch [bins], and whole bins to add to all of them.
-    value, active
-        What is deposited, and where anything is.
-    """
+    """Deposit ``value`` over the bins that a patch covers: those of its ``delays`` [bins] plus ``whole`` bins."""
     base = dr.floor(delays.t0)
     first = mi.Int32(base) + whole
     last = first + mi.Int32(delays.t3 - base)

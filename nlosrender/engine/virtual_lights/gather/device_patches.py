@@ -141,19 +141,9 @@ def upload_patches(
 ) -> DevicePatches:
     """Bring patches to the device, neighbours together, and evaluate their reflectance and shading frames.
 
-    Parameters
-    ----------
-    built, patches
-        The scene and what it was cut into, region after region.
-    regions
-        Region of each patch, and its number there.
-    seed
-        Of the points where shadow rays end. With a point at random a partly hidden patch counts by its visible share,
-        on average; one for all sensor points keeps their rays together (docs/virtual-lights.md, 5).
-    is_near
-        Whether some patch is so near to a laser or sensor point that float32 positions are too coarse.
-    tuning
-        How many lookups a textured patch takes.
+    ``seed`` draws the points where shadow rays end: a partly hidden patch counts by its visible share, on average
+    (docs/virtual-lights.md, 5.1). ``is_near``: some patch is so near to a laser or sensor point that float32 positions
+    are too coarse.
     """
     patches = patches.select(np.lexsort((morton_order(patches.centres), regions.regions)))
     interaction = surface_at(built, patches.points(patches.centres, patches.barycentric))

@@ -95,19 +95,7 @@ class LitPatches:
 def light_patches(
     settings: GatherSettings, params: LaunchParams, patches: DevicePatches, mask_query: MaskQuery, n_lasers: int
 ) -> LitPatches:
-    """Light patches.
-
-    Parameters
-    ----------
-    settings, params
-        What the gather does and reads.
-    patches
-        All patches of a scale.
-    mask_query
-        Tells which shadow rays may be left out.
-    n_lasers
-        Lasers of the batch.
-    """
+    """Light all patches of a scale by the ``n_lasers`` of a batch, and find their visibility masks."""
     count = dr.width(patches.areas)
     shadow_target, all_lit = patches.points(patches.number), dr.full(mi.Bool, True, count)
     dr.eval(shadow_target)

@@ -124,16 +124,9 @@ class VisibilityMasks:
         return self.built.wall.is_planar and n_points >= self.tuning.min_mask_sensors
 
     def of(self, surface: Surface, wall_tiles: WallTiles, where: mi.UInt32, active: mi.Bool) -> mi.UInt64:
-        """Return the bits of the tiles that certainly see each point.
+        """Return the bits of the tiles of rectangle ``where`` that certainly see each ``active`` point.
 
-        Parameters
-        ----------
-        surface
-            The points.
-        wall_tiles, where
-            Rectangles, and from which of them each point is seen. Where masks do not pay off they are empty.
-        active
-            The masks of other points are empty.
+        The masks of other points are empty, and all where masks do not pay off.
         """
         if not self.pay_off(wall_tiles.n_points):
             return dr.zeros(mi.UInt64, dr.width(surface.points))

@@ -34,15 +34,7 @@ class Vpls(SurfacePoints):
 
 
 class VplSampler:
-    """Draws VPLs on the elements of a scene.
-
-    Parameters
-    ----------
-    tessellator
-        Holds the elements of meshes and round shapes.
-    capture_gate
-        Of elements beyond it few VPLs are drawn; None: no time gate.
-    """
+    """Draws VPLs on the elements of a scene; few on those beyond ``capture_gate``, if there is one."""
 
     def __init__(self, tessellator: Tessellator, capture_gate: CaptureTimeGate | None = None):
         elements, on_round = tessellator.elements, tessellator.round_elements()
@@ -76,12 +68,7 @@ class VplSampler:
     def sample(self, count: int, generator: np.random.Generator) -> Vpls:
         """Draw ``count`` VPLs, stratified: one in each of as many equal parts of the elements' measure.
 
-        Parameters
-        ----------
-        count
-            Number of VPLs.
-        generator
-            Source of the random offsets; the points within elements are a low-discrepancy sequence.
+        The points within elements are a low-discrepancy sequence, shifted by ``generator``.
         """
         position = (np.arange(count) + generator.random(count)) / count
         chosen = np.searchsorted(self._cumulative, position * self._cumulative[-1])

@@ -39,7 +39,7 @@ class ProposalLasers:
     untried_share: float = DEFAULT_TUNING.untried_share
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)  # not frozen: the state of a loop
 class SubpathVertex:
     """One vertex of every subpath, chosen in proportion to the light it is expected to bring; one lane per subpath."""
 
@@ -50,8 +50,7 @@ class SubpathVertex:
     carried: mi.Spectrum  # throughput up to the vertex, its reflectance / pi included
     opl: mi.Float  # from the VPL [engine units]
     bounce: mi.UInt32  # of a connection to the laser
-    expected: mi.Float  # light expected of the vertex chosen
-    total: mi.Float  # light expected of all vertices of the subpath
+    expected: mi.Float  # light expected of it
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,23 +80,10 @@ def trace_subpaths(
     max_bounces: int | None,
     time_gate: TimeGate | None,
     randomness: LaneRandomness,
-) -> SubpathVertex:
-    """Trace subpaths from VPLs until roulette, an escape or ``max_bounces`` ends them.
+) -> tuple[SubpathVertex, mi.Float]:
+    """Trace one subpath per lane from ``vpls`` until roulette, escape or ``max_bounces`` (None: no limit) ends it.
 
-    Parameters
-    ----------
-    built
-        The scene.
-    vpls, reflectance
-        Where the subpaths begin, one lane each.
-    proposal_lasers
-        Lasers by which vertices are judged.
-    max_bounces
-        Highest bounce; None for no limit.
-    time_gate
-        Beyond which light comes too late, per subpath; None: none does.
-    randomness
-        One generator per subpath.
+    Returns one vertex of each, and the light expected of all of them.
     """
     scene, wall, context = built.scene, mi.ShapePtr(built.wall_shape), mi.BSDFContext()
     generator = mi.PCG32(randomness.generator)
@@ -111,9 +97,10 @@ def trace_subpaths(
     origin = mi.Point3f(vpls.p)
     opl = mi.Float(0)  # optical path length from the VPL [engine units]
     bounce = mi.UInt32(FIRST_BOUNCE + 1)  # of a connection from the last vertex
-    position, normal, shading, shape = mi.Point3f(0), mi.Normal3f(0), mi.Normal3f(0), mi.ShapePtr(wall)
-    carried, chosen_opl, chosen_bounce = mi.Spectrum(0), mi.Float(0), mi.UInt32(0)
-    expected, total = mi.Float(0), mi.Float(0)
+    vertex = SubpathVertex(
+        mi.Point3f(0), mi.Normal3f(0), mi.Normal3f(0), wall, mi.Spectrum(0), mi.Float(0), mi.UInt32(0), mi.Float(0)
+    )
+    total = mi.Float(0)  # light expected of all vertices so far
     is_past_gate = mi.Bool(False)  # all light still to be found comes too late; survived that roulette
 
     while dr.hint(alive, exclude=[built, scene, proposal_lasers, vpls, time_gate]):
@@ -149,11 +136,8 @@ def trace_subpaths(
         # reservoir sampling: of the vertices so far, each is chosen in proportion to its light
         total += lit
         pick = (lit > 0) & (generator.next_float32(alive) * total < lit)
-        position, normal = dr.select(pick, si.p, position), dr.select(pick, si.n, normal)
-        shading, shape = dr.select(pick, si.sh_frame.n, shading), dr.select(pick, si.shape, shape)
-        carried = dr.select(pick, leaving, carried)
-        chosen_opl, chosen_bounce = dr.select(pick, opl, chosen_opl), dr.select(pick, bounce, chosen_bounce)
-        expected = dr.select(pick, lit, expected)
+        found = SubpathVertex(si.p, si.n, mi.Normal3f(si.sh_frame.n), si.shape, leaving, opl, bounce, lit)
+        vertex = dr.select(pick, found, vertex)
 
         # ---- Sample the next direction -----------------------------------------------------------------------------
         if dr.hint(max_bounces is not None, mode="scalar"):
@@ -168,7 +152,7 @@ def trace_subpaths(
         origin = mi.Point3f(si.p)
         ray = mi.Ray3f(offset_origin(built, si, direction), direction)
 
-    return SubpathVertex(position, normal, shading, shape, carried, chosen_opl, chosen_bounce, expected, total)
+    return vertex, total
 
 
 def arriving(built: BuiltScene, laser: WallPoints, point: mi.Point3f, shading: mi.Normal3f) -> mi.Spectrum:
@@ -196,21 +180,7 @@ class SubpathPlan:
 def vpl_contributions(
     plan: SubpathPlan, params: LaunchParams, vpls: Vpls, proposal_lasers: ProposalLasers, seed: int
 ) -> VplContributions:
-    """Trace subpaths from ``vpls`` and return what the lasers of the batch send back along them.
-
-    Parameters
-    ----------
-    plan
-        Numbers of subpaths and contributions.
-    params
-        Scene and lasers.
-    vpls
-        Where the subpaths begin: of one replica after the other.
-    proposal_lasers
-        Lasers by which vertices are judged.
-    seed
-        Of the subpaths' random numbers.
-    """
+    """Trace subpaths from ``vpls``, one replica after the other, and return what the batch's lasers send back."""
     built = params.built
     surface = surface_at(built, vpls)
     reflectance = normal_reflectance(surface)
@@ -219,7 +189,7 @@ def vpl_contributions(
     time_gate = None
     if plan.capture_gate is not None:
         time_gate = plan.capture_gate.of_points(np.repeat(vpls.positions, plan.subpaths, axis=0))
-    ends = trace_subpaths(
+    ends, expected = trace_subpaths(
         built,
         dr.gather(mi.SurfaceInteraction3f, surface, vpl),
         dr.gather(mi.Spectrum, reflectance, vpl),
@@ -228,8 +198,8 @@ def vpl_contributions(
         time_gate,
         LaneRandomness.seeded(seed, dr.arange(mi.UInt32, dr.width(vpl))),
     )
-    dr.eval(ends)
-    subpath, copies, share = _resample(ends, vpls, plan, np.random.default_rng(seed))
+    dr.eval(ends, expected)
+    subpath, copies, share = _resample(expected.numpy(), vpls, plan, np.random.default_rng(seed))
     if not len(subpath):
         return no_contributions()
     end, scale = on_device(mi.UInt32, subpath), on_device(mi.Float, copies * share)
@@ -278,17 +248,14 @@ def _surface_of(ends: SubpathVertex, index: mi.UInt32) -> mi.SurfaceInteraction3
 
 
 def _resample(
-    ends: SubpathVertex, vpls: Vpls, plan: SubpathPlan, generator: np.random.Generator
+    expected: NDArray[np.float32], vpls: Vpls, plan: SubpathPlan, generator: np.random.Generator
 ) -> tuple[NDArray[np.int64], Float64, Float64]:
     """Choose subpaths in proportion to what they bring to the sensor points, by systematic resampling along the VPLs.
 
-    Returns
-    -------
-    tuple
-        Subpaths (n,) ascending, how often each was chosen, and the value of one choice: radiance per expected light.
+    Returns subpaths (n,) ascending, how often each was chosen, and a choice's value: radiance per expected light.
     """
     importance = np.repeat(vpls.importance, plan.subpaths)
-    weights = ends.total.numpy().astype(np.float64) * importance
+    weights = expected.astype(np.float64) * importance
     per_replica, count = plan.vpls * plan.subpaths, plan.contributions * plan.vpls
     subpaths, copies, shares = [np.zeros(0, np.int64)], [np.zeros(0)], [np.zeros(0)]
     for replica in range(plan.replicas):
