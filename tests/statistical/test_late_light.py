@@ -177,8 +177,7 @@ def test_without_survivors_no_light_comes_after_the_window(engine: str, scan: st
     stage = Stage.of(scene(ROOM, engine=engine, scan=scan, sensors=(1, 1), capture=LEGS, width=0.2))
     from nlosrender.engine.launch import time_gate as deadline
     from nlosrender.engine.path.engine import Budget
-    from nlosrender.engine.virtual_lights.vpls import sampler
-    from nlosrender.engine.virtual_lights.vpls import subpaths
+    from nlosrender.engine.virtual_lights.vpls import sampler, subpaths
 
     def outside_and_inside() -> tuple[float, float]:
         result = stage.seeded(3).render(stage.batch, Budget(**BUDGETS[engine]))

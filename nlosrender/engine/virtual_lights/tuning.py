@@ -144,10 +144,14 @@ class VirtualLightTuning:
     third_share_alone: float = 0.85
     third_share_of_many: float = 0.35  # beside paths: patches are cheaper than these
     rest_share_of_many: float = 0.88  # 0.35^2 + 0.88^2 = 0.90
-    third_shares: tuple[float, ...] = (0.65, 0.5, 0.35)  # beside VPLs: the one that costs least, (21)
+    # Beside VPLs: the one that costs least by (21). Target 1.5 %, each alone: plates 0.39 / 0.46 / 0.66 s CPU, room 3.6
+    # / 3.2 / 2.8 s; (21) takes 0.65 for both.
+    third_shares: tuple[float, ...] = (0.65, 0.5, 0.35)
+    # Room, target 1.5 %: 28 / 26 / 22 rounds, stated 1.1 / 1.1 / 1.2 % at 0.7 / 0.9 / 1.
     share_squares: float = 0.9
-    # A pilot of VPLs ends once its error is this many times the goal, or after so many rounds: it is extrapolated by 1
-    # / sqrt(rounds).
+    # A pilot of VPLs ends once its error is this many times the goal, or after so many rounds: it is extrapolated by
+    # 1 / sqrt(rounds). Plates and room, targets 3 and 0.5 %: the same rounds at 1 and 16, and at half and twice the
+    # lanes.
     max_pilot_error: float = 4.0
     max_pilot_rounds: int = 16
     pilot_lanes: int = 2048
