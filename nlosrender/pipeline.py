@@ -22,7 +22,7 @@ from nlosrender.files.capture_results import MISSED
 from nlosrender.files.file_kinds import CAPTURE
 from nlosrender.files.identity import capture_identity, files_read, identity_attributes
 from nlosrender.files.partial.partial_capture import PartialCapture
-from nlosrender.files.parts.part_attributes import part_attributes
+from nlosrender.files.parts.shards import part_attributes
 from nlosrender.files.provenance import provenance_attributes
 from nlosrender.rendering.dask_executor import render_on_cluster
 from nlosrender.rendering.dask_worker import Job

@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from nlosrender.capture.bounces import FILE_BOUNCES, LINE_OF_SIGHT, first_bounce_of
-from nlosrender.files.chunk_shape import CHUNK_SAMPLES, chunk_shape
-from nlosrender.files.layout import FRAMES, SCAN_TYPES, Float64
+from nlosrender.files.layout import CHUNK_SAMPLES, FRAMES, SCAN_TYPES, Float64, chunk_shape
 from nlosrender.scene.pose import Pose
 
 INT32_MAX = 2**31 - 1  # t is a 32-bit integer in the file
@@ -21,72 +20,35 @@ UNIT_TOLERANCE = 1e-6  # deviation of a normal's length from 1: float32 leaves 6
 class CaptureHeader:
     """Everything of a capture but its samples, in the local frame (wall in z = 0, normal +z) and float64.
 
-    Parameters
-    ----------
-    scan_type
-        ``single``, ``confocal``, ``exhaustive`` or ``line_of_sight``, whose sensor points are a camera's pixels.
-    sensor_positions, sensor_normals
-        (Ny, Nx, 3) sensor points [m] and unit normals.
-    laser_positions, laser_normals
-        (Ly, Lx, 3) laser points [m] and unit normals; (1, 1, 3) for ``single``, the sensor's for ``confocal``.
-    sensor_position, laser_position
-        (3,) where the sensor and the laser stand [m].
-    sensor_grid_size, laser_grid_size
-        (width, height) of the grids along the wall [m].
-    n_bins, bin_width_opl, start_opl
-        Time axis: number of bins, their width [m of optical path] and where bin 0 starts [m].
-    n_channels
-        1 (grey), 3 (red, green, blue) or 4 (Stokes components).
-    bounce_indices
-        For each in-memory bounce slot its index on the file's bounce axis (``BounceAxis.file_indices``).
-    max_bounces
-        Highest bounce rendered; None for no limit.
-    split_bounces
-        Whether bounces have indices of their own.
-    account_first_and_last_bounces
-        Whether optical path lengths include the legs laser -> wall and wall -> sensor.
-    hidden_bounds
-        ((3,), (3,)) lowest and highest corner of the hidden geometry [m]; None without hidden geometry.
-    pose
-        Pose of the local frame in the scene.
-    frame
-        Frame of the positions in the file: ``znlos`` or ``scene``.
-    planar_wall
-        Whether the relay wall is a plane.
-    shared_samples
-        Which samples have errors in common, in words: their variances may not be summed. Empty where none have.
-    chunk_samples
-        Samples of a chunk of the file at most.
-
     Raises
     ------
     ValueError
         A field is impossible or contradicts another one; the message starts with the field's name.
     """
 
-    scan_type: str
-    sensor_positions: Float64
-    sensor_normals: Float64
-    laser_positions: Float64
+    scan_type: str  # one of ``layout.SCAN_TYPES``; the sensor points of ``line_of_sight`` are a camera's pixels
+    sensor_positions: Float64  # (Ny, Nx, 3) sensor points [m]
+    sensor_normals: Float64  # (Ny, Nx, 3) unit normals there
+    laser_positions: Float64  # (Ly, Lx, 3) laser points [m]; (1, 1, 3) for ``single``, the sensor's for ``confocal``
     laser_normals: Float64
-    sensor_position: Float64
+    sensor_position: Float64  # (3,) where the sensor stands [m]
     laser_position: Float64
-    sensor_grid_size: tuple[float, float]
+    sensor_grid_size: tuple[float, float]  # width and height of the grid along the wall [m]
     laser_grid_size: tuple[float, float]
     n_bins: int
-    bin_width_opl: float
-    start_opl: float
-    n_channels: int
-    bounce_indices: tuple[int, ...]
-    max_bounces: int | None
-    split_bounces: bool
-    account_first_and_last_bounces: bool
-    hidden_bounds: tuple[Float64, Float64] | None
-    pose: Pose
-    frame: str = "znlos"
+    bin_width_opl: float  # m of optical path
+    start_opl: float  # where bin 0 starts [m of optical path]
+    n_channels: int  # 1 (grey), 3 (red, green, blue) or 4 (Stokes components)
+    bounce_indices: tuple[int, ...]  # of each in-memory bounce slot, on the file's bounce axis
+    max_bounces: int | None  # highest bounce rendered; None: no limit
+    split_bounces: bool  # whether bounces have indices of their own
+    account_first_and_last_bounces: bool  # whether path lengths include the legs laser -> wall and wall -> sensor
+    hidden_bounds: tuple[Float64, Float64] | None  # lowest and highest corner (3,) of the hidden geometry [m], if any
+    pose: Pose  # of the local frame in the scene
+    frame: str = "znlos"  # of the positions in the file, one of ``layout.FRAMES``
     planar_wall: bool = True
-    shared_samples: str = ""
-    chunk_samples: int = CHUNK_SAMPLES
+    shared_samples: str = ""  # which samples have errors in common, in words: their variances may not be summed
+    chunk_samples: int = CHUNK_SAMPLES  # of a chunk of the file at most
 
     def __post_init__(self) -> None:
         _require(self.scan_type in SCAN_TYPES, "scan_type", self.scan_type, f"one of {', '.join(SCAN_TYPES)}")

@@ -31,27 +31,13 @@ class CaptureResults:
 
 @dataclass(frozen=True)
 class SummedCapture:
-    """A render, or several that were put together.
-
-    Parameters
-    ----------
-    sums
-        Over all that was rendered.
-    bounces
-        Names of the bounces.
-    unsampled
-        Classes of paths whose light is missing.
-    zero_because
-        Why H is zero everywhere; empty where it is not.
-    unknown_from
-        The lowest bounce that light is missing of; None: of none.
-    """
+    """Sums over a render, or over several that were put together, and what is missing of it."""
 
     sums: Sums
     bounces: BounceAxis
-    unsampled: tuple[str, ...] = ()
-    zero_because: tuple[str, ...] = ()
-    unknown_from: int | None = None
+    unsampled: tuple[str, ...] = ()  # classes of paths whose light is missing
+    zero_because: tuple[str, ...] = ()  # why H is zero everywhere; empty where it is not
+    unknown_from: int | None = None  # the lowest bounce that light is missing of; None: of none
 
     @property
     def stated_error(self) -> float:

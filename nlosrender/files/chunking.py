@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from nlosrender.errors import RenderError
 from nlosrender.files import layout
 from nlosrender.files.capture_header import CaptureHeader
-from nlosrender.files.chunk_shape import cuts
+from nlosrender.files.layout import cuts
 
 COMPRESSIONS = ("gzip", "none")
 # ISA-L's encoder. Measured on captures, one core: 640 to 2000 MB/s where zlib's level 4 does 57 to 230 MB/s, for

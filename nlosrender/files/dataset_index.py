@@ -15,7 +15,7 @@ from nlosrender.files.atomic_write import replacing
 from nlosrender.files.attributes import json_object, text_list
 from nlosrender.files.capture_results import UNSAMPLED
 from nlosrender.files.file_kinds import INDEX
-from nlosrender.files.parts.part_attributes import PART
+from nlosrender.files.parts.shards import PART
 from nlosrender.files.reading.reader import read_header
 
 FORMAT_VERSION = 1

@@ -18,7 +18,7 @@ from nlosrender.errors import FileError
 from nlosrender.files import layout
 from nlosrender.files.attributes import get_attributes, json_object
 from nlosrender.files.identity import SELECTION, comparable_config, differences, listed
-from nlosrender.files.parts.part_attributes import PART
+from nlosrender.files.parts.shards import PART
 from nlosrender.files.reading.reader import open_hdf5
 
 START_BYTES = 16_384  # of a file, that tell what it is

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from nlosrender.files import layout
-from nlosrender.files.chunk_shape import chunk_shape
+from nlosrender.files.layout import chunk_shape
 from nlosrender.readable import readable_size
 
 SAMPLE_BYTES = 4  # float32

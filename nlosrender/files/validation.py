@@ -6,8 +6,9 @@ deviation.
 
 from __future__ import annotations
 
+import math
 from collections import deque
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -18,8 +19,7 @@ from nlosrender.capture.bounces import FILE_BOUNCES, LINE_OF_SIGHT, THIRD_BOUNCE
 from nlosrender.capture.bounces import FIRST_BOUNCE as FIRST
 from nlosrender.errors import FileError
 from nlosrender.files import layout
-from nlosrender.files.attributes import get_attributes
-from nlosrender.files.energy_check import wrong_energies
+from nlosrender.files.attributes import get_attributes, json_object
 from nlosrender.files.reading.reader import StoredCapture, explained_read, open_hdf5
 from nlosrender.files.reading.scan import read_scan
 from nlosrender.files.reading.stored_axes import BY_RANK, stored_axes
@@ -30,25 +30,19 @@ CLASSES = {layout.FLOAT: h5py.h5t.FLOAT, layout.INTEGER: h5py.h5t.INTEGER}
 WORDS = {h5py.h5t.FLOAT: "floating point", h5py.h5t.INTEGER: "integer"}
 NORMAL_TOLERANCE = 1e-5  # three float32 components: 1e-7, with room for other writers' float32 arithmetic
 PLANE_TOLERANCE = 1e-5  # m, a wall a few metres wide in float32
+# Energies are sums of float64 samples, which the file holds rounded to float32: by at most half a unit in the last of
+# 24 digits, or of the smallest denormal number. Twice that leaves room for the float64 sums themselves.
+ENERGY_TOLERANCE = 2.0**-23
+SMALLEST_FLOAT32 = 2.0**-149
 
 
 @dataclass(frozen=True)
 class FileCheck:
-    """What a file is, after all of it has been read.
+    """What a file is, after all of it has been read."""
 
-    Attributes
-    ----------
-    is_ours
-        Whether it says that this program wrote it; then every deviation from the layout is a violation.
-    violations
-        What makes the file wrong, or impossible to read right.
-    deviations
-        How a readable file by another writer differs from what this program writes; other loaders may mind.
-    """
-
-    is_ours: bool
-    violations: tuple[str, ...]
-    deviations: tuple[str, ...]
+    is_ours: bool  # whether this program wrote it, as it says; then every deviation from the layout is a violation
+    violations: tuple[str, ...]  # what makes the file wrong, or impossible to read right
+    deviations: tuple[str, ...]  # how a readable file by another writer differs from ours; other loaders may mind
 
 
 def check_file(path: str | Path) -> FileCheck:
@@ -254,3 +248,51 @@ def _stored_parts(samples: h5py.Dataset) -> list[tuple[slice, ...]]:
 
 def _listed(values: tuple[float, ...] | None) -> str:
     return " x ".join(f"{value:g}" for value in values or ())
+
+
+def wrong_energies(
+    samples: h5py.Dataset,
+    parts: Iterable[tuple[tuple[slice, ...], np.ndarray]],
+    attributes: Mapping[str, object],
+    data_attributes: Mapping[str, object],
+) -> list[str]:
+    """Return in which bounces the samples do not add up to the attribute ``energy``.
+
+    Parameters
+    ----------
+    samples, parts
+        Dataset ``data``; all samples in it that take space, once each, with their place.
+    attributes, data_attributes
+        Of the file and of ``data``; a file that states no energies is not judged.
+    """
+    stated = json_object(attributes.get("energy"))
+    indices = data_attributes.get("bounce_indices")
+    if not stated or not isinstance(indices, list):
+        return []
+    if len(stated) != len(indices):
+        return [f"attribute 'energy': {len(stated)} bounces, but bounce_indices of data has {len(indices)}"]
+    axis = layout.file_axes(samples.ndim == len(layout.CONFOCAL_AXES)).index("bounce")
+    total, magnitude = np.zeros((2, samples.shape[axis]))
+    # of Stokes components the intensity, as in the render
+    intensity_only = attributes.get("channels") == layout.STOKES
+    for part, stored in parts:
+        if intensity_only and part[0].start > 0:
+            continue
+        values = (stored[:1] if intensity_only else stored).astype(np.float64)
+        others = tuple(index for index in range(values.ndim) if index != axis)
+        total[part[axis]] += values.sum(axis=others)
+        magnitude[part[axis]] += np.abs(values).sum(axis=others)
+    count = samples.size / samples.shape[axis]
+    found = []
+    for index, (name, energy) in zip(indices, stated.items(), strict=True):
+        known = isinstance(index, int) and 0 <= index < len(total) and isinstance(energy, (int, float))
+        if (
+            not known
+            or not abs(total[index] - energy) <= ENERGY_TOLERANCE * magnitude[index] + count * SMALLEST_FLOAT32
+        ):
+            sums = f"{total[index]:.9g}" if known else "nothing"
+            found.append(f"data: bounce {name} adds up to {sums}, but the render summed up {energy} (attribute energy)")
+    for index in sorted(set(range(len(total))) - set(indices)):
+        if magnitude[index] > 0 or math.isnan(magnitude[index]):
+            found.append(f"data: holds light at bounce index {index}, where the render left none")
+    return found

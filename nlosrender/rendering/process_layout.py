@@ -19,18 +19,10 @@ MIN_PROCESS_BYTES = 1.5 * PROCESS_BYTES  # of a process, where the user sets no 
 
 @dataclass(frozen=True)
 class ProcessLayout:
-    """How many processes render a capture.
+    """How many processes render a capture."""
 
-    Parameters
-    ----------
-    workers
-        Processes that render, each one work item at a time; 0: this process does.
-    memory_shares
-        Processes that share ``render.memory_limit``; 1: each may take all of it.
-    """
-
-    workers: int = 0
-    memory_shares: int = 1
+    workers: int = 0  # processes that render, each one work item at a time; 0: this process does
+    memory_shares: int = 1  # processes that share ``render.memory_limit``; 1: each may take all of it
 
     def memory_limit(self, limit: int | None) -> int | None:
         """Return the limit of one process [bytes], from the user's for all that share it; None: none given.

@@ -17,7 +17,7 @@ from nlosrender.capture.time_axis import TimeAxis, resolve_time_axis
 from nlosrender.config.document import Config
 from nlosrender.engine.backend.start import Backend, batch_memory, physical_memory, start_backend
 from nlosrender.files.capture_header import CaptureHeader
-from nlosrender.files.chunk_shape import sensor_tile
+from nlosrender.files.layout import sensor_tile
 from nlosrender.rendering.process_layout import ONE_PROCESS, ProcessLayout
 from nlosrender.scene.surfaces import Surface, hidden_surfaces
 from nlosrender.scene.walls.wall import RelayWall

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from nlosrender.files import layout
-from nlosrender.files.chunk_shape import CHUNK_SAMPLES, chunk_shape, cuts, sensor_tile
+from nlosrender.files.layout import CHUNK_SAMPLES, chunk_shape, cuts, sensor_tile
 from nlosrender.scene.pose import Pose
 
 POSE = Pose.from_normal_up([4.0, -2.0, 0.5], [0.3, 0.2, 1.0], [0.0, 1.0, 0.1])

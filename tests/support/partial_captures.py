@@ -17,7 +17,7 @@ from nlosrender.files.capture_header import CaptureHeader
 from nlosrender.files.capture_results import SummedCapture
 from nlosrender.files.identity import identity_attributes
 from nlosrender.files.partial.partial_capture import PartialCapture
-from nlosrender.files.parts.part_attributes import part_attributes
+from nlosrender.files.parts.shards import part_attributes
 from nlosrender.files.provenance import provenance_attributes
 from nlosrender.files.sums import Sums, sums_of
 from nlosrender.files.validation import check_file

@@ -14,8 +14,8 @@ import h5py
 import numpy as np
 from numpy.typing import ArrayLike
 
-from nlosrender.files.chunk_shape import CHUNK_SAMPLES
 from nlosrender.files.hdf5_writer import HDF5Writer
+from nlosrender.files.layout import CHUNK_SAMPLES
 from nlosrender.files.reading.scan import Float32
 
 USER_BLOCK = 512  # bytes before HDF5's own

@@ -14,8 +14,7 @@ import numpy as np
 from nlosrender.constants import opl_to_seconds
 from nlosrender.errors import FileError, OptionError
 from nlosrender.files.export.mat73 import chunk_rows, new_mat73
-from nlosrender.files.export.rectification import Rectification, rectification
-from nlosrender.files.export.wall_order import SAME, OrderedCapture
+from nlosrender.files.export.wall_order import SAME, OrderedCapture, Rectification, rectification
 from nlosrender.files.layout import Float64
 from nlosrender.files.reading.scan import Float32, Scan
 

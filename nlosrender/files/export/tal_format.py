@@ -9,8 +9,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from nlosrender.files.export.rectification import Rectification, rectification
-from nlosrender.files.export.wall_order import OrderedCapture
+from nlosrender.files.export.wall_order import OrderedCapture, Rectification, rectification
 from nlosrender.files.hdf5_writer import HDF5Writer
 from nlosrender.files.layout import Float64
 from nlosrender.files.reading.reader import StoredCapture

@@ -39,16 +39,17 @@ from nlosrender.files.hdf5_writer import HDF5Writer
 from nlosrender.files.header_writer import add_attributes, create_capture
 from nlosrender.files.identity import differences, listed
 from nlosrender.files.partial.journal import Journal, claimed_journal
-from nlosrender.files.partial.stored_chunks import StoredChunks, stored_chunks
 from nlosrender.files.partial.work_item_log import (
     Closing,
     JournalState,
     RenderState,
     StoredChunk,
+    StoredChunks,
     WorkItemKey,
     closing_record,
     item_record,
     items_of,
+    stored_chunks,
 )
 from nlosrender.files.partial.work_item_state import NEW, ItemState, states_in
 from nlosrender.files.sums import Sums

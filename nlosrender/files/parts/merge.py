@@ -26,8 +26,7 @@ from nlosrender.files.file_kinds import CAPTURE, FileKind, same_capture
 from nlosrender.files.hdf5_writer import HDF5Writer
 from nlosrender.files.identity import SELECTION
 from nlosrender.files.partial.work_item_log import CHECKSUM_RANGE, placed_checksum
-from nlosrender.files.parts.part_attributes import CHECKSUMS, NOTE, PART, SUMS
-from nlosrender.files.parts.shards import Shard, read_shards
+from nlosrender.files.parts.shards import CHECKSUMS, NOTE, PART, SUMS, Shard, read_shards
 from nlosrender.files.reading.reader import explained_read, open_hdf5
 from nlosrender.files.sums import Sums
 from nlosrender.interruption import uninterrupted

@@ -2,24 +2,68 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 from itertools import groupby
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from nlosrender.capture.part import Part, Range, Tiling
+from nlosrender.capture.tile import joined
 from nlosrender.errors import FileError
 from nlosrender.files import layout
 from nlosrender.files.attributes import json_object
 from nlosrender.files.identity import PACKAGES, comparable_config, differences, listed
-from nlosrender.files.parts.part_attributes import StoredPart
+from nlosrender.files.partial.work_item_log import RenderState
 from nlosrender.files.reading.reader import open_capture
 from nlosrender.files.reading.stored_header import StoredHeader
+from nlosrender.files.sums import Sums
 
+PART, SUMS, CHECKSUMS, NOTE = "part", "part_sums", "part_checksums", "incomplete"
 MAX_PROBLEMS = 8  # in one message
 SAME = ("capture_hash", "variant", "replicas", "nlosrender_format_version")  # attributes that have to agree
+
+
+@dataclass(frozen=True)
+class StoredPart:
+    """Which part of a capture a file holds, its sums and checksums."""
+
+    part: Part
+    sums: Sums
+    checksum: Mapping[str, int]  # per dataset
+
+    @classmethod
+    def from_attributes(cls, attributes: Mapping[str, object]) -> StoredPart | None:
+        """Read it; None for a file that does not say that it is a part.
+
+        Raises
+        ------
+        ValueError
+            The attributes are damaged.
+        """
+        if PART not in attributes:
+            return None
+        try:
+            part, sums, checksum = (json.loads(str(attributes[name])) for name in (PART, SUMS, CHECKSUMS))
+            return cls(Part.from_json(part), Sums.from_json(sums), {str(k): int(v) for k, v in checksum.items()})
+        except (KeyError, TypeError, AttributeError, RecursionError) as error:
+            raise ValueError(f"the attributes {PART}, {SUMS}, {CHECKSUMS} are damaged: {error!r}") from error
+
+
+def part_attributes(part: Part, tiling: Tiling, finished: RenderState) -> dict[str, object]:
+    """Return the attributes of a file that holds a part of a capture."""
+    tiles = joined(tiling.cells(part.strips), tiling.ny * tiling.nx)
+    shown: dict[str, Any] = part.as_json() | {"sensor_tiles": [list(astuple(tile)) for tile in tiles]}
+    return {
+        PART: json.dumps(shown),
+        SUMS: json.dumps(finished.sums.as_json()),
+        CHECKSUMS: json.dumps(finished.checksum),
+        NOTE: "a part of a capture: laser points [first, last) counted row by row, and sensor tiles "
+        "[y0, y1, x0, x1) as in the attribute part; everything else is zero. nlosrender merge puts parts together",
+    }
 
 
 @dataclass(frozen=True)

@@ -28,24 +28,12 @@ BY_RANK = {
 
 @dataclass(frozen=True)
 class StoredAxes:
-    """The axes of ``data`` as h5py shows them.
+    """The axes of ``data`` as h5py shows them."""
 
-    Attributes
-    ----------
-    names
-        In-memory names, in the file's order.
-    row_major
-        Whether every dataset of the file has its axes in reverse order.
-    sizes
-        Length of every in-memory axis; 1 where the file has no such axis.
-    confocal
-        Whether laser and sensor points are the same. Else there are laser axes, or there is one laser point.
-    """
-
-    names: tuple[str, ...]
-    row_major: bool
-    sizes: Mapping[str, int]
-    confocal: bool
+    names: tuple[str, ...]  # in-memory names, in the file's order
+    row_major: bool  # whether every dataset of the file has its axes in reverse order
+    sizes: Mapping[str, int]  # length of every in-memory axis; 1 where the file has no such axis
+    confocal: bool  # laser and sensor points are the same; else there are laser axes, or there is one laser point
 
 
 def stored_axes(file: h5py.File, path: Path, samples: h5py.Dataset, attributes: Mapping[str, object]) -> StoredAxes:
