@@ -79,7 +79,7 @@ def write_frames(path: str | Path, output: str | Path, options: FrameOptions) ->
         Folder where pictures go: frame-00000.exr and so on, in place of those of an earlier run, steady.exr,
         steady.png; an animation is frames.gif. Or a name that ends in .gif, for an animation alone.
     options
-        Which.
+        Which pictures.
 
     Returns
     -------

@@ -54,7 +54,7 @@ ROW_LINES = 1200  # of the row over time: more than the picture has pixels
 
 def plot_capture(
     path: str | Path,
-    out_png: str | Path,
+    picture: str | Path,
     laser: tuple[int, int] | None = None,
     pixel: tuple[int, int] | None = None,
 ) -> Path:
@@ -62,19 +62,11 @@ def plot_capture(
 
     Parameters
     ----------
-    path
-        Capture file.
-    out_png
-        Picture to write: .png, .pdf or .svg.
-    laser
-        (row, column) of the laser point; the middle of the laser grid when omitted.
-    pixel
-        (row, column) of the sensor point whose histogram is shown; the brightest when omitted.
-
-    Returns
-    -------
-    Path
-        ``out_png``.
+    path, picture
+        Capture file; picture to write: .png, .pdf or .svg.
+    laser, pixel
+        (row, column) of the laser point, by default in the middle of its grid, and of the sensor point whose histogram
+        is shown, by default the brightest.
 
     Raises
     ------
@@ -83,7 +75,7 @@ def plot_capture(
     OptionError
         There is no such point, or pictures have no such format.
     """
-    picture = Path(out_png)
+    picture = Path(picture)
     if picture.suffix.lower() not in FORMATS:
         raise OptionError(f"--output: got {str(picture)!r}, need a name that ends in one of {', '.join(FORMATS)}")
     kind = PICTURES[picture.suffix.lower()]

@@ -29,17 +29,7 @@ class JsonOutput:
         return "--json" in options
 
     def print(self, content: Mapping[str, Any], exit_code: int = EXIT_OK, indent: int | None = None) -> None:
-        """Print the object: what a command found, with the exit code it will fail with.
-
-        Parameters
-        ----------
-        content
-            Plain values; numbers that are not finite become null, which is all that JSON knows of them.
-        exit_code
-            Added as ``exit_code`` unless it is 0.
-        indent
-            Spaces per level; None: one line.
-        """
+        """Print the object: plain values, and ``exit_code`` unless it is 0; numbers that are not finite become null."""
         import json
 
         import typer

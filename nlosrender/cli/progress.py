@@ -94,16 +94,7 @@ def _print_line(line: str) -> None:
 class ProgressLog:
     """Prints a line every few per cent and at least every minute; by a thread, since work items take minutes.
 
-    Parameters
-    ----------
-    label
-        What every line begins with.
-    write
-        Takes a line.
-    intervals
-        Between lines.
-    clock
-        Seconds since some moment.
+    ``write`` takes each line, which begins with ``label``; ``clock`` returns seconds since some moment.
     """
 
     def __init__(

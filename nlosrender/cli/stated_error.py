@@ -10,16 +10,9 @@ from typing import TypeGuard
 def stated_error_rows(
     error: float, unsampled: Sequence[str], zero_because: Sequence[str], remark: str = ""
 ) -> Iterator[tuple[str, str]]:
-    """Yield label and text: the stated error with a remark, and why it is not known.
+    """Yield label and text: the stated error, followed by ``remark``, and why it is not known.
 
-    Parameters
-    ----------
-    error
-        Relative L2 error of H; NaN: not known; inf: pure noise.
-    unsampled, zero_because
-        As in the report of a render.
-    remark
-        Follows the error.
+    ``error`` is the relative L2 error of H: NaN where it is not known, inf of pure noise; the rest as in RenderReport.
     """
     if unsampled:
         text = f"unknown: {len(unsampled)} class{'' if len(unsampled) == 1 else 'es'} of paths not sampled"

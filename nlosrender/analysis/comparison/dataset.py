@@ -44,14 +44,7 @@ def check_dataset(
 ) -> DatasetCheck:
     """Compare every capture below ``reference`` with that of the same relative path below ``folder``.
 
-    Parameters
-    ----------
-    folder, reference
-        Folders; captures are files named .hdf5 or .h5, at any depth, hidden ones excepted.
-    tolerances
-        Hold for every pair.
-    done
-        Called after each file.
+    Captures are files named .hdf5 or .h5, at any depth, hidden ones excepted; ``done`` is called after each.
 
     Raises
     ------

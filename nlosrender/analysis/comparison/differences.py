@@ -39,28 +39,17 @@ class WorstPlaces:
 
 
 class Differences:
-    """Sums over the blocks of two captures of the same structure, a (the new one) and b (the reference).
-
-    Attributes
-    ----------
-    energy_a, energy_b
-        (bounce,) sums of H [J m^-2 sr^-1].
-    squares_b, squares_bounce
-        (bounce,) sums of b^2 and of (a - b)^2.
-    squares_laser, squares_sensor, squares_bin
-        Sums of (a - b)^2 over all but (Ly, Lx), (Ny, Nx), (bin,).
-    largest
-        The sample with the largest |a - b|; None while there is no difference.
-    """
+    """Sums over the blocks of two captures of the same structure, a (the new one) and b (the reference)."""
 
     def __init__(self, header: StoredHeader):
         n_bounces = header.sizes["bounce"]
         lasers = (1, 1) if header.confocal else header.laser_grid
-        self.energy_a, self.energy_b = np.zeros(n_bounces), np.zeros(n_bounces)
-        self.squares_b, self.squares_bounce = np.zeros(n_bounces), np.zeros(n_bounces)
+        self.energy_a, self.energy_b = np.zeros(n_bounces), np.zeros(n_bounces)  # sums of H [J m^-2 sr^-1]
+        self.squares_b, self.squares_bounce = np.zeros(n_bounces), np.zeros(n_bounces)  # of b^2 and (a - b)^2
+        # of (a - b)^2 over all other axes
         self.squares_laser, self.squares_sensor = np.zeros(lasers), np.zeros(header.sensor_grid)
         self.squares_bin = np.zeros(header.n_bins)
-        self.largest: LargestDifference | None = None
+        self.largest: LargestDifference | None = None  # None while there is no difference
 
     def add(self, block: Block) -> None:
         """Take one block into the sums."""

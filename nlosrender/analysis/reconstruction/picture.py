@@ -30,23 +30,9 @@ def draw_reconstruction(
     silhouette: Float64 | None = None,
     score: Score | None = None,
 ) -> Path:
-    """Draw a reconstruction as a .png.
+    """Draw a reconstruction as a .png, outlined by the true front view ``silhouette`` (y, x); return ``path``.
 
-    Parameters
-    ----------
-    reconstruction
-        What to draw. The front is drawn as the wall sees it, so that letters facing the wall read as they should.
-    path
-        Picture to write.
-    silhouette
-        (y, x) true front view, outlined when given.
-    score
-        Written into the heading when given.
-
-    Returns
-    -------
-    Path
-        ``path``.
+    The front is drawn as the wall sees it, so that letters facing the wall read as they should.
 
     Raises
     ------

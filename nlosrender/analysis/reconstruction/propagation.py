@@ -45,34 +45,18 @@ class Refinement:
 
 @dataclass(frozen=True, eq=False)
 class Propagator:
-    """Propagates fields on ``lattice`` to voxels at coordinates ``x`` and ``y`` [m].
+    """Propagates fields on ``lattice`` to the voxels of planes parallel to it."""
 
-    Parameters
-    ----------
-    lattice
-        The points on the wall.
-    x, y
-        Coordinates of the voxels along the wall [m].
-    ways
-        Times the distance counts in the phase: 1 from sensor points; 2 for confocal captures, in which light goes the
-        same way forth and back (the wavenumber doubles).
-    """
-
-    lattice: Lattice
-    x: Float64
+    lattice: Lattice  # of the points on the wall
+    x: Float64  # of the voxels along the wall [m]
     y: Float64
-    ways: int = 1
+    ways: int = 1  # times the distance counts in the phase; 2 for confocal captures: light goes forth and back
     refinements: dict[int, Refinement] = field(default_factory=dict)
 
     def fields(self, spectra: Complex64, wavenumbers: Float64, z: float) -> Iterator[tuple[int, Complex64]]:
         """Yield (index of the wavenumber, field (..., voxel y, voxel x)) in the plane at ``z`` [m].
 
-        Parameters
-        ----------
-        spectra
-            (wavenumber, ..., Ny, Nx) at the lattice's points.
-        wavenumbers
-            (wavenumber,) equally spaced, ascending [rad/m].
+        ``spectra`` (wavenumber, ..., Ny, Nx) at the lattice's points; ``wavenumbers`` [rad/m] ascend in equal steps.
 
         Raises
         ------

@@ -24,21 +24,14 @@ MIN_BINS = 4  # bins in a default wavelength: a box that long passes 90 % of it
 class Pulse:
     """A virtual pulse.
 
-    Parameters
-    ----------
-    wavelength
-        Of the carrier [m], > 0.
-    cycles
-        Wavelengths within three standard deviations of the envelope on both sides, > 0.
-
     Raises
     ------
     OptionError
         A parameter is not a positive number.
     """
 
-    wavelength: float
-    cycles: float = DEFAULT_CYCLES
+    wavelength: float  # of the carrier [m]
+    cycles: float = DEFAULT_CYCLES  # wavelengths within ``REACH`` standard deviations of the envelope on both sides
 
     def __post_init__(self) -> None:
         for name in ("wavelength", "cycles"):

@@ -106,18 +106,7 @@ def reconstruct_capture(
     progress: Progress = lambda share: None,
     warn: Warn = lambda text: None,
 ) -> Reconstruction:
-    """Reconstruct the hidden scene of a capture.
-
-    Parameters
-    ----------
-    path
-        Capture file.
-    settings
-        What to do.
-    progress
-        Called with the share of the work done.
-    warn
-        Called with every warning, before the work begins where possible.
+    """Reconstruct the hidden scene of a capture; ``warn`` is called before the work begins where possible.
 
     Raises
     ------

@@ -28,14 +28,7 @@ SUBPIXELS = 4  # per voxel edge, for the share of a front pixel that is covered
 def true_silhouette(source: Path, attributes: Mapping[str, object], grid: VoxelGrid) -> Float64:
     """Return the share of each front pixel (y, x) that hidden geometry within the volume's depth covers.
 
-    Parameters
-    ----------
-    source
-        The capture file, for messages.
-    attributes
-        Of the capture file; ``config`` has the scene.
-    grid
-        Voxels of the reconstruction.
+    The scene is that of ``config`` among the ``attributes`` of the capture file ``source``.
 
     Raises
     ------

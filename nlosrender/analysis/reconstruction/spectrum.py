@@ -45,12 +45,8 @@ def spectra(
 
     Parameters
     ----------
-    light
-        (row, Nx, bin) histograms of one laser point.
-    rows
-        Which rows of the sensor grid they are.
-    laser
-        (row, column) of the laser point; (0, 0) for confocal captures.
+    light, rows, laser
+        (row, Nx, bin) histograms of some rows of the sensor grid, of one laser point; (0, 0) for confocal captures.
     box
         Of the volume; light that no voxel in it can send is left out.
     wavenumbers

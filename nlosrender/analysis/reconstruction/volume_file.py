@@ -30,23 +30,9 @@ def write_volume(
     silhouette: np.ndarray | None = None,
     attributes: dict[str, object] | None = None,
 ) -> Path:
-    """Write a reconstruction; the file appears whole or not at all.
+    """Write a reconstruction as HDF5, in place of an older one; the file appears whole or not at all; return ``path``.
 
-    Parameters
-    ----------
-    reconstruction
-        What to write.
-    path
-        HDF5 file; an existing reconstruction is replaced.
-    silhouette
-        (y, x) true front view, stored beside the volume when given.
-    attributes
-        Further attributes, such as a score.
-
-    Returns
-    -------
-    Path
-        ``path``.
+    ``silhouette`` is the true front view (y, x), ``attributes`` are further ones, such as a score.
 
     Raises
     ------

@@ -57,16 +57,12 @@ def voxel_grid(
 
     Parameters
     ----------
-    scan
-        Says where the hidden geometry is.
-    wavelength
-        Shortest length to be resolved [m]; the default margin follows it.
+    scan, wavelength
+        The capture; shortest length to be resolved [m], which the default margin follows.
     center, size
         (3,) middle and edges of the box [m], wall's frame; each by default the hidden geometry's.
-    voxels
-        Number of voxels along the longest edge.
-    voxel_size
-        Edge of a voxel [m], instead of ``voxels``.
+    voxels, voxel_size
+        Number of voxels along the longest edge, or edge of a voxel [m].
 
     Raises
     ------
@@ -98,13 +94,7 @@ def voxel_grid(
 def expected_box(
     scan: Scan, center: Sequence[float] | None = None, size: Sequence[float] | None = None
 ) -> Bounds | None:
-    """Return where the hidden scene is expected, before a wavelength is known; None when the file does not say.
-
-    Parameters
-    ----------
-    scan, center, size
-        As for ``voxel_grid``.
-    """
+    """Return the box of ``voxel_grid`` before a wavelength is known; None when the file does not say where it is."""
     if center is None or size is None:
         if scan.hidden_aabb is None:
             return None
