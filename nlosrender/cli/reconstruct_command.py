@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -97,13 +98,29 @@ def reconstruct(
 
         silhouette = true_silhouette(found.source, found.source_attributes, found.grid)
         scored = score_front_view(found.front_view(), silhouette)
-    written = [write_volume(found, volume_path, silhouette, _score_attributes(scored))]
+    attributes: dict[str, object] = {}
+    if scored is not None:
+        attributes = {"score_correlation": scored.correlation, "score_iou": scored.iou}
+    written = [write_volume(found, volume_path, silhouette, attributes)]
     if png:
         from nlosrender.analysis.reconstruction.picture import draw_reconstruction
 
         written.append(draw_reconstruction(found, picture_path, silhouette, scored))
     if as_json:
-        _print_json(found, scored, written)
+        report = {
+            "written": [str(path) for path in written],
+            "method": found.method,
+            "wavelength": found.wavelength,
+            "cycles": found.cycles,
+            "bounces": found.bounces,
+            "voxels": found.grid.shape[::-1],
+            "voxel_size": found.grid.voxel_size,
+            "volume": [corner.tolist() for corner in found.grid.bounds],
+            "seconds": found.seconds,
+            "warnings": found.warnings,
+            "score": None if scored is None else dataclasses.asdict(scored),
+        }
+        OUTPUT.print(report)
     elif not quiet:
         _print_report(found, scored, written)
 
@@ -115,29 +132,6 @@ def _lengths(text: str | None, option: str) -> tuple[float, ...] | None:
         return tuple(float(part) for part in text.split(","))
     except ValueError as error:
         raise typer.BadParameter(f"got {text!r}, need lengths in m such as 1,0.8,0.5", param_hint=option) from error
-
-
-def _score_attributes(score: Score | None) -> dict[str, object]:
-    return {} if score is None else {"score_correlation": score.correlation, "score_iou": score.iou}
-
-
-def _print_json(found: Reconstruction, score: Score | None, written: list[Path]) -> None:
-    import dataclasses
-
-    report = {
-        "written": [str(path) for path in written],
-        "method": found.method,
-        "wavelength": found.wavelength,
-        "cycles": found.cycles,
-        "bounces": found.bounces,
-        "voxels": found.grid.shape[::-1],
-        "voxel_size": found.grid.voxel_size,
-        "volume": [corner.tolist() for corner in found.grid.bounds],
-        "seconds": found.seconds,
-        "warnings": found.warnings,
-        "score": None if score is None else dataclasses.asdict(score),
-    }
-    OUTPUT.print(report)
 
 
 def _print_report(found: Reconstruction, score: Score | None, written: list[Path]) -> None:
