@@ -53,10 +53,7 @@ ROW_LINES = 1200  # of the row over time: more than the picture has pixels
 
 
 def plot_capture(
-    path: str | Path,
-    picture: str | Path,
-    laser: tuple[int, int] | None = None,
-    pixel: tuple[int, int] | None = None,
+    path: str | Path, picture: str | Path, laser: tuple[int, int] | None = None, pixel: tuple[int, int] | None = None
 ) -> Path:
     """Draw one laser point's part of a capture; only that part is read, a few rows at a time.
 

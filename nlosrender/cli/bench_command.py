@@ -13,8 +13,7 @@ from nlosrender.cli.options import AsJson, one_of, refuse_folder
 
 def bench(
     scene: Annotated[
-        list[str] | None,
-        typer.Option(metavar="NAME", help="Scene to race on; may be repeated.", show_default="all"),
+        list[str] | None, typer.Option(metavar="NAME", help="Scene to race on; may be repeated.", show_default="all")
     ] = None,
     part: Annotated[
         list[str] | None,
@@ -30,8 +29,7 @@ def bench(
         ),
     ] = None,
     peer: Annotated[
-        str | None,
-        typer.Option(metavar="COMMAND", help="Also race another renderer, see 'make bench-peers'."),
+        str | None, typer.Option(metavar="COMMAND", help="Also race another renderer, see 'make bench-peers'.")
     ] = None,
     output: Annotated[
         Path, typer.Option("-o", "--output", help="OUTPUT.json and OUTPUT.png are written.", readable=False)

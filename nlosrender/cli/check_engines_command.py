@@ -20,15 +20,13 @@ def check_engines(
         int, typer.Option("--points", metavar="N", min=1, max=16, help="Sensor points along each side of the grid.")
     ] = 4,
     target_error: Annotated[
-        float,
-        typer.Option(metavar="X", min=1e-6, max=1.0, help="Relative L2 error of H at which a technique stops."),
+        float, typer.Option(metavar="X", min=1e-6, max=1.0, help="Relative L2 error of H at which a technique stops.")
     ] = 0.01,
     seconds: Annotated[
         float, typer.Option("--seconds", metavar="S", min=0.1, help="Longest time of a technique, without set-up.")
     ] = 20.0,
     significance: Annotated[
-        float,
-        typer.Option(metavar="P", min=1e-9, max=0.5, help="Chance of an alarm where all techniques are right."),
+        float, typer.Option(metavar="P", min=1e-9, max=0.5, help="Chance of an alarm where all techniques are right.")
     ] = 0.01,
     as_json: AsJson = False,
 ) -> None:

@@ -15,14 +15,7 @@ import typer
 
 from nlosrender.capture.bounces import LINE_OF_SIGHT
 from nlosrender.cli.json_output import OUTPUT
-from nlosrender.cli.options import (
-    AsJson,
-    ConfigFile,
-    Overrides,
-    Quiet,
-    refuse_folder,
-    two_numbers,
-)
+from nlosrender.cli.options import AsJson, ConfigFile, Overrides, Quiet, refuse_folder, two_numbers
 from nlosrender.cli.progress import reporting
 from nlosrender.cli.tables import print_table
 from nlosrender.readable import readable_duration
@@ -70,12 +63,10 @@ def render(
         typer.Option(metavar="ADDRESS|FILE", help="dask: scheduler to use.", show_default="start one on this machine"),
     ] = None,
     workers: Annotated[
-        int | None,
-        typer.Option(min=1, help="dask: processes to start, or to wait for.", show_default="one per core"),
+        int | None, typer.Option(min=1, help="dask: processes to start, or to wait for.", show_default="one per core")
     ] = None,
     strict: Annotated[
-        bool,
-        typer.Option("--strict", help="Exit 3 before rendering where light is missing that no technique samples."),
+        bool, typer.Option("--strict", help="Exit 3 before rendering where light is missing that no technique samples.")
     ] = False,
     quiet: Quiet = False,
     as_json: AsJson = False,

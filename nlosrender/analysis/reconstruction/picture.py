@@ -25,10 +25,7 @@ BACKGROUND_SHARE = 0.5  # of the threshold between object and background below w
 
 
 def draw_reconstruction(
-    reconstruction: Reconstruction,
-    path: str | Path,
-    silhouette: Float64 | None = None,
-    score: Score | None = None,
+    reconstruction: Reconstruction, path: str | Path, silhouette: Float64 | None = None, score: Score | None = None
 ) -> Path:
     """Draw a reconstruction as a .png, outlined by the true front view ``silhouette`` (y, x); return ``path``.
 

@@ -40,11 +40,7 @@ def write_volume(
         The file cannot be written, or is the capture itself.
     """
     grid = reconstruction.grid
-    with (
-        replacing(path, VOLUME, [reconstruction.source]) as partial,
-        uninterrupted(),
-        HDF5Writer(partial) as hdf5,
-    ):
+    with replacing(path, VOLUME, [reconstruction.source]) as partial, uninterrupted(), HDF5Writer(partial) as hdf5:
         file = hdf5.file
         for name in AXES:
             file.create_dataset(name, data=getattr(grid, name))
