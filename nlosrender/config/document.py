@@ -13,7 +13,7 @@ from nlosrender.config.fields import Name
 from nlosrender.config.issues import WrongValueRead, mismatch, shown
 from nlosrender.config.mitsuba_xml import read_mitsuba_xml
 from nlosrender.config.plugin_check import config_folder
-from nlosrender.config.relay_wall import EDGE_TOLERANCE
+from nlosrender.config.relay_wall import EDGE_TOLERANCE, RectangleWallConfig
 from nlosrender.config.render import OutputConfig, RenderConfig
 from nlosrender.config.scene import SceneConfig
 from nlosrender.config.section import Section
@@ -84,17 +84,15 @@ class Config(Section):
             lacking = f"{mitsuba.name} has no perspective sensor with a whole film"
             yield ValidationIssue(path, f"missing, and {lacking}; need a camera, {example}")
 
-    def rule_line_of_sight_engine(self) -> Iterator[ValidationIssue]:
-        """Virtual lights are on a relay wall."""
-        if self.capture.is_line_of_sight and self.render.engine == "virtual_lights":
+    def rule_plain_paths(self) -> Iterator[ValidationIssue]:
+        """A camera has neither virtual lights, which are on a relay wall, nor a kernel in time."""
+        if not self.capture.is_line_of_sight:
+            return
+        if self.render.engine == "virtual_lights":
             message = "got virtual_lights, which need a relay wall; a line_of_sight capture needs auto or path."
             yield ValidationIssue(("render", "engine"), message)
-
-    def rule_temporal_kernel(self) -> Iterator[ValidationIssue]:
-        """A camera's bins are plain."""
-        width = self.render.temporal_kernel_opl
-        if self.capture.is_line_of_sight and width > 0:
-            message = mismatch(width, "0: a line_of_sight capture has plain bins")
+        if self.render.temporal_kernel_opl > 0:
+            message = mismatch(self.render.temporal_kernel_opl, "0: a line_of_sight capture has plain bins")
             yield ValidationIssue(("render", "temporal_kernel_opl"), message)
 
     # --- captures of a relay wall ---
@@ -113,25 +111,21 @@ class Config(Section):
             message += "one by one, as {type: mitsuba, shape: {...}, bsdf: {...}} or {type: mesh, ...}."
             yield ValidationIssue(("scene", "mitsuba"), message, "key")
 
-    def rule_polarized_engine(self) -> Iterator[ValidationIssue]:
-        """Only paths know polarisation."""
-        polarized_wall = self.render.polarized and not self.capture.is_line_of_sight
-        if polarized_wall and self.render.engine == "virtual_lights":
+    def rule_polarized(self) -> Iterator[ValidationIssue]:
+        """Polarised light is for paths from a point of a rectangle."""
+        if not self.render.polarized or self.capture.is_line_of_sight:
+            return
+        path: KeyPath = ("render", "polarized")
+        if self.render.engine == "virtual_lights":
             message = "got virtual_lights, which know no polarisation; with render.polarized need auto or path."
             yield ValidationIssue(("render", "engine"), message)
-
-    def rule_polarized_wall(self) -> Iterator[ValidationIssue]:
-        """Polarised light falls on a rectangle."""
-        wall = self.scene.relay_wall
-        if self.render.polarized and not self.capture.is_line_of_sight and wall and wall.type != "rectangle":
-            message = f"got true before a {wall.type} wall; polarised light needs a rectangle relay wall."
-            yield ValidationIssue(("render", "polarized"), message)
-
-    def rule_polarized_spot(self) -> Iterator[ValidationIssue]:
-        """Polarised light comes from a point."""
-        if self.render.polarized and self.capture.laser_spot_radius > 0 and not self.capture.is_line_of_sight:
+        if self.capture.laser_spot_radius > 0:
             message = "got true with a laser that has a spot; polarised light needs capture.laser_spot_radius: 0."
-            yield ValidationIssue(("render", "polarized"), message)
+            yield ValidationIssue(path, message)
+        wall = self.scene.relay_wall
+        if wall is not None and wall.type != "rectangle":
+            message = f"got true before a {wall.type} wall; polarised light needs a rectangle relay wall."
+            yield ValidationIssue(path, message)
 
     def rule_grids_on_the_wall(self) -> Iterator[ValidationIssue]:
         """Grids are no larger than the wall."""
@@ -159,23 +153,19 @@ class Config(Section):
             )
             yield ValidationIssue(("capture", "laser_point"), message)
 
-    def rule_laser_before_the_wall(self) -> Iterator[ValidationIssue]:
-        """The laser stands on the lit side of a flat wall."""
-        yield from self._behind_the_wall("laser_position")
-
-    def rule_sensor_before_the_wall(self) -> Iterator[ValidationIssue]:
-        """The sensor stands on the lit side of a flat wall."""
-        yield from self._behind_the_wall("sensor_position")
-
-    def _behind_the_wall(self, key: str) -> Iterator[ValidationIssue]:
-        wall, position = self.scene.relay_wall, getattr(self.capture, key)
-        if wall is None or wall.type != "rectangle" or position is None:
+    def rule_devices_before_the_wall(self) -> Iterator[ValidationIssue]:
+        """Laser and sensor stand on the lit side of a flat wall."""
+        wall = self.scene.relay_wall
+        if not isinstance(wall, RectangleWallConfig):
             return
-        height = wall.height_above(position)
-        if height <= 0:
-            where = f"{-height:.6g} m behind the relay wall" if height < 0 else "in the plane of the relay wall"
-            message = f"got {shown(position)}, {where}; need a point on the side its normal looks to."
-            yield ValidationIssue(("capture", key), message)
+        for key in ("laser_position", "sensor_position"):
+            with suppress(WrongValueRead):
+                position = getattr(self.capture, key)
+                height = 1.0 if position is None else wall.height_above(position)
+                if height <= 0:
+                    where = f"{-height:.6g} m behind the relay wall" if height else "in the plane of the relay wall"
+                    message = f"got {shown(position)}, {where}; need a point on the side its normal looks to."
+                    yield ValidationIssue(("capture", key), message)
 
     def rule_spot_on_the_wall(self) -> Iterator[ValidationIssue]:
         """A laser spot is on a rectangle."""

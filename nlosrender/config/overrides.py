@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import typing
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
+from nlosrender.config.document import Config
 from nlosrender.config.issues import Wrong, shown
-from nlosrender.config.text_keys import takes_text
+from nlosrender.config.section import Section, sections_in
 from nlosrender.config.yaml_tree import MAX_DEPTH, Document, Place, read_document
 from nlosrender.errors import ConfigError, KeyPath, ValidationIssue
 
@@ -58,6 +61,24 @@ def _value(parts: Sequence[str], key: str, text: str, place: str) -> Any:
     except ConfigError as error:
         raise ConfigError([ValidationIssue((key,), found.message, place=place) for found in error.issues]) from error
     return read.tree
+
+
+def takes_text(parts: Sequence[str]) -> bool:
+    """Return whether the value of a key, told by its parts from the root down, is a name, a text or a file."""
+    sections: list[type[Section]] = [Config]
+    annotations: list[Any] = []
+    for part in parts:
+        if not part.isdecimal():  # an item of a list is one of the sections that the list may hold
+            annotations = [
+                section.model_fields[part].annotation for section in sections if part in section.model_fields
+            ]
+            sections = [section for annotation in annotations for section in sections_in(annotation)]
+    return parts[-1] == "filename" or any(map(_is_text, annotations))  # Mitsuba's plugins have no schema here
+
+
+def _is_text(annotation: Any) -> bool:
+    of_items = typing.get_origin(annotation) in (dict, tuple)
+    return annotation in (str, Path) or (not of_items and any(map(_is_text, typing.get_args(annotation))))
 
 
 def put(document: Document, parts: Sequence[str], value: Any, place: Place) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from contextlib import suppress
 from typing import Annotated, Literal
 
 from pydantic import Field
@@ -11,7 +12,7 @@ from pydantic import Field
 from nlosrender.config.bsdf import WHITE_DIFFUSE, BsdfMapping
 from nlosrender.config.fields import Direction, Flag, Length, Point3
 from nlosrender.config.hidden_geometry import FromFile, MeshFilename
-from nlosrender.config.issues import shown
+from nlosrender.config.issues import WrongValueRead, shown
 from nlosrender.config.section import BY_TYPE, Section, pose_issues
 from nlosrender.config.vectors import height_above
 from nlosrender.errors import ValidationIssue
@@ -66,18 +67,14 @@ class SphereWallConfig(_Wall):
     height: Length | None = None
     """m, default height of the grids along the polar axis; null: the whole diameter"""
 
-    def rule_width(self) -> Iterator[ValidationIssue]:
-        """The default width of the grids is on the sphere."""
-        yield from self._too_large("width", self.width, self.extent[0])
-
-    def rule_height(self) -> Iterator[ValidationIssue]:
-        """The default height of the grids is on the sphere."""
-        yield from self._too_large("height", self.height, self.extent[1])
-
-    def _too_large(self, key: str, given: float | None, largest: float) -> Iterator[ValidationIssue]:
-        if given is not None and given > largest * (1 + EDGE_TOLERANCE):
-            message = f"got {shown(given)}, need at most {largest:.6g} m, the whole sphere's."
-            yield ValidationIssue((key,), message)
+    def rule_extent(self) -> Iterator[ValidationIssue]:
+        """The default extent of the grids is on the sphere."""
+        for key, largest in zip(("width", "height"), self.extent, strict=True):
+            with suppress(WrongValueRead):
+                given = getattr(self, key)
+                if given is not None and given > largest * (1 + EDGE_TOLERANCE):
+                    message = f"got {shown(given)}, need at most {largest:.6g} m, the whole sphere's."
+                    yield ValidationIssue((key,), message)
 
     @property
     def extent(self) -> tuple[float, float]:

@@ -1,10 +1,11 @@
-"""Keys that another value of a choice needs and the chosen one does not: left out before validation, and said.
+"""Keys without effect, which another value of a choice needs: left out before validation, and told in a warning.
 
 So ``--set capture.scan_type=confocal`` works on a file with a ``laser_point``, and a sweep may go over scan types.
 """
 
 from __future__ import annotations
 
+import copy
 import typing
 from collections.abc import Iterator, Mapping
 from typing import Any
@@ -14,30 +15,29 @@ from nlosrender.config.emitters import EmitterConfig
 from nlosrender.config.hidden_geometry import HiddenItemConfig
 from nlosrender.config.relay_wall import RelayWallConfig
 from nlosrender.config.render import RenderConfig
+from nlosrender.config.scene import SceneConfig
 from nlosrender.config.section import Section, sections_in, type_of
-from nlosrender.errors import KeyPath
 
 _SCANS = typing.get_args(ScanType)
 _OF_WALLS = ("single", "confocal", "exhaustive")
-_NEEDED_BY: dict[KeyPath, tuple[str, ...]] = {
-    ("capture", "laser_grid"): ("exhaustive",),
-    ("capture", "laser_point"): ("single",),
-    ("capture", "camera"): ("line_of_sight",),
-    ("scene", "emitters"): ("line_of_sight",),
-    ("capture", "laser_position"): _OF_WALLS,
-    ("capture", "sensor_position"): _OF_WALLS,
-    ("capture", "laser_energy"): _OF_WALLS,
-    ("capture", "laser_spot_radius"): _OF_WALLS,
-    ("render", "laser_sampling"): _OF_WALLS,
-    ("render", "hidden_geometry_sampling"): _OF_WALLS,
+_NEEDED_BY: dict[str, tuple[str, ...]] = {
+    "capture.laser_grid": ("exhaustive",),
+    "capture.laser_point": ("single",),
+    "capture.camera": ("line_of_sight",),
+    "scene.emitters": ("line_of_sight",),
+    "capture.laser_position": _OF_WALLS,
+    "capture.sensor_position": _OF_WALLS,
+    "capture.laser_energy": _OF_WALLS,
+    "capture.laser_spot_radius": _OF_WALLS,
+    "render.laser_sampling": _OF_WALLS,
+    "render.hidden_geometry_sampling": _OF_WALLS,
 }
-_SECTIONS: dict[str, type[Section]] = {"capture": CaptureConfig, "render": RenderConfig}
+_SECTIONS: dict[str, type[Section]] = {"scene": SceneConfig, "capture": CaptureConfig, "render": RenderConfig}
 # an item or a wall without them would stand elsewhere than its author thinks: they stay mistakes
 _PLACING = ("center", "translate", "rotate_deg", "scale")
-_NOTHING: tuple[object, ...] = (None, [], ())
 
 
-def without_unused_keys(raw: Mapping[str, Any]) -> tuple[dict[str, Any], tuple[str, ...]]:
+def without_unused_keys(raw: Mapping[str, Any]) -> tuple[dict[str, Any], list[str]]:
     """Return the values of a config that have an effect, and a sentence for each choice that leaves some without.
 
     Parameters
@@ -45,9 +45,16 @@ def without_unused_keys(raw: Mapping[str, Any]) -> tuple[dict[str, Any], tuple[s
     raw
         Not validated: whatever is wrong in it is left as it is. Values that are left out are not validated.
     """
-    kept = {key: {**value} if isinstance(value, Mapping) else value for key, value in raw.items()}
-    notes = [*_by_scan_type(kept), *_by_types(kept)]
-    return kept, tuple(notes)
+    kept = copy.deepcopy(dict(raw))
+    notes = [*_by_scan_type(kept)]
+    scene = kept.get("scene")
+    if isinstance(scene, dict):
+        notes += _by_type(scene.get("relay_wall"), RelayWallConfig, "scene.relay_wall")
+        for key, choice in (("hidden_geometry", HiddenItemConfig), ("emitters", EmitterConfig)):
+            items = scene.get(key)
+            for index, item in enumerate(items if isinstance(items, list) else ()):
+                notes += _by_type(item, choice, f"scene.{key}.{index}")
+    return kept, notes
 
 
 def _by_scan_type(kept: dict[str, Any]) -> Iterator[str]:
@@ -55,23 +62,22 @@ def _by_scan_type(kept: dict[str, Any]) -> Iterator[str]:
     scan = capture.get("scan_type") if isinstance(capture, dict) else None
     if not isinstance(capture, dict) or scan not in _SCANS:
         return
-    idle = [path for path, needed_by in _NEEDED_BY.items() if scan not in needed_by and _take(kept, path)]
+    unused = [key for key, needed_by in _NEEDED_BY.items() if scan not in needed_by and _take(kept, key)]
     if scan == "line_of_sight" and _is_no_film(capture.get("sensor_grid"), capture.get("camera")):
         del capture["sensor_grid"]
-        idle.append(("capture", "sensor_grid"))
-    if idle:
-        owners = {name for path in idle for name in _NEEDED_BY.get(path, _OF_WALLS)}
-        yield _note(idle, f"capture.scan_type: {scan}", [name for name in _SCANS if name in owners])
+        unused.append("capture.sensor_grid")
+    owners = {name for key in unused for name in _NEEDED_BY.get(key, _OF_WALLS)}
+    yield from _note(unused, f"capture.scan_type: {scan}", [name for name in _SCANS if name in owners])
 
 
-def _take(kept: dict[str, Any], path: KeyPath) -> bool:
+def _take(kept: dict[str, Any], path: str) -> bool:
     """Take a key out; return whether it said anything: null and the default say nothing."""
-    section, key = kept.get(str(path[0])), str(path[1])
+    name, key = path.split(".")
+    section = kept.get(name)
     if not isinstance(section, dict) or key not in section:
         return False
     value = section.pop(key)
-    known = _SECTIONS.get(str(path[0]))
-    return value not in _NOTHING and not (known and value == known.model_fields[key].default)
+    return value not in (None, [], (), _SECTIONS[name].model_fields[key].default)
 
 
 def _is_no_film(grid: Any, camera: Any) -> bool:
@@ -82,34 +88,16 @@ def _is_no_film(grid: Any, camera: Any) -> bool:
     return given != {"nx": camera.get("width"), "ny": camera.get("height")}
 
 
-def _by_types(kept: dict[str, Any]) -> Iterator[str]:
-    """Leave out the keys of other types of walls, items and emitters."""
-    scene = kept.get("scene")
-    if not isinstance(scene, dict):
-        return
-    if isinstance(scene.get("relay_wall"), Mapping):
-        scene["relay_wall"], notes = _of_type(scene["relay_wall"], RelayWallConfig, ("scene", "relay_wall"))
-        yield from notes
-    for key, choice in (("hidden_geometry", HiddenItemConfig), ("emitters", EmitterConfig)):
-        items = scene.get(key)
-        if isinstance(items, (list, tuple)):
-            found = [_of_type(item, choice, ("scene", key, index)) for index, item in enumerate(items)]
-            scene[key] = [item for item, _ in found]
-            for _, notes in found:
-                yield from notes
-
-
-def _of_type(item: Any, choice: Any, path: KeyPath) -> tuple[Any, list[str]]:
+def _by_type(item: Any, choice: Any, path: str) -> Iterator[str]:
+    """Take the keys of other types of walls, items and emitters out."""
     fields = fields_by_type(choice)
-    chosen = item.get("type") if isinstance(item, Mapping) else None
+    chosen = item.get("type") if isinstance(item, dict) else None
     if not isinstance(chosen, str) or chosen not in fields:
-        return item, []
-    others = {key for name in fields for key in fields[name]} - fields[chosen]
+        return
+    others = set().union(*fields.values()) - fields[chosen]
     gone = [key for key in item if key in others and (item[key] is None or key not in _PLACING)]
-    idle = [(*path, key) for key in gone if item[key] is not None]
-    kept = {key: value for key, value in item.items() if key not in gone}
-    owners = [name for name in fields if any(key in fields[name] for key in gone)]
-    return kept, [_note(idle, f"{'.'.join(map(str, path))}.type: {chosen}", owners)] if idle else []
+    unused = [f"{path}.{key}" for key in gone if item.pop(key) is not None]
+    yield from _note(unused, f"{path}.type: {chosen}", [name for name in fields if not fields[name].isdisjoint(gone)])
 
 
 def fields_by_type(choice: Any) -> dict[str, set[str]]:
@@ -117,9 +105,7 @@ def fields_by_type(choice: Any) -> dict[str, set[str]]:
     return {type_of(member): {*member.model_fields} for member in sections_in(typing.get_args(choice)[0])}
 
 
-def _note(idle: list[KeyPath], choice: str, others: list[str]) -> str:
-    keys = ", ".join(".".join(map(str, path)) for path in idle)
-    verb = "has" if len(idle) == 1 else "have"
-    return (
-        f"{keys} {verb} no effect with {choice}; {'it is' if len(idle) == 1 else 'they are'} for {', '.join(others)}."
-    )
+def _note(unused: list[str], choice: str, owners: list[str]) -> Iterator[str]:
+    verb, they = ("has", "it is") if len(unused) == 1 else ("have", "they are")
+    if unused:
+        yield f"{', '.join(unused)} {verb} no effect with {choice}; {they} for {', '.join(owners)}."

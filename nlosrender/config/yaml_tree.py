@@ -17,12 +17,8 @@ from pathlib import Path
 from typing import Any, Literal
 
 import yaml
-from yaml.composer import Composer
 from yaml.nodes import MappingNode, Node, ScalarNode, SequenceNode
-from yaml.parser import Parser
-from yaml.reader import Reader, ReaderError
-from yaml.resolver import BaseResolver
-from yaml.scanner import Scanner
+from yaml.reader import ReaderError
 
 from nlosrender.config.encodable import joined
 from nlosrender.config.issues import Wrong, shown
@@ -95,17 +91,11 @@ class Document:
         return f"{self.source}:1:1"
 
 
-class _Composer(Reader, Scanner, Parser, Composer, BaseResolver):
+class _Composer(yaml.BaseLoader):
     """PyYAML's composer with the scalars of YAML 1.2 and a bound on depth and size."""
 
-    def __init__(self, text: str):
-        Reader.__init__(self, text)
-        Scanner.__init__(self)
-        Parser.__init__(self)
-        Composer.__init__(self)
-        BaseResolver.__init__(self)
-        self._depth = 0
-        self._n_nodes = 0
+    _depth = 0
+    _n_nodes = 0
 
     def compose_node(self, parent: Node | None, index: Any) -> Node | None:
         self._depth += 1
@@ -162,10 +152,12 @@ def read_document(text: str, source: str, folder: Path = Path()) -> Document:
     """
     if len(text.encode("utf-8", "surrogatepass")) > MAX_BYTES:
         raise ConfigError.of_file(source, f"larger than {MAX_BYTES // 1024} KiB, which no configuration needs.")
+    document = Document(source, Path(folder).absolute(), _default_name(source))
     try:
         node = _Composer(text).get_single_node()
         if node is not None:
-            _check_growth(node)
+            document.places[()] = Place(_at(node, source), _at(node, source))
+            document.tree = _Builder(document).build(node, ())
     except yaml.MarkedYAMLError as error:
         raise ConfigError(syntax_issue(error, source)) from error
     except ReaderError as error:
@@ -173,10 +165,6 @@ def read_document(text: str, source: str, folder: Path = Path()) -> Document:
         place = f"{source}:{before.count(chr(10)) + 1}:{len(before) - before.rfind(chr(10))}"
         message = f"character U+{error.character:04X} may not stand in YAML; remove it."
         raise ConfigError.of_file(place, message) from error
-    document = Document(source, Path(folder).absolute(), _default_name(source))
-    if node is not None:
-        document.places[()] = Place(_at(node, source), _at(node, source))
-        document.tree = _Builder(document).build(node, ())
     return document
 
 
@@ -186,71 +174,56 @@ def _default_name(source: str) -> str:
     return "".join(letters).strip() or "capture"
 
 
-def _check_growth(root: Node) -> None:
-    """Count the nodes every alias written out would give, without writing them out.
-
-    Each node is visited once: an alias can only name an earlier node, whose count is then known.
-    """
-    sizes: dict[int, tuple[int, int] | None] = {}  # id -> (nodes, levels); None while it is being counted
-
-    def measure(node: Node) -> tuple[int, int]:
-        if id(node) in sizes:
-            known = sizes[id(node)]
-            if known is None:
-                message = "an alias inside its own anchor never ends"
-                raise yaml.MarkedYAMLError(problem=message, problem_mark=node.start_mark)
-            return known
-        sizes[id(node)] = None
-        n_nodes, levels = 1, 1
-        for child in _children(node):
-            n_child, child_levels = measure(child)
-            n_nodes, levels = n_nodes + n_child, max(levels, child_levels + 1)
-        if n_nodes > MAX_NODES or levels > MAX_DEPTH:
-            message = f"aliases grow it beyond {MAX_NODES} values or {MAX_DEPTH} levels"
-            raise yaml.MarkedYAMLError(problem=message, problem_mark=node.start_mark)
-        sizes[id(node)] = (n_nodes, levels)
-        return n_nodes, levels
-
-    measure(root)
-
-
-def _children(node: Node) -> list[Node]:
-    if isinstance(node, MappingNode):
-        return [child for pair in node.value for child in pair]
-    return list(node.value) if isinstance(node, SequenceNode) else []
-
-
 def _at(node: Node, source: str) -> str:
     return f"{source}:{node.start_mark.line + 1}:{node.start_mark.column + 1}"
 
 
 class _Builder:
-    """Turns nodes into values, noting places and issues in the document."""
+    """Turns nodes into values, writing aliases out, and notes places and issues in the document."""
 
     def __init__(self, document: Document):
         self.document = document
+        self._open: list[Node] = []  # nodes that are being built, each inside the one before
+        self._n_nodes = 0  # keys and values so far
 
     def build(self, node: Node, path: KeyPath) -> Any:
-        """Return the value of ``node`` at ``path``."""
+        """Return the value of ``node`` at ``path``.
+
+        Raises
+        ------
+        yaml.MarkedYAMLError
+            Aliases have made it too large.
+        """
+        self._n_nodes += 1
+        if any(node is outer for outer in self._open):
+            message = "an alias inside its own anchor never ends"
+            raise yaml.MarkedYAMLError(problem=message, problem_mark=node.start_mark)
+        if self._n_nodes > MAX_NODES or len(self._open) == MAX_DEPTH:
+            message = f"aliases grow it beyond {MAX_NODES} values or {MAX_DEPTH} levels"
+            raise yaml.MarkedYAMLError(problem=message, problem_mark=node.start_mark)
         if node.tag not in _KNOWN_TAGS:
             known = "only plain values, lists and mappings"
             return self._unread(node, path, f"tag {node.tag.replace(_TAG, '!!')} is not allowed, {known}.")
         if isinstance(node, ScalarNode):
             return self._scalar(node, path)
-        if isinstance(node, SequenceNode):
-            items = []
-            for index, item in enumerate(node.value):
-                place = _at(item, self.document.source)
-                self.document.places[(*path, index)] = Place(place, place)
-                items.append(self.build(item, (*path, index)))
-            return items
-        return self._mapping(node, path)
+        self._open.append(node)
+        value = self._list(node, path) if isinstance(node, SequenceNode) else self._mapping(node, path)
+        self._open.pop()
+        return value
+
+    def _list(self, node: Node, path: KeyPath) -> list[Any]:
+        items = []
+        for index, item in enumerate(node.value):
+            place = _at(item, self.document.source)
+            self.document.places[(*path, index)] = Place(place, place)
+            items.append(self.build(item, (*path, index)))
+        return items
 
     def _mapping(self, node: Node, path: KeyPath) -> dict[str, Any]:
         values: dict[str, Any] = {}
         source = self.document.source
-        merged = [value for key, value in node.value if _is_merge(key)]
         for key_node, value_node in node.value:
+            self._n_nodes += 1
             if _is_merge(key_node):
                 continue
             if not isinstance(key_node, ScalarNode) or key_node.tag != _TAG + "str":
@@ -264,20 +237,20 @@ class _Builder:
                 continue
             self.document.places[at] = Place(_at(key_node, source), _at(value_node, source))
             values[key] = self.build(value_node, at)
-        for value in merged:
-            self._merge(value, path, values)
+        for key_node, value_node in node.value:
+            if _is_merge(key_node):
+                self._merge(value_node, path, values)
         return values
 
     def _merge(self, node: Node, path: KeyPath, values: dict[str, Any]) -> None:
         """Add what ``<<: *anchor`` brings; keys of the mapping itself, and of earlier anchors, win."""
-        parts = node.value if isinstance(node, SequenceNode) else [node]
-        for part in parts:
+        for part in node.value if isinstance(node, SequenceNode) else [node]:
             if not isinstance(part, MappingNode):
                 self._note(part, path, "got no mapping after <<, need the alias of a mapping or a list of them.")
                 continue
-            # Only new keys are built: places of keys that win must stay.
-            fresh = MappingNode(part.tag, [p for p in part.value if p[0].value not in values], part.start_mark)
-            values.update(self._mapping(fresh, path))
+            # only new keys are built: places of keys that win must stay
+            new = [pair for pair in part.value if str(pair[0].value) not in values]
+            values.update(self.build(MappingNode(_TAG + "map", new, part.start_mark), path))
 
     def _scalar(self, node: ScalarNode, path: KeyPath) -> Any:
         text, kind = node.value, node.tag.removeprefix(_TAG)
