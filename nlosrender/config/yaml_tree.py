@@ -152,7 +152,7 @@ def read_document(text: str, source: str, folder: Path = Path()) -> Document:
     """
     if len(text.encode("utf-8", "surrogatepass")) > MAX_BYTES:
         raise ConfigError.of_file(source, f"larger than {MAX_BYTES // 1024} KiB, which no configuration needs.")
-    document = Document(source, Path(folder).absolute(), _default_name(source))
+    document = Document(source, folder, _default_name(source))
     try:
         node = _Composer(text).get_single_node()
         if node is not None:
