@@ -56,10 +56,15 @@ class ShapeDescription:
         The box of a transformed shape is that of its transformed box: it may be larger than the shape.
         """
         box = _object_bounds(self.description)
-        if box is None:
-            return None
-        to_world = np.asarray(self.description.get("to_world", np.eye(4)), dtype=np.float64)
-        return bounds_of(box_corners(box) @ to_world[:3, :3].T + to_world[:3, 3])
+        return None if box is None else bounds_of(box_corners(box) @ self._to_world[:3, :3].T + self._to_world[:3, 3])
+
+    def transformed(self, matrix: Float64) -> ShapeDescription:
+        """Return the shape under an affine map, a (4, 4) matrix."""
+        return ShapeDescription({**self.description, "to_world": matrix @ self._to_world})
+
+    @property
+    def _to_world(self) -> Float64:
+        return np.asarray(self.description.get("to_world", np.eye(4)), dtype=np.float64)
 
 
 @dataclass(frozen=True, eq=False)
@@ -170,7 +175,7 @@ def _pictured(item: SphereConfig | CylinderConfig, frame: Pose) -> ShapeDescript
         towards, up = -axes[:, 2], axes[:, 1]
     pose = Pose.from_normal_up(item.center, towards, up).seen_from(frame)
     plugin = round_plugin(item.radius, height, inside=item.inside, turned=item.inside)
-    return ShapeDescription({**plugin, "to_world": pose.matrix() @ np.asarray(plugin["to_world"])})
+    return ShapeDescription(plugin).transformed(pose.matrix())
 
 
 def _object_bounds(description: Mapping[str, object]) -> Bounds | None:

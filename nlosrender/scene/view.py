@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from nlosrender.config.emitters import PointLamp, SpotLamp
 from nlosrender.errors import ConfigError
-from nlosrender.scene.bounding_box import Bounds, box_corners, joined_bounds
+from nlosrender.scene.bounding_box import Bounds, bounds_of, box_corners, joined_bounds
 from nlosrender.scene.build import EngineScene, count_triangles
 from nlosrender.scene.loading.materials import check_surface, medium_warnings, mitsuba_spectrum
 from nlosrender.scene.loading.mitsuba_shapes import load_surface, shape_bounds
@@ -112,12 +112,8 @@ def _wall_surface(wall: RelayWall, bsdf: Mapping[str, object], frame: Pose) -> S
     """Return a relay wall as any other surface, in the engine's frame."""
     description = wall.shape_description()
     to_frame = frame.inverse_matrix() @ wall.pose.matrix()
-    shape: TriangleMesh | ShapeDescription
-    if isinstance(description, TriangleMesh):
-        shape = description.transformed(to_frame)
-    else:
-        to_world = to_frame @ np.asarray(description.get("to_world", np.eye(4)))
-        shape = ShapeDescription({**description, "to_world": to_world})
+    item = description if isinstance(description, TriangleMesh) else ShapeDescription(description)
+    shape = item.transformed(to_frame)
     return Surface("relay_wall", "scene.relay_wall", shape, upright_bsdf(description, bsdf))
 
 
@@ -178,7 +174,4 @@ def _unit_length(boxes: Sequence[Bounds | None], points: Sequence[Float64]) -> f
 
 
 def _in_frame_of(plane: ImagePlane, frame: Pose, box: Bounds | None) -> Bounds | None:
-    if box is None:
-        return None
-    corners = plane.pose.to_local(frame.to_scene(box_corners(box)))
-    return corners.min(axis=0), corners.max(axis=0)
+    return None if box is None else bounds_of(plane.pose.to_local(frame.to_scene(box_corners(box))))

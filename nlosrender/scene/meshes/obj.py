@@ -68,23 +68,17 @@ def read_obj(content: bytes) -> FileMesh:
 def _numbers(text: ObjLines, kind: bytes) -> Float64:
     """Return the numbers of all lines of one kind, (lines, 2 or 3); zero where they may be left away."""
     n_needed, n_read = _KINDS[kind]
-    rows = text.rows(kind)
-    lines = [text.lines[row] for row in rows]
-    if not lines:
-        return np.zeros((0, n_read))
-    width = len(lines[0].split()) - 1
+    lines = [text.lines[row] for row in text.rows(kind)]
+    counts = np.array([len(line.split()) - 1 for line in lines], dtype=np.int64)
     values = _parsed(lines, np.float64)
-    if width >= n_read and len(values) == width * len(lines) and all(len(line.split()) == width + 1 for line in lines):
-        return values.reshape(-1, width)[:, :n_read]
-    found = np.zeros((len(lines), n_read))
-    for row, line in enumerate(lines):
-        numbers = _parsed([line], np.float64)
-        if len(numbers) < n_needed or len(numbers) != len(line.split()) - 1:
-            raise ValueError(
-                f"{text.place(rows[row])}: need {n_needed} numbers after {kind.decode()}, got {shown(line)}"
-            )
-        found[row, : len(numbers)] = numbers[:n_read]
-    return found
+    if len(values) != counts.sum() or counts.min(initial=n_needed) < n_needed:
+        for row, line, count in zip(text.rows(kind), lines, counts, strict=True):
+            if count < n_needed or len(_parsed([line], np.float64)) != count:
+                needed = f"need {n_needed} numbers after {kind.decode()}, got {shown(line)}"
+                raise ValueError(f"{text.place(row)}: {needed}")
+    column = np.arange(n_read)
+    at = np.minimum((np.cumsum(counts) - counts)[:, None] + column, len(values) - 1)
+    return np.where(column < counts[:, None], values[at], 0.0)
 
 
 def _parsed(lines: Sequence[bytes], dtype: type) -> NDArray:
