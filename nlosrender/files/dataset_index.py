@@ -40,24 +40,13 @@ class IndexEntry:
     unsampled_paths: Sequence[str] = ()  # classes of paths whose light is missing
 
 
-def stored_entry(index: int, path: Path, folder: Path, values: Mapping[str, Any], capture_hash: str) -> IndexEntry:
-    """Return the entry of a capture by what its file says; ``pending`` unless the file holds all of this capture.
-
-    Parameters
-    ----------
-    index, values
-        Of the capture.
-    path, folder
-        The file, and the folder of the index.
-    capture_hash
-        What the file has to say that it holds.
-    """
-    entry = IndexEntry(index, relative_name(path, folder), values, "pending", capture_hash)
+def stored_entry(entry: IndexEntry, path: Path) -> IndexEntry:
+    """Return a pending entry completed by what its file says; as it is, unless the file holds all of this capture."""
     try:
         attributes = read_header(path).attributes
     except FileError:  # missing, or no capture: to be rendered
         return entry
-    if attributes.get("capture_hash") != capture_hash or PART in attributes:
+    if attributes.get("capture_hash") != entry.capture_hash or PART in attributes:
         return entry
     error, stored = attributes.get("error_estimate"), attributes.get("config_hash")
     return replace(

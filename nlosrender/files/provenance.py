@@ -64,10 +64,10 @@ def provenance_attributes(
     return attributes
 
 
-def package_versions() -> dict[str, str]:
-    """Return the versions of this program and what its numbers depend on, without importing any of it."""
+def package_versions(packages: Sequence[str] = PACKAGES) -> dict[str, str]:
+    """Return the versions of Python and of ``packages``, this program among them, without importing any."""
     versions = {"python": platform.python_version()}
-    for package in PACKAGES:
+    for package in packages:
         try:
             versions[package] = version(package)
         except PackageNotFoundError:

@@ -58,13 +58,13 @@ class _Dataset:
             with explained_write(folder):
                 folder.mkdir(parents=True, exist_ok=True)
 
-    def look(self, index: int) -> IndexEntry:
-        """Note and return what there is of a capture."""
-        sweep = self.sweep
+    def look(self, index: int, anew: bool = False) -> IndexEntry:
+        """Note and return what there is of a capture; with ``anew`` nothing counts."""
+        sweep, path = self.sweep, self.sweep.paths[index]
         expected = capture_hash(config_to_dict(sweep.config(index)))
-        entry = stored_entry(index, sweep.paths[index], self.folder, sweep.values(index), expected)
-        self.entries[index] = entry
-        return entry
+        entry = IndexEntry(index, relative_name(path, self.folder), sweep.values(index), "pending", expected)
+        self.entries[index] = entry if anew else stored_entry(entry, path)
+        return self.entries[index]
 
     def refuse_others(self, indices: Sequence[int], overwrite: bool) -> None:
         """Make sure that the captures replace nothing but themselves: before the first one, not hours later.
@@ -82,11 +82,6 @@ class _Dataset:
             config = config_to_dict(self.sweep.config(index))
             kind = CAPTURE if overwrite else same_capture(self.entries[index].capture_hash, str(WHOLE), config)
             kind.refuse_others(path, target)
-
-    def forget(self) -> None:
-        """Note that everything is to be rendered anew."""
-        for index, entry in self.entries.items():
-            self.entries[index] = IndexEntry(index, entry.file, entry.values, "pending", entry.capture_hash)
 
     def write(self, at_once: bool = False) -> None:
         """Write the index, unless that was done a moment ago."""
@@ -138,14 +133,9 @@ def render_sweep(
     begun = time.perf_counter()
     dataset = _Dataset(sweep, shard)
     dataset.prepare()
-    for index in dataset.chosen:
-        dataset.look(index)
-    there = [index for index in dataset.chosen if dataset.entries[index].status == "done"]
+    there = [index for index in dataset.chosen if dataset.look(index, anew=resume is False).status == "done"]
     if resume and not there and not any(partial_folder(sweep.paths[i].resolve()).exists() for i in dataset.chosen):
         raise FileError(f"{dataset.folder}: holds nothing of this sweep to resume. Leave --resume away to begin.")
-    if resume is False:
-        there = []
-        dataset.forget()
     todo = sorted(set(dataset.chosen) - set(there))
     dataset.refuse_others(todo, overwrite=resume is False)
     dataset.write(at_once=True)

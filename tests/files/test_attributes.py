@@ -99,9 +99,8 @@ def test_provenance_refuses_local_times() -> None:
         provenance_attributes({}, "abc", created=datetime(2030, 5, 4))
 
 
-def test_versions_of_what_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_versions_of_what_is_missing() -> None:
     """A package that is not installed is said to be so."""
-    monkeypatch.setattr("nlosrender.files.provenance.PACKAGES", ("numpy", "no-such-package"))
-    versions = package_versions()
+    versions = package_versions(("numpy", "no-such-package"))
     assert versions["no-such-package"] == "not installed"
     assert versions["numpy"] == np.__version__

@@ -14,6 +14,7 @@ that the order of a capture's rows does not show.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -21,7 +22,7 @@ from nlosrender.errors import OptionError
 from nlosrender.files.atomic_write import replacing
 from nlosrender.files.export.mat_formats import write_fk, write_lct, write_learned, write_phasor_mat
 from nlosrender.files.export.tal_format import write_tal
-from nlosrender.files.export.wall_order import OrderedCapture, ordered_capture
+from nlosrender.files.export.wall_order import ordered_capture
 from nlosrender.files.file_kinds import MAT, TAL, FileKind
 from nlosrender.files.layout import STOKES
 from nlosrender.files.reading.reader import StoredCapture, open_capture
@@ -34,16 +35,17 @@ class ExportFormat:
 
     suffix: str  # of a file's name
     kind: FileKind
+    write: Callable[..., list[str]]  # (path, capture, option), the option where there is one; returns what is lost
     y_descends: bool = False  # whether the first row is the top one
     x_descends: bool = False  # whether the first column is the right one
 
 
 PROGRAMS = {
-    "tal": ExportFormat(".hdf5", TAL),
-    "fk": ExportFormat(".mat", MAT, y_descends=True, x_descends=True),
-    "lct": ExportFormat(".mat", MAT, y_descends=True),
-    "phasor_mat": ExportFormat(".mat", MAT, y_descends=True),
-    "learned": ExportFormat(".mat", MAT, y_descends=True, x_descends=True),
+    "tal": ExportFormat(".hdf5", TAL, write_tal),
+    "fk": ExportFormat(".mat", MAT, write_fk, y_descends=True, x_descends=True),
+    "lct": ExportFormat(".mat", MAT, write_lct, y_descends=True),
+    "phasor_mat": ExportFormat(".mat", MAT, write_phasor_mat, y_descends=True),
+    "learned": ExportFormat(".mat", MAT, write_learned, y_descends=True, x_descends=True),
 }
 FORMATS = tuple(PROGRAMS)
 LEGS = ("remove", "keep")
@@ -92,14 +94,13 @@ def export_capture(
         There is no such format, or an option does not belong to it.
     """
     suffix_of(file_format)  # refuses a format that there is not
-    _refuse_options(file_format, legs, key)
-    order = PROGRAMS[file_format]
-    with open_capture(path) as capture, replacing(output, order.kind, [path]) as partial:
+    option = _option(file_format, legs, key)
+    program = PROGRAMS[file_format]
+    order = {"x_descends": program.x_descends, "y_descends": program.y_descends}
+    with open_capture(path) as capture, replacing(output, program.kind, [path]) as partial:
         indices = chosen_bounces(capture.header, bounces)
-        ordered = ordered_capture(
-            capture, read_scan(capture), indices, x_descends=order.x_descends, y_descends=order.y_descends
-        )
-        losses = _general_losses(capture, indices) + _write(file_format, partial, ordered, legs, key)
+        ordered = ordered_capture(capture, read_scan(capture), indices, **order)
+        losses = _general_losses(capture, indices) + program.write(partial, ordered, *option)
     return ExportReport(Path(output), tuple(losses))
 
 
@@ -116,24 +117,16 @@ def suffix_of(file_format: str) -> str:
     return PROGRAMS[file_format].suffix
 
 
-def _refuse_options(file_format: str, legs: str | None, key: str | None) -> None:
+def _option(file_format: str, legs: str | None, key: str | None) -> tuple[bool | str, ...]:
+    """Return the option of a format, where it has one; refuse those of others."""
     if legs is not None and legs not in LEGS:
         raise OptionError(f"--legs: got {legs!r}, need one of {', '.join(LEGS)}")
     if legs is not None and file_format != "tal":
         raise OptionError(f"--legs: belongs to --format tal; {file_format} counts time from the wall. Leave it out.")
     if key is not None and file_format != "learned":
-        raise OptionError(
-            f"--key: belongs to --format learned; {file_format} names its variables itself. Leave it out."
-        )
-
-
-def _write(file_format: str, path: Path, ordered: OrderedCapture, legs: str | None, key: str | None) -> list[str]:
-    """Write a file in a format and return what that does not hold."""
-    if file_format == "tal":
-        return write_tal(path, ordered, keep_legs=legs == "keep")
-    if file_format == "learned":
-        return write_learned(path, ordered, key or DEFAULT_KEY)
-    return {"fk": write_fk, "lct": write_lct, "phasor_mat": write_phasor_mat}[file_format](path, ordered)
+        raise OptionError(f"--key: belongs to --format learned; {file_format} has names of its own. Leave it out.")
+    options: dict[str, tuple[bool | str, ...]] = {"tal": (legs == "keep",), "learned": (key or DEFAULT_KEY,)}
+    return options.get(file_format, ())
 
 
 def _general_losses(capture: StoredCapture, indices: tuple[int, ...]) -> list[str]:
