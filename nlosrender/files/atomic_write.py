@@ -53,7 +53,7 @@ def check_writable(path: str | Path, kind: FileKind, sources: Iterable[str | Pat
             raise FileError(f"{path}: there is no folder {target.parent}. Create it (mkdir -p) or name another output.")
         kind.refuse_others(path, target)
         with explained_write(path):
-            # permissions, a read-only disk, a full one, a name that is too long: trying tells them all
+            # finds missing permissions, a read-only or full disk, a name that is too long
             new_partial(target).unlink()
     except (OSError, ValueError) as error:  # ValueError: a zero byte in the name
         raise FileError(f"{path}: cannot be used as an output: {error}") from error
@@ -91,7 +91,7 @@ def refuse_sources(path: str | Path, sources: Iterable[str | Path]) -> None:
 
 def new_partial(target: Path) -> Path:
     """Create the empty file that ``target`` is until it is complete, under a name nobody else has (OSError)."""
-    # not the number of the process, which another one may have, on another machine or in another container
+    # not the process id, which a process in another container may have
     partial = target.with_name(f".{target.name}.{secrets.token_hex(4)}.partial")
     os.close(os.open(partial, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW, 0o666))
     return partial
@@ -115,7 +115,7 @@ def publish(path: str | Path, partial: Path, target: Path, kind: FileKind) -> No
     synchronise(partial)
     kind.refuse_others(path, target)
     os.replace(partial, target)
-    with suppress(OSError):  # the new name itself; some network file systems cannot sync a folder
+    with suppress(OSError):  # makes the new name durable; some network file systems cannot sync a folder
         synchronise(target.parent)
 
 
@@ -146,20 +146,20 @@ def filled_folder(folder: str | Path) -> Iterator[Path]:
             raise FileError(f"{folder}: is a file. Name a folder, which may be a new one.")
         is_new = not target.exists()
         target.mkdir(parents=True, exist_ok=True)
-        # inside: beside it may be another disk
+        # inside the folder, so on the same disk
         unfinished = Path(tempfile.mkdtemp(prefix=".", suffix=".partial", dir=target))
         try:
             yield unfinished
             with uninterrupted():
                 files = sorted(unfinished.iterdir())
-                for file in files:  # all of them first: none is replaced where one may not be
+                for file in files:  # checked before the first is replaced: all or none
                     PICTURES[file.suffix].refuse_others(Path(folder) / file.name, target / file.name)
                 for file in files:
                     os.replace(file, target / file.name)
         finally:
             shutil.rmtree(unfinished, ignore_errors=True)
             if is_new:
-                with suppress(OSError):  # not empty: all went well
+                with suppress(OSError):  # not empty: the block ended well
                     target.rmdir()
 
 

@@ -18,7 +18,7 @@ from nlosrender.config.encodable import encodable
 
 # An object header holds an attribute of at most 64 KiB. Variable-length text lies in the heap and is not bound by
 # it; arrays are, and go there as JSON text when they are larger.
-MAX_STORED_BYTES = 2**24  # of an attribute by anyone: larger ones are not read
+MAX_STORED_BYTES = 2**24  # larger attributes, by any writer, are not read
 MAX_ARRAY_BYTES = 60_000
 
 

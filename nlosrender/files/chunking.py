@@ -92,7 +92,10 @@ class Chunker:
             cuts(0, n_bins, step["bin"]),
         ):
             tile = histograms[:, :, y0 - y_start : y1 - y_start, x0 - x_start : x1 - x_start, t0:t1]
-            below, right = y0 % step["sensor_y"], x0 % step["sensor_x"]  # place of the tile in its chunk
+            below, right = (
+                y0 % step["sensor_y"],
+                x0 % step["sensor_x"],
+            )  # offset of the tile in its chunk: shards may begin inside one
             for channel, slot in np.ndindex(tile.shape[:2]):
                 samples = tile[channel, slot]
                 if not samples.any():

@@ -36,7 +36,7 @@ class DeferredErrorFile:
     def __init__(self, path: Path, keep: bool = False):
         self.error: OSError | None = None
         self.writes: list[tuple[int, int]] = []
-        self._held: list[tuple[int, bytes]] = []  # position and content of what the disk did not take, oldest first
+        self._held: list[tuple[int, bytes]] = []  # (position, content) of failed writes, oldest first
         self._position = 0
         flags = os.O_RDWR | os.O_NOFOLLOW | (0 if keep else os.O_CREAT | os.O_TRUNC)
         self._descriptor: int | None = os.open(path, flags, 0o666)

@@ -73,7 +73,7 @@ class HDF5Writer:
         """Store a packed chunk, instead of one that was there; return where its bytes lie in the file."""
         with self.writing():
             dataset.id.write_direct_chunk(at, content)
-        # HDF5 can tell, but goes through all chunks for it
+        # asking HDF5 takes a pass over all chunks
         found = [position for position, length in self._stream.writes if length == len(content)]
         if len(found) == 1:
             return found[0]

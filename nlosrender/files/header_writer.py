@@ -34,7 +34,7 @@ _STOKES_TEXT = (
 )
 
 
-GZIP_LEVEL = 4  # told to HDF5, which packs only chunks that are filled in parts
+GZIP_LEVEL = 4  # stored as the filter's level; HDF5 itself packs only chunks that are filled in parts, by merge
 
 
 def create_capture(

@@ -72,7 +72,7 @@ SPECS: Mapping[str, DatasetSpec] = {spec.name: spec for spec in DATASETS}
 
 ROOT_TEXT = {"data order": "column-major", "engine": "nlosrender"}  # attributes of the file
 STOKES = "stokes"
-CHANNELS = {3: "rgb", 4: STOKES}  # grey has no name: it is what every file without the attribute holds
+CHANNELS = {3: "rgb", 4: STOKES}  # grey: files without the attribute
 DATA_UNIT = "J m^-2 sr^-1"  # radiance leaving a sensor point, integrated over the bin, for one pulse
 VIEW_UNIT = "W m^-2 sr^-1"  # line_of_sight: of a pixel's steady radiance the share that arrives in the bin
 

@@ -15,12 +15,12 @@ from nlosrender.files.layout import chunk_shape
 from nlosrender.readable import readable_size
 
 SAMPLE_BYTES = 4  # float32
-HEADER_BYTES = 60_000  # attributes, the configuration among them, and HDF5's own tables of a small file
+HEADER_BYTES = 60_000  # attributes with the configuration, and HDF5's tables of a small file
 # Measured: gzip and shuffle leave 0.8 to 1.1 bytes per byte of light (the more the noisier and the more scattered)
 # and 0.001 of zeros, at 320 and 2800 MB/s on one core.
 PACKED_LIGHT, PACKED_ZEROS = 1.0, 0.001
-PACKING_LIGHT, PACKING_ZEROS = 320e6, 2800e6  # bytes per second on the way in
-UNPACKED_SPEED = 500e6  # bytes per second
+PACKING_LIGHT, PACKING_ZEROS = 320e6, 2800e6  # bytes of samples per second
+UNPACKED_SPEED = 500e6  # bytes per second, of a disk
 
 
 @dataclass(frozen=True)

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from nlosrender.capture.bounces import BounceAxis
 from nlosrender.capture.relative_error import relative_l2_error
 
-CONTRAST_BITS = 32  # that a work item's contrasts are rounded to: journals keep their digits as text
-STATED_DIGITS = 4  # of errors that rest on them: more would depend on how the work is cut
+CONTRAST_BITS = 32  # mantissa bits of a contrast: journals store it as text, and an error estimate needs no more
+STATED_DIGITS = 4  # digits of errors computed from contrasts: further ones depend on how the work is cut
 
 
 @dataclass(frozen=True)

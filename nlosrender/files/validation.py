@@ -97,7 +97,7 @@ def _axes(file: h5py.File, path: Path, samples: h5py.Dataset) -> tuple[tuple[str
     """Return names and lengths of the axes of ``data``, and whether the capture is confocal."""
     try:
         axes = stored_axes(file, path, samples, get_attributes(file))
-    except FileError:  # it contradicts itself, and ``_unreadable`` says how
+    except FileError:  # it contradicts itself: ``_unreadable`` says how
         names = BY_RANK[samples.ndim]
         sizes = dict.fromkeys(layout.MEMORY_AXES, 1) | dict(zip(names, samples.shape, strict=True))
         return names, sizes, samples.ndim <= len(layout.CONFOCAL_AXES)
@@ -232,7 +232,7 @@ def _stored_parts(samples: h5py.Dataset) -> list[tuple[slice, ...]]:
     """Return the parts of a dataset that take space: its chunks, or for one without chunks its bins one by one."""
     if samples.chunks is None:
         whole = [slice(0, length) for length in samples.shape]
-        if not samples.id.get_storage_size():  # claimed, never written
+        if not samples.id.get_storage_size():  # allocated, never written
             return []
         return [(whole[0], slice(index, index + 1), *whole[2:]) for index in range(samples.shape[1])]
     offsets: list[tuple[int, ...]] = []

@@ -19,8 +19,8 @@ from nlosrender.rendering.process_layout import ProcessLayout
 if TYPE_CHECKING:
     from distributed import Client, LocalCluster
 
-CONNECT_SECONDS = 10.0  # for a scheduler to answer
-WORKER_SECONDS = 60.0  # for workers to join it
+CONNECT_SECONDS = 10.0  # timeout for a scheduler to answer
+WORKER_SECONDS = 60.0  # timeout for workers to join it
 ADVICE = "Start one with 'dask scheduler' and 'dask worker ADDRESS', or leave --scheduler out to use this machine."
 
 
@@ -108,7 +108,7 @@ def _connected(scheduler: str) -> Iterator[Client]:
     from distributed import Client
 
     is_file = "://" not in scheduler and (scheduler.endswith(".json") or Path(scheduler).exists())
-    if is_file and not Path(scheduler).exists():  # dask would wait for it without end
+    if is_file and not Path(scheduler).exists():  # dask would wait forever
         raise BackendError(f"--scheduler {scheduler}: there is no such scheduler file. {ADVICE}")
     try:
         if is_file:
@@ -139,8 +139,8 @@ def _local_workers(count: int) -> LocalCluster:
     """Start processes that finish their work item when Ctrl-C reaches every process of the terminal."""
     from distributed import LocalCluster
 
-    resource_tracker.ensure_running()  # a process of Python's own: starting it lets the signal through again
-    # inherited by dask's thread, and by every worker that it ever starts, from the worker's first moment on
+    resource_tracker.ensure_running()  # started now: starting this process of Python's later would unblock the signal
+    # the blocked signal is inherited by dask's thread and by every worker it starts
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         # memory_limit 0: work items are planned to fit, and dask would kill workers for the machine's file cache

@@ -29,10 +29,10 @@ if TYPE_CHECKING:
 
     from nlosrender.engine.path.engine import Budget
 
-STOP_SECONDS = 20.0  # that work items in flight have after a signal: a batch system waits 30 s before it kills
+STOP_SECONDS = 20.0  # grace for work items in flight after a signal: batch systems kill after 30 s
 PER_WORKER = 2  # work items on the way for each worker: the one it renders, and the next or the last
-LOOK_SECONDS = 0.02  # between two looks at what has come, and at the signals
-WORKER_LOOK_SECONDS = 5.0  # between two looks at whether there are workers at all
+LOOK_SECONDS = 0.02  # polling interval for arrivals and signals
+WORKER_LOOK_SECONDS = 5.0  # polling interval for the number of workers
 
 
 def render_on_cluster(
@@ -121,7 +121,7 @@ class _Flight:
 
         flying = as_completed([])
         looked = time.monotonic()
-        if not stop.came:  # while the workers started
+        if not stop.came:  # a signal may have come while the workers started
             self._top_up(flying)
         while not flying.is_empty():
             if stop.came and not self._recalled:
@@ -136,7 +136,7 @@ class _Flight:
             if time.monotonic() - looked > WORKER_LOOK_SECONDS:
                 looked = time.monotonic()
                 if not self._client.scheduler_info()["workers"]:
-                    if self._recalled:  # the signal has ended them, too
+                    if self._recalled:  # the signal reached them, too
                         return
                     warn("no worker is left; waiting for one to join. Ctrl-C saves what is finished.")
             if not flying.has_ready():

@@ -35,7 +35,7 @@ class Job:
 
     config: Config
     selection: Selection
-    identity: Mapping[str, Any]  # what the worker's own view of the capture has to agree with
+    identity: Mapping[str, Any]  # has to equal the worker's own identity of the capture
     backend: BackendName
     processes: ProcessLayout
 
@@ -63,11 +63,11 @@ class _WorkerState:
 
     def prepared(self, job: Job) -> tuple[Engine, Chunker]:
         """Return what renders and what cuts; the backend is started."""
-        # in every thread: Mitsuba's variant belongs to the thread
+        # in every thread: Mitsuba's variant is thread-local
         backend = start_backend(job.backend, colored=job.config.is_colored, polarized=job.config.render.polarized)
         key = tree_hash(dict(job.identity))
         if key != self.key or self.engine is None or self.chunker is None:
-            self.key, self.engine, self.chunker = "", None, None  # only one fits the memory
+            self.key, self.engine, self.chunker = "", None, None  # dropped first: memory holds one engine
             _refuse_other_capture(job, backend)
             _, self.engine, header = set_up_engine(job.config, backend, job.selection, job.processes)
             self.chunker = Chunker(header, job.config.output.compression, job.config.output.variance)

@@ -18,12 +18,10 @@ from nlosrender.rendering.render_report import Progress, Warn
 if TYPE_CHECKING:
     from nlosrender.engine.path.engine import Budget
 
-KEEP_SECONDS = (
-    30.0  # between two states, so that a kill costs no more than about a minute; quick work items never keep one
-)
-KEEP_COST = 0.1  # share of the time that keeping may take: states may have gigabytes
-SOON_SECONDS = 5.0  # a work item that ends so soon after a signal is finished
-OF_ITEM = "unit"  # stage of what is noted here
+KEEP_SECONDS = 30.0  # between two states: a kill costs about a minute at most, and quick work items write none
+KEEP_COST = 0.1  # largest share of the time spent on writing states, which may have gigabytes
+SOON_SECONDS = 5.0  # grace for the work item in flight after a signal
+OF_ITEM = "unit"  # stage under which the seconds are saved
 
 
 class ItemStopped(Exception):
@@ -88,6 +86,6 @@ class ItemInFlight:
         try:
             with uninterrupted(), explained_write(self._partial.path):
                 self._state.write(kept | {OF_ITEM: noted})
-        except FileError as error:  # a full disk: what an earlier state holds is left
+        except FileError as error:  # a full disk: an earlier state is left as it was
             self._warn(f"{error} What is done of the unit in flight cannot be kept.")
             self._pause *= 4

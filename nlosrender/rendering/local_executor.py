@@ -43,7 +43,7 @@ def resumable(partial: PartialCapture) -> Iterator[StopRequest]:
             raise
         raise IncompleteRender(f"{error} The render stopped{saved_suffix(partial)}") from error
     except RenderError:
-        partial.discard()  # the same would come out again
+        partial.discard()  # rendering again would give the same
         raise
 
 
@@ -80,7 +80,7 @@ def render_items(
     spent = partial.finished.sums.seconds
     begun = time.perf_counter()
     writer = ItemWriter(partial, monitor.stopwatch)
-    so_far = partial.finished.sums  # which the writer is a work item behind of, later on
+    so_far = partial.finished.sums  # counts the item that is still being written
     monitor.watch(standing(so_far, earlier, total))
     try:
         for number, item in enumerate(items):
@@ -104,7 +104,7 @@ def render_items(
             spent += flight.earlier_seconds
             so_far += finished.sums
             writer.store(finished)
-            del finished, flight  # its arrays are the writer's now
+            del finished, flight  # only the writer holds its arrays now
             report_progress(1.0)
             monitor.watch(standing(so_far, earlier + number + 1, total))
             if stop.came and number + 1 < len(items):

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from nlosrender.files.sums import Sums
     from nlosrender.rendering.work_items import Engine
 
-MISSED_BY = 1.25  # times the target: the estimate has an error of its own
+MISSED_BY = 1.25  # tolerance of the target: the error estimate has an error itself
 
 
 def summed_capture(engine: Engine, unsampled: tuple[UnsampledPaths, ...], sums: Sums) -> SummedCapture:

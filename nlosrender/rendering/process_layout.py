@@ -10,9 +10,9 @@ from nlosrender.capture.plan import MAX_ITEM_SAMPLES
 from nlosrender.engine.backend.start import PROCESS_BYTES, physical_memory
 from nlosrender.errors import ConfigError
 
-# 64 MB with the variance, before it is packed: a message a network carries, and a loss a dying worker may cause
+# of a work item that travels: 64 MB with the variance before packing, which a network carries and a dying worker loses
 MAX_SHIPPED_SAMPLES = 2**23
-MIN_ITEMS_PER_WORKER = 4  # at least, where the capture can be cut so: the last work items end at different times
+MIN_ITEMS_PER_WORKER = 4  # so that all workers are busy until near the end
 _KEY = "render.memory_limit"
 MIN_PROCESS_BYTES = 1.5 * PROCESS_BYTES  # of a process, where the user sets no limit
 

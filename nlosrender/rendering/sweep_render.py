@@ -22,7 +22,7 @@ from nlosrender.files.reading.reader import read_header
 from nlosrender.interruption import StopRequest, stop_request
 from nlosrender.rendering.render_report import Progress, RenderReport, Standing, Warn, Watch
 
-INDEX_SECONDS = 10.0  # between two writings of the index: that of a large dataset takes a while
+INDEX_SECONDS = 10.0  # between two writings of the index, which takes a while for a large dataset
 
 RenderOne = Callable[[Config, Progress, Warn, bool | None], RenderReport]  # the last: resume, as for render_capture
 Shard = tuple[int, int]  # I of N, counted from 1
@@ -77,7 +77,7 @@ class _Dataset:
         for index in indices:
             path = self.sweep.paths[index]
             target = Path(os.path.realpath(path))
-            if not os.path.lexists(target) or partial_folder(target).exists():  # the render knows what it began over
+            if not os.path.lexists(target) or partial_folder(target).exists():  # the render checks what it began over
                 continue
             config = config_to_dict(self.sweep.config(index))
             kind = CAPTURE if overwrite else same_capture(self.entries[index].capture_hash, str(WHOLE), config)
@@ -181,7 +181,10 @@ def _render_one(
     path = dataset.sweep.paths[index]
     try:
         render(dataset.sweep.config(index), progress, lambda text: warn(f"{path}: {text}"), resume)
-    except (ConfigError, RenderError) as error:  # this capture's own; those of disk and machine would meet all others
+    except (
+        ConfigError,
+        RenderError,
+    ) as error:  # errors of this capture; those of disk and machine would hit all others
         warn(f"{path}: failed: {error}")
         dataset.entries[index] = replace(dataset.entries[index], status="failed", message=str(error))
         return

@@ -19,12 +19,12 @@ from nlosrender.files.layout import Float64
 from nlosrender.files.reading.scan import Float32, Scan
 
 PS = 1e12  # picoseconds in a second
-FK_BIN_PS = 32.0  # their program's constant: the file has no place for it
-FK_BINS = 2048  # at least: their demo reads as many, their program 512
+FK_BIN_PS = 32.0  # bin width [ps] that is a constant in f-k's program: the file has no place for it
+FK_BINS = 2048  # at least: f-k's demo reads as many, its program 512
 LCT_BIN_PS = 4.0
-LCT_BINS = 2048  # at least: their program empties up to 800 of the first, and halves the number twice
-PHASOR_BINS = 4  # a multiple: their program halves the number twice
-NETWORK_BINS = 512  # of FK_BIN_PS, which the networks are made for
+LCT_BINS = 2048  # at least: the authors' program empties up to 800 of the first bins, and halves their number twice
+PHASOR_BINS = 4  # bins come in multiples of it: the authors' program halves their number twice
+NETWORK_BINS = 512  # bins of FK_BIN_PS: the input size of the networks
 MAX_VARIABLE_BYTES = 2**31 - 1  # of one variable in a version 7 file
 TIME_FIRST = ("data",)  # keys whose readers want (t, row, column): nlos3d
 
@@ -41,7 +41,7 @@ def write_fk(path: Path, ordered: OrderedCapture) -> list[str]:
     """
     scan = ordered.scan
     _refuse_pairs(ordered, "f-k migration")
-    # a start after 0 becomes empty bins: the reader's shift goes round the end
+    # a start after 0 becomes empty bins: the reader's shift is circular
     lead = max(int(np.ceil(scan.start_opl / scan.bin_width_opl - 1e-9)), 0)
     delay = scan.sensor_legs + scan.laser_legs - scan.start_opl + lead * scan.bin_width_opl
     shape = (*scan.sensors.shape[:2], max(lead + scan.n_bins, FK_BINS))
@@ -141,7 +141,7 @@ def write_learned(path: Path, ordered: OrderedCapture, key: str) -> list[str]:
     _refuse_pairs(ordered, "networks trained on f-k migration's captures")
     _refuse_large(ordered, NETWORK_BINS)
     move = rectification(scan)
-    bins = opl_to_seconds(scan.bin_width_opl) * PS / FK_BIN_PS  # of theirs in one of ours
+    bins = opl_to_seconds(scan.bin_width_opl) * PS / FK_BIN_PS  # bins of FK_BIN_PS in one of the capture
     found = np.empty((*scan.sensors.shape[:2], NETWORK_BINS), dtype=np.float32)
     total = 0.0
     for rows, light in ordered.bands():

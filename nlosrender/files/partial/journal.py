@@ -24,7 +24,7 @@ from nlosrender.files.atomic_write import explained_write, new_partial, partial_
 from nlosrender.files.reading.locking import locked
 
 JOURNAL = "journal"
-MAX_ATTEMPTS = 10  # to open a folder that another render is just removing
+MAX_ATTEMPTS = 10  # attempts to open a folder that another render is just removing
 
 
 class JournalInUseError(Exception):
@@ -148,7 +148,7 @@ def claimed_journal(path: Path, target: Path) -> Journal:
     folder = partial_folder(target)
     with explained_write(path):
         probe = new_partial(target)
-        owner = probe.lstat().st_uid  # of what this process makes there: network file systems have their own idea of it
+        owner = probe.lstat().st_uid  # as this file system has it: network ones may map users
         probe.unlink()
         for attempt in range(MAX_ATTEMPTS):
             with suppress(FileExistsError):

@@ -135,7 +135,7 @@ class PartialCapture:
             store_variance=store_variance,
         )
         if self.finished.items and self._state.closed and self._is_whole():
-            # on the disk before HDF5 changes its tables: a closed file's are believed
+            # durable before HDF5 changes its tables: those of a file noted as closed are trusted
             self._note({"opened": True}, durable=True)
             self._open_samples()
         elif self.finished.items:
@@ -143,7 +143,7 @@ class PartialCapture:
         else:
             begun_by = {"process": os.getpid(), "machine": socket.gethostname()}
             self._note({"identity": self._identity, "overwrite": self._overwrites, **begun_by})
-            with explained_write(self.path):  # without a finished work item it means nothing
+            with explained_write(self.path):  # a file without a finished work item holds nothing of use
                 self._samples().unlink(missing_ok=True)
             self._open_samples(create)
 
@@ -201,7 +201,7 @@ class PartialCapture:
         FileError
             The disk refuses.
         """
-        self._kind.refuse_others(self.path, self.target)  # while there is still something to go on with
+        self._kind.refuse_others(self.path, self.target)  # before the file is closed: the render can still be resumed
         with explained_write(self.path):
             with self._open_writer.writing():
                 add_attributes(self._open_writer.file, self._header, attributes)
@@ -215,7 +215,7 @@ class PartialCapture:
         with uninterrupted():
             self._abandon()
             self._state = JournalState()
-            for leftover in self.folder.glob("samples.*"):  # first: without them the journal means nothing
+            for leftover in self.folder.glob("samples.*"):  # samples first: without them a journal counts for nothing
                 with suppress(OSError):
                     leftover.unlink()
             shutil.rmtree(self.folder, ignore_errors=True)
@@ -332,10 +332,10 @@ class PartialCapture:
                 of_all = f"{lost} of {len(earlier.finished.items)} finished units"
                 self.damage.append(f"{old}: {of_all} are damaged on the disk and are rendered again.")
             with explained_write(self.path):
-                synchronise(self._samples())  # before the old file goes: its work items would have to be done again
+                synchronise(self._samples())  # before the old file is removed: a power failure must not lose both
             self._note({"switched_to": self._state.generation}, durable=True)
         except BaseException:
-            # the old file still counts
+            # the old file is still the one that counts
             self._abandon()
             self._state = earlier
             raise
@@ -349,7 +349,7 @@ class PartialCapture:
                 self.discard()
                 return
             if self._writer is not None and self.finished.items:
-                # where the disk refuses, the journal knows enough to build the file anew
+                # where the disk refuses, the next render rebuilds the file from the journal
                 with suppress(FileError), explained_write(self.path):
                     self._writer.close()
                     synchronise(self._samples())

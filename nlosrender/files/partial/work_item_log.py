@@ -16,7 +16,7 @@ from nlosrender.capture.tile import Tile
 from nlosrender.files.sums import Sums
 
 CHECKSUM_RANGE = 2**64
-READ_BYTES = 2**20  # of what is no chunk, at a time
+READ_BYTES = 2**20  # read at a time between the chunks
 WorkItemKey = tuple[Tile, Tile]  # sensors, lasers
 Record = Mapping[str, Any]
 

@@ -60,7 +60,7 @@ class ItemState:
         new = self.path.with_name(self.path.name + NEW)
         new.unlink(missing_ok=True)
         try:
-            with new.open("xb") as stream:  # exclusive: nothing that lies there, a link say, is written through
+            with new.open("xb") as stream:  # exclusive: never writes through a link that lies there
                 stream.write(line_of({"tag": self.tag, "stages": header}))
                 for content in contents:
                     stream.write(_bytes_of(content))

@@ -101,7 +101,7 @@ def _copy(shard: Shard, writer: HDF5Writer | None, output: Path) -> None:
         for name in layout.sample_names(header.has_variance):
             samples: h5py.Dataset = file[name]
             chunks: list[tuple[int, ...]] = []
-            # not one by one: HDF5 goes through all chunks for each
+            # in one pass: asking for each chunk takes time that grows with their number squared
             samples.id.chunk_iter(lambda chunk, chunks=chunks: chunks.append(chunk.chunk_offset))
             checksum = 0
             for chunk in chunks:

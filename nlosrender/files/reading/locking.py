@@ -9,7 +9,7 @@ from pathlib import Path
 
 import h5py
 
-# What locking a file answers there. Two renders into one file are then the user's to avoid.
+# errno of flock on a file system without locks; there nothing notices two renders into one file.
 NO_LOCKS = (errno.ENOSYS, errno.EOPNOTSUPP, errno.ENOLCK, errno.EINVAL)
 
 
@@ -39,7 +39,7 @@ def open_for_reading(path: Path) -> h5py.File:
         It cannot be read.
     """
     has_locks = True
-    with path.open("rb") as stream, suppress(OSError):  # HDF5 says itself who has the lock
+    with path.open("rb") as stream, suppress(OSError):  # a lock that another program holds: HDF5 reports it
         has_locks = locked(stream.fileno(), fcntl.LOCK_SH)
-    # found out here, not by trying: HDF5 opens a file a second time only with the same setting
+    # asked for explicitly: HDF5 opens a file a second time only with the same setting
     return h5py.File(path, "r", locking=has_locks)

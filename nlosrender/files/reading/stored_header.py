@@ -28,7 +28,7 @@ from nlosrender.files.reading.stored_points import NOT_ZNLOS, Numbers, dataset_i
 
 T = TypeVar("T", np.float32, np.float64)
 MAX_CHUNK_BYTES = 2**30  # unpacked; a few kilobytes in a file may claim 4 GiB
-MAX_BOUNCES = 64  # on the axis of a file from elsewhere; ours have 6
+MAX_BOUNCES = 64  # longest bounce axis that is read; this program writes 6
 
 
 @dataclass(frozen=True)
@@ -113,7 +113,7 @@ def header_of(file: h5py.File, path: Path) -> StoredHeader:
         ``data`` or ``deltaT`` is missing, or what is there cannot be a capture.
     """
     samples = samples_of(file, path)
-    for name in layout.SPECS:  # read or not: a file that names others is refused as a whole
+    for name in layout.SPECS:  # whether it is read or not: a link to another file is refused
         dataset_in(file, path, name)
     attributes, data_attributes = get_attributes(file), get_attributes(samples)
     axes = stored_axes(file, path, samples, attributes)
@@ -173,7 +173,7 @@ def samples_of(file: h5py.File, path: Path, name: str = layout.DATA) -> h5py.Dat
         raise FileError(f"{path}: has no dataset {name} (found: {found}). {NOT_ZNLOS}")
     if samples.dtype.kind not in "iuf":
         raise FileError(f"{path}: {name} holds {samples.dtype}, need numbers. {NOT_ZNLOS}")
-    # without a channel the number of axes alone makes no capture
+    # the ranks without a channel are common: deltaT tells a capture
     if samples.ndim not in BY_RANK or (samples.ndim % 2 == 0 and dataset_in(file, path, "deltaT") is None):
         confocal, pairs = " ".join(layout.CONFOCAL_AXES), " ".join(layout.PAIR_AXES)
         raise FileError(
