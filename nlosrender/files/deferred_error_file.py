@@ -8,11 +8,12 @@ closed the file and reports the error.
 
 from __future__ import annotations
 
+import io
 import os
 from pathlib import Path
 
 
-class DeferredErrorFile:
+class DeferredErrorFile(io.RawIOBase):
     """Read-write file for h5py's file-object driver.
 
     Parameters
@@ -51,6 +52,7 @@ class DeferredErrorFile:
         if self._descriptor is not None:
             os.close(self._descriptor)
             self._descriptor = None
+        super().close()
 
     def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
         """Move to ``offset``, as files do."""
@@ -58,25 +60,21 @@ class DeferredErrorFile:
         self._position = start + offset
         return self._position
 
-    def tell(self) -> int:
-        """Return the position."""
-        return self._position
-
-    def write(self, content: memoryview) -> int:
+    def write(self, content: memoryview) -> int:  # type: ignore[override]  # h5py hands in memoryviews
         """Write all of ``content``; keep it in memory if the disk fails."""
         start = self._position
         self._position += len(content)
         self.writes.append((start, len(content)))
         try:
             if self.error is None:
-                self._write_to_disk(content, start)
+                write_all(self._open_descriptor(), content, start)
                 return len(content)
         except OSError as error:
             self.error = error
         self._held.append((start, bytes(content)))
         return len(content)
 
-    def readinto(self, target: memoryview) -> int:
+    def readinto(self, target: memoryview) -> int:  # type: ignore[override]
         """Fill all of ``target``; bytes that were never written are zero."""
         start, length = self._position, len(target)
         self._position += length
@@ -93,12 +91,6 @@ class DeferredErrorFile:
         target[:] = content
         return length
 
-    def read(self, length: int) -> bytes:
-        """Return the next ``length`` bytes."""
-        content = bytearray(length)
-        self.readinto(memoryview(content))
-        return bytes(content)
-
     def truncate(self, size: int | None = None) -> int:
         """Set the file's length."""
         length = self._position if size is None else size
@@ -109,14 +101,6 @@ class DeferredErrorFile:
             self.error = error
         return length
 
-    def flush(self) -> None:
-        """Do nothing: writes are not buffered."""
-
-    def _write_to_disk(self, content: memoryview, start: int) -> None:
-        written = 0
-        while written < len(content):  # the system may take less than it is given, as the disk fills
-            written += os.pwrite(self._open_descriptor(), content[written:], start + written)
-
     def _open_descriptor(self) -> int:
         if self._descriptor is None:
             raise OSError("the file is closed already")
@@ -125,3 +109,10 @@ class DeferredErrorFile:
     def _size(self) -> int:
         on_disk = os.fstat(self._open_descriptor()).st_size
         return max([on_disk, *(position + len(held) for position, held in self._held)])
+
+
+def write_all(descriptor: int, content: bytes | memoryview, start: int) -> None:
+    """Write all of ``content`` at ``start``: as the disk fills the system takes less than it is given (OSError)."""
+    written = 0
+    while written < len(content):
+        written += os.pwrite(descriptor, content[written:], start + written)

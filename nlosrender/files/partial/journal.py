@@ -21,6 +21,7 @@ from typing import Any
 
 from nlosrender.errors import FileError
 from nlosrender.files.atomic_write import explained_write, new_partial, partial_folder
+from nlosrender.files.deferred_error_file import write_all
 from nlosrender.files.reading.locking import locked
 
 JOURNAL = "journal"
@@ -75,9 +76,7 @@ class Journal:
             The disk is full, or gone; the record does not count.
         """
         line = line_of(record)
-        written = 0
-        while written < len(line):  # the system may take less than it is given, as the disk fills
-            written += os.pwrite(self._descriptor, line[written:], self._end + written)
+        write_all(self._descriptor, line, self._end)
         self._end += len(line)
         if durable:
             os.fsync(self._descriptor)
