@@ -1,4 +1,4 @@
-"""A line-of-sight capture as pictures: one per range of bins, and the steady one. Light in flight, in any viewer."""
+"""A line-of-sight capture as pictures: one per range of bins, and the steady one."""
 
 from __future__ import annotations
 

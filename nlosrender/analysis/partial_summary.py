@@ -1,4 +1,4 @@
-"""What there is of a capture that is still being rendered, or was interrupted."""
+"""The summary of an unfinished capture, read from its journal."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ def is_unfinished(path: str | Path) -> bool:
 
 
 def partial_summary(folder: str | Path) -> dict[str, object]:
-    """Return what the journal of an unfinished capture says, as JSON can hold it.
+    """Return what the journal of an unfinished capture holds, as plain values.
 
     Raises
     ------
     FileError
-        There is no journal, or it says nothing.
+        There is no journal, or it is empty.
     """
     folder = Path(folder)
     with explained_read(folder):

@@ -1,4 +1,4 @@
-"""Pictures as files: OpenEXR for numbers, PNG and GIF for eyes; false colours of polarised light."""
+"""Writes OpenEXR, PNG and GIF files; tone mapping, and false colours of polarised light."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ Bytes = NDArray[np.uint8]
 
 SUFFIXES = {"exr": ".exr", "png": ".png", "gif": ".gif"}
 STOKES_NAMES = ("I", "Q", "U", "V")
-SMALLEST_SIDE = 512  # pixels; smaller pictures are enlarged by a whole number for the eye
+MIN_SIDE = 512  # pixels of a picture for the eye; smaller ones are enlarged by a whole number
 
 
 def save_exr(picture: Float32, path: Path, stokes: bool = False) -> None:
@@ -119,5 +119,5 @@ def stokes_panels(stokes: Float32, scale: float) -> Bytes:
 
 
 def _enlarged(picture: Bytes) -> Bytes:
-    factor = max(1, -(-SMALLEST_SIDE // max(picture.shape[:2])))
+    factor = max(1, -(-MIN_SIDE // max(picture.shape[:2])))
     return picture.repeat(factor, axis=0).repeat(factor, axis=1)

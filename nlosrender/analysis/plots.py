@@ -49,7 +49,7 @@ if TYPE_CHECKING:
 
 FORMATS = (".png", ".pdf", ".svg")
 DECADES = 5  # shown of a logarithmic axis
-ROW_LINES = 1200  # of the row over time: more than the picture has pixels
+MAX_ROW_LINES = 1200  # of the row over time, whose panel is about 500 pixels high
 
 
 def plot_capture(
@@ -210,7 +210,7 @@ def _draw_row(axes: Axes, capture: StoredCapture, view: LaserView) -> None:
     header = capture.header
     row = view.brightest[0]
     first, last = lit_window(view.time)
-    light = _at_most(row_over_time(capture, view.laser, row)[:, first : last + 1].T, ROW_LINES)
+    light = _at_most(row_over_time(capture, view.laser, row)[:, first : last + 1].T, MAX_ROW_LINES)
     factor, power = power_of_ten(float(light.max()))
     (left, right, _, _), xlabel, _ = _wall_extent(header)
     early, late = (header.start_opl + index * header.bin_width_opl for index in (first, last + 1))

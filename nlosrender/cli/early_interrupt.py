@@ -1,4 +1,4 @@
-"""Ctrl-C before the command line is there: in the fifth of a second that its import takes.
+"""Ctrl-C during the import of the command line, which takes a fifth of a second.
 
 Imported before everything else, so it imports next to nothing.
 """

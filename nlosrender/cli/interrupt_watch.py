@@ -1,4 +1,4 @@
-"""Ctrl-C and its like end a command in one way, whatever they hit: an import, say, makes errors of its own of them."""
+"""Signals end a command as KeyboardInterrupt, whatever exception the interrupted code makes of them."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from nlosrender.interruption import SIGNALS
 class InterruptWatch:
     """Inside its block, ``SIGNALS`` become KeyboardInterrupt, and so does every error that comes after one.
 
-    Renders hold the signals back while they save; what they say of them passes, and so does success. After the block
-    they end the process at once.
+    InterruptedRender, IncompleteRender and success pass unchanged: renders hold the signals back while they save.
+    After the block a signal ends the process at once.
     """
 
     def __init__(self) -> None:

@@ -1,4 +1,4 @@
-"""``--json``: one object on standard output, whatever comes of a command."""
+"""``--json``: exactly one object on standard output, also when a command fails."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class JsonOutput:
 
     @staticmethod
     def asked(arguments: Sequence[str]) -> bool:
-        """Tell whether ``arguments`` ask for JSON; looked for by hand, for they may be no command line at all."""
+        """Return whether ``arguments`` ask for JSON; they may be no valid command line."""
         options = arguments[: arguments.index("--")] if "--" in arguments else arguments
         return "--json" in options
 

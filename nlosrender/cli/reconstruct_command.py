@@ -18,8 +18,6 @@ if TYPE_CHECKING:
     from nlosrender.analysis.reconstruction.reconstruct import Reconstruction
     from nlosrender.analysis.reconstruction.score import Score
 
-LENGTHS = "W,H,D"
-
 
 def reconstruct(
     file: CaptureFile,
@@ -49,7 +47,7 @@ def reconstruct(
     volume_size: Annotated[
         str | None,
         typer.Option(
-            metavar=LENGTHS, help="Edges of the volume [m], or one for all.", show_default="the file's + margin"
+            metavar="W,H,D", help="Edges of the volume [m], or one for all.", show_default="the file's + margin"
         ),
     ] = None,
     voxels: Annotated[

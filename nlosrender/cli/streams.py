@@ -1,4 +1,4 @@
-"""Standard streams that are there, and print every name a file can have, whatever the locale."""
+"""Opens closed standard streams, and lets stdout print any file name, whatever the locale."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import io
 import os
 import sys
 
-ERRORS = "nlosrender.names"  # what Python's codecs call the handler
+ERROR_HANDLER = "nlosrender.names"  # what Python's codecs call the handler
 
 
 def open_closed_streams() -> None:
@@ -22,9 +22,9 @@ def print_any_name() -> None:
 
     Messages on stderr need nothing: Python escapes there.
     """
-    codecs.register_error(ERRORS, _encoded)
+    codecs.register_error(ERROR_HANDLER, _encoded)
     if isinstance(sys.stdout, io.TextIOWrapper) and sys.stdout.errors == "strict":
-        sys.stdout.reconfigure(errors=ERRORS)
+        sys.stdout.reconfigure(errors=ERROR_HANDLER)
 
 
 def _encoded(error: UnicodeError) -> tuple[str | bytes, int]:

@@ -10,7 +10,13 @@ import pytest
 from support.point_captures import POSE, cells, points_header, write_points
 from support.rendering import configured
 
-from nlosrender.analysis.reconstruction.lattice import Axis, lattice_of
+from nlosrender.analysis.reconstruction.lattice import (
+    OVERSAMPLING,
+    Axis,
+    covering,
+    interpolation_matrix,
+    lattice_of,
+)
 from nlosrender.analysis.reconstruction.propagation import Propagator
 from nlosrender.analysis.reconstruction.pulse import Pulse, default_wavelength, pulse_warnings, sampling_limit
 from nlosrender.analysis.reconstruction.reconstruct import (
@@ -18,7 +24,6 @@ from nlosrender.analysis.reconstruction.reconstruct import (
     ReconstructionSettings,
     reconstruct_capture,
 )
-from nlosrender.analysis.reconstruction.resampling import OVERSAMPLING, covering, interpolation_matrix
 from nlosrender.analysis.reconstruction.score import otsu_threshold, score_front_view
 from nlosrender.analysis.reconstruction.silhouette import true_silhouette
 from nlosrender.analysis.reconstruction.threads import in_threads

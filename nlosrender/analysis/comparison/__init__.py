@@ -1,1 +1,1 @@
-"""Two captures, or two datasets, against each other: has anything changed, by how much, and where most?"""
+"""Compares two captures or two data sets: what differs, by how much, and where most."""

@@ -1,4 +1,4 @@
-"""The same points and times in two captures, whatever the order of their rows and wherever their bins begin."""
+"""Aligns two captures whose grids are flipped or transposed, or whose bins begin at different times."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from nlosrender.files.reading.stored_header import StoredHeader
 T = TypeVar("T", np.float32, np.float64)
 Grid = NDArray[np.float64]
 POSITION_TOLERANCE = 1e-5  # of the largest coordinate: float32 leaves 6e-8, other writers' arithmetic some more
-START_TOLERANCE = 1e-3  # bins
+START_TOLERANCE = 1e-3  # bins; float32 leaves 3e-4 of 3 mm at a start of 10 m
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,7 @@ from nlosrender.files.reading.stored_header import samples_of
 Float32 = NDArray[np.float32]
 Samples = NDArray[np.float32] | NDArray[np.float64]  # as stored, or as rendered
 BLOCK_SAMPLES = 2**21  # of one dataset at a time: 8 MiB as read, and about 20 times that in intermediate results
-MAX_CHUNK = 8  # blocks; larger ones, by other writers, are unpacked more than once
+MAX_CHUNK_BLOCKS = 8  # of chunks that are read as a whole; larger ones, by other writers, are unpacked repeatedly
 MAX_POINTS = 2**24  # of one grid; 4096 x 4096 is beyond any scan
 MAX_PER_POINT = 2**26  # samples of one sensor point and laser: 11 million bins of six bounces
 STORED = ("bounce", "sensor_y", "sensor_x", "laser_y", "laser_x")  # axes along which parts may never be written
@@ -201,7 +201,7 @@ def _tiles(capture: OpenCapture, block_samples: int) -> Iterator[tuple[slice, sl
     n_rows, n_columns = capture.sensors.turned_shape
     points = max(block_samples // (header.sizes["channel"] * len(header.bounce_indices) * header.n_bins), 1)
     height, width = capture.tile
-    if height * width > MAX_CHUNK * points:
+    if height * width > MAX_CHUNK_BLOCKS * points:
         height, width = 1, 1
     chunks = max(points // (height * width), 1)
     across = min(chunks, -(-n_columns // width))

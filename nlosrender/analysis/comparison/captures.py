@@ -1,4 +1,4 @@
-"""``compare_captures``: two files in, one verdict out, whatever their size."""
+"""``compare_captures``: reads two files block by block and holds their differences against tolerances."""
 
 from __future__ import annotations
 
@@ -15,8 +15,7 @@ from nlosrender.analysis.comparison.z_test import ZTest
 from nlosrender.errors import FileError
 from nlosrender.files.reading.stored_header import StoredHeader
 
-SAME = 1e-6  # relative L2: float32 leaves 6e-8 per sample
-SIGNIFICANCE = 0.01
+EQUAL_REL_L2 = 1e-6  # of captures that are equal up to rounding: float32 leaves 6e-8 per sample
 
 
 @dataclass(frozen=True)
@@ -44,7 +43,7 @@ class Tolerances:
         if self.significance is not None and not 0 < self.significance < 1:
             raise ValueError(f"significance: got {self.significance}, need a number between 0 and 1")
         if all(value is None for value in vars(self).values()):
-            object.__setattr__(self, "max_rel_l2", SAME)
+            object.__setattr__(self, "max_rel_l2", EQUAL_REL_L2)
 
 
 @dataclass(frozen=True)

@@ -35,7 +35,7 @@ MIN_FREEDOM = 10.0  # degrees of freedom: below it t is so wide that a statement
 MAX_FREEDOM = 1e9  # t is normal long before
 MIN_REPLICAS = 2  # behind a stored variance, where the file does not say
 ROUNDING = 1e-5  # relative: float32 samples, and arithmetic that differs between processors
-MANY_BOUNCES = 10  # deposits of one path in one index, where paths have no limit: later ones are weak
+UNLIMITED_BOUNCES = 10  # counted in the last index where paths have no limit: later ones are weak
 
 
 @dataclass(frozen=True)
@@ -120,7 +120,7 @@ class ErrorModel:
         self._is_noise = np.ones(n_bounces, dtype=bool)
         if not self.is_independent and header.split_bounces and n_bounces > third:
             self._is_noise[third] = False
-        highest = limit if isinstance(limit, int) else LAST_FILE_BOUNCE + MANY_BOUNCES
+        highest = limit if isinstance(limit, int) else LAST_FILE_BOUNCE + UNLIMITED_BOUNCES
         self._per_path = np.ones(n_bounces)  # deposits of one path in one index
         if header.split_bounces is False and n_bounces > third:
             self._per_path[third] = max(highest - FIRST_BOUNCE, 1)

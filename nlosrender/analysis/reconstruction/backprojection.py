@@ -19,7 +19,7 @@ from nlosrender.files.reading.reader import StoredCapture
 from nlosrender.files.reading.scan import Float32, Scan, light_bands
 from nlosrender.rendering.render_report import Progress
 
-FINER = 4  # samples per bin of the interpolated histograms; the nearest one is taken
+SAMPLES_PER_BIN = 4  # of the interpolated histograms; the nearest is taken, at most 1/8 bin off
 SLAB_VOXELS = 2**16  # voxels at a time: their distances stay in the cache
 
 
@@ -66,9 +66,9 @@ def _add_band(
     first, last = np.searchsorted(centres, [near.min() - width, far.max() + width])
     if first == last:
         return
-    fine = _finer(light[..., first:last].reshape(len(sensors), -1)) / np.float32(width)
-    scale = FINER / width  # samples per metre
-    starts = (legs.ravel() - centres[first]) * scale + FINER  # sample of path length 0: FINER zeros come first
+    fine = _interpolated(light[..., first:last].reshape(len(sensors), -1)) / np.float32(width)
+    scale = SAMPLES_PER_BIN / width  # samples per metre
+    starts = (legs.ravel() - centres[first]) * scale + SAMPLES_PER_BIN  # of path length 0; zeros come first
     planes = max(SLAB_VOXELS // (len(grid.y) * len(grid.x)), 1)
 
     def slab(number: int) -> None:
@@ -99,9 +99,9 @@ def _distances(grid: VoxelGrid, z: Float64, point: Float64) -> Float32:
     return np.sqrt(squares, out=squares)
 
 
-def _finer(light: Float32) -> NDArray[np.float32]:
-    """Interpolate histograms (row, bin) linearly to FINER samples per bin, with zeros before and after."""
+def _interpolated(light: Float32) -> NDArray[np.float32]:
+    """Interpolate histograms (row, bin) linearly to SAMPLES_PER_BIN samples per bin, with zeros before and after."""
     padded = np.pad(light, ((0, 0), (1, 1)))
-    steps = np.arange(FINER, dtype=np.float32) / FINER
+    steps = np.arange(SAMPLES_PER_BIN, dtype=np.float32) / SAMPLES_PER_BIN
     between = padded[:, :-1, None] * (1 - steps) + padded[:, 1:, None] * steps
     return np.pad(between.reshape(len(light), -1), ((0, 0), (0, 1)))

@@ -1,15 +1,21 @@
-"""Regular grids of points on a planar wall, as a convolution needs them."""
+"""Regular grids of points on a planar wall, and band-limited interpolation from one to any coordinates."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from nlosrender.errors import FileError
 from nlosrender.files.layout import Float64
 
-IRREGULARITY = 0.02  # of the spacing that a point may be off its place; float32 positions far from the origin
+MAX_IRREGULARITY = 0.02  # of the spacing that a point may be off its place: float32 positions far from the origin
+HALF_WIDTH = 10  # lattice points used on either side of a coordinate
+OVERSAMPLING = 1.5  # lattice points per wave, over the two that are needed at least
+# A Kaiser window of this shape leaves exp(-pi * HALF_WIDTH * (1 - 1/OVERSAMPLING)) = 3e-5 of anything below the band's
+# edge wrong (Kaiser 1974).
+KAISER_SHAPE = np.pi * HALF_WIDTH * (1 - 1 / OVERSAMPLING)
 
 
 @dataclass(frozen=True)
@@ -53,7 +59,7 @@ def lattice_of(points: Float64) -> Lattice:
     ordered = np.flip(points, axis=flips) if flips else points
     expected = np.stack(np.broadcast_arrays(x.coordinates(), y.coordinates()[:, None], height), axis=-1)
     worst = float(np.abs(ordered - expected).max())
-    if worst > IRREGULARITY * min(x.step, y.step):
+    if worst > MAX_IRREGULARITY * min(x.step, y.step):
         raise FileError(
             f"the {rows} x {columns} points on the wall are not equally spaced along its axes (one is {worst:.3g} m "
             "off), which phasor fields by convolution need. Use --method backprojection."
@@ -71,3 +77,21 @@ def _ascending(axis: Axis, fallback: float) -> Axis:
     if axis.step < 0:
         return Axis(axis.first + axis.step * (axis.count - 1), -axis.step, axis.count)
     return axis if axis.step > 0 else Axis(axis.first, fallback, axis.count)
+
+
+def interpolation_matrix(coordinates: Float64, first: float, step: float, count: int) -> NDArray[np.float32]:
+    """Return the matrix (coordinate, count) that takes samples at first + i * step to ``coordinates``.
+
+    Exact to 1e-4 for what has ``2 * OVERSAMPLING`` samples per period or more, where the lattice reaches ``HALF_WIDTH``
+    points beyond the coordinates on both sides.
+    """
+    offset = (coordinates[:, None] - first) / step - np.arange(count)
+    inside = np.clip(1 - (offset / HALF_WIDTH) ** 2, 0, None)
+    window = np.where(np.abs(offset) < HALF_WIDTH, np.i0(KAISER_SHAPE * np.sqrt(inside)) / np.i0(KAISER_SHAPE), 0.0)
+    return (np.sinc(offset) * window).astype(np.float32)
+
+
+def covering(coordinates: Float64, first: float, step: float) -> tuple[int, int]:
+    """Return the indices (start, stop) of the lattice first + i * step that interpolation to ``coordinates`` needs."""
+    low, high = (float(end - first) / step for end in (coordinates.min(), coordinates.max()))
+    return int(np.floor(low)) - HALF_WIDTH, int(np.ceil(high)) + HALF_WIDTH + 1

@@ -28,8 +28,8 @@ from nlosrender.files.reading.scan import Scan, light_bands
 from nlosrender.rendering.render_report import Progress
 
 SPECTRA_BYTES = 2**29  # of the laser points that are propagated together, sharing the kernels
-MAX_WAVENUMBERS = 20_000
-LASERS_TOGETHER = 32  # more share little more: the kernels are a small part of the work by then
+MAX_WAVENUMBERS = 20_000  # their spectra at 64 x 64 points take 0.66 GB
+MAX_LASERS_TOGETHER = 32  # that share the kernels, which are a small part of the work by then
 
 
 def refuse_curved(scan: Scan) -> None:
@@ -68,7 +68,7 @@ def phasor_field(
     camera = _Camera(capture, scan, grid, pulse, bounces, _wavenumbers(scan, grid, pulse), lattice_of(scan.sensors))
     lasers = [(0, 0)] if scan.confocal else list(np.ndindex(*scan.lasers.shape[:2]))
     fitting = SPECTRA_BYTES // (8 * len(camera.wavenumbers) * camera.lattice.x.count * camera.lattice.y.count)
-    together = min(max(fitting, 1), LASERS_TOGETHER)
+    together = min(max(fitting, 1), MAX_LASERS_TOGETHER)
     total = np.zeros(grid.shape, dtype=np.complex64)
     for start in range(0, len(lasers), together):
         chosen = lasers[start : start + together]

@@ -21,8 +21,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
-from nlosrender.analysis.reconstruction.lattice import Axis, Lattice
-from nlosrender.analysis.reconstruction.resampling import OVERSAMPLING, REACH, covering, interpolation_matrix
+from nlosrender.analysis.reconstruction.lattice import (
+    HALF_WIDTH,
+    OVERSAMPLING,
+    Axis,
+    Lattice,
+    covering,
+    interpolation_matrix,
+)
 from nlosrender.errors import OptionError
 from nlosrender.files.layout import Float64
 
@@ -105,7 +111,7 @@ class Propagator:
             while True:
                 fine = axis.step / factor
                 # the phase is steepest where interpolation reaches farthest out; 1 / depth for the slope of 1/|d|
-                out = reach + REACH * fine
+                out = reach + HALF_WIDTH * fine
                 slope = self.ways * wavenumber * out / np.hypot(out, depth) + 1 / depth
                 if fine * slope * OVERSAMPLING <= np.pi:
                     break

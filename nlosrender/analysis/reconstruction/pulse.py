@@ -16,7 +16,7 @@ from nlosrender.files.reading.scan import Scan
 from nlosrender.scene.bounding_box import Bounds
 
 DEFAULT_CYCLES = 5.0
-REACH = 3.0  # standard deviations at which the pulse is cut, in time and in frequency: it is down to 1.1 % there
+CUTOFF = 3.0  # standard deviations at which the pulse is cut, in time and in frequency: exp(-9 / 2) = 1.1 % there
 MIN_BINS = 4  # bins in a default wavelength: a box that long passes 90 % of it
 
 
@@ -31,7 +31,7 @@ class Pulse:
     """
 
     wavelength: float  # of the carrier [m]
-    cycles: float = DEFAULT_CYCLES  # wavelengths within ``REACH`` standard deviations of the envelope on both sides
+    cycles: float = DEFAULT_CYCLES  # wavelengths within ``CUTOFF`` standard deviations of the envelope on both sides
 
     def __post_init__(self) -> None:
         for name in ("wavelength", "cycles"):
@@ -42,16 +42,16 @@ class Pulse:
     @property
     def sigma(self) -> float:
         """Standard deviation of the envelope [m of optical path]."""
-        return self.cycles * self.wavelength / (2 * REACH)
+        return self.cycles * self.wavelength / (2 * CUTOFF)
 
     @property
     def half_length(self) -> float:
         """Half of what is kept of the pulse [m of optical path]."""
-        return REACH * self.sigma
+        return CUTOFF * self.sigma
 
     def wavenumbers(self, period: float) -> Float64:
         """Return wavenumbers (n,) [rad/m] over the pulse's band, dense enough for signals of length ``period`` [m]."""
-        center, half = 2 * np.pi / self.wavelength, REACH / self.sigma
+        center, half = 2 * np.pi / self.wavelength, CUTOFF / self.sigma
         step = 2 * np.pi / period
         low = max(center - half, step)
         return low + step * np.arange(int(np.ceil((center + half - low) / step)) + 1, dtype=np.float64)

@@ -22,7 +22,7 @@ from nlosrender.rendering.render_report import Progress, Warn, Warnings
 METHODS = ("phasor", "backprojection")
 FILTER_WAVELENGTHS = 1 / 8  # width of the backprojection's filter: about the depth resolution of phasor fields
 SEPARATOR = "  ·  "  # between parts of ``settings_text``
-FILTER_VOXELS = 1.0  # but at least this, or the filter sees the voxels' edges only
+MIN_FILTER_VOXELS = 1.0  # width of the filter at least, or it responds to single voxels
 
 
 @dataclass(frozen=True)
@@ -136,7 +136,7 @@ def reconstruct_capture(
                 warnings.emit(pulse_warnings(scan, pulse, grid.bounds))
             volume = np.abs(phasor_field(capture, scan, grid, pulse, indices, progress))
         else:
-            width = max(wavelength * FILTER_WAVELENGTHS, grid.voxel_size * FILTER_VOXELS)
+            width = max(wavelength * FILTER_WAVELENGTHS, grid.voxel_size * MIN_FILTER_VOXELS)
             volume = laplacian_filtered(backproject(capture, scan, grid, indices, progress), grid.voxel_size, width)
         header = capture.header
     if not np.isfinite(volume).all():

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from shapely.geometry.base import BaseGeometry
 
 UP = np.array([0.0, 0.0, 1.0])
-ROUND = 64  # corners of what stands in for a circle
+CIRCLE_CORNERS = 64  # of the polygon in place of a circle: its area is 0.16 % smaller
 SUBPIXELS = 4  # per voxel edge, for the share of a front pixel that is covered
 
 
@@ -98,12 +98,12 @@ def _surfaces(source: Path, attributes: Mapping[str, object]) -> tuple[Surface, 
 
 def _round_points(description: Mapping[str, object]) -> Float64 | None:
     """Return points (n, 3) whose projections have the shape's as their convex hull; None for unknown shapes."""
-    angles = np.linspace(0, 2 * np.pi, ROUND, endpoint=False)
-    circle = np.stack([np.cos(angles), np.sin(angles), np.zeros(ROUND)], axis=-1)
+    angles = np.linspace(0, 2 * np.pi, CIRCLE_CORNERS, endpoint=False)
+    circle = np.stack([np.cos(angles), np.sin(angles), np.zeros(CIRCLE_CORNERS)], axis=-1)
     square = np.array([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
     kind, to_world = description.get("type"), np.asarray(description.get("to_world", np.eye(4)), dtype=np.float64)
     if kind == "sphere":
-        latitudes = np.linspace(-np.pi / 2, np.pi / 2, ROUND // 2 + 1)[:, None, None]
+        latitudes = np.linspace(-np.pi / 2, np.pi / 2, CIRCLE_CORNERS // 2 + 1)[:, None, None]
         ball = circle * np.cos(latitudes) + UP * np.sin(latitudes)
         center = np.asarray(description.get("center", [0.0, 0, 0]), dtype=np.float64)
         points = center + float(np.asarray(description.get("radius", 1.0))) * ball.reshape(-1, 3)

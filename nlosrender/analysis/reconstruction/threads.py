@@ -1,4 +1,4 @@
-"""Independent pieces of a reconstruction side by side: numpy and the FFTs let go of the interpreter."""
+"""Independent parts of a reconstruction in threads: numpy and the FFTs release the interpreter lock."""
 
 from __future__ import annotations
 

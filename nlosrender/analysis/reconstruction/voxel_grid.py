@@ -15,7 +15,7 @@ from nlosrender.scene.bounding_box import Bounds
 DEFAULT_VOXELS = 128  # along the longest edge
 MARGIN = 0.15  # of the longest edge of the hidden geometry's box, on every side
 MARGIN_WAVELENGTHS = 1.5  # but at least this: a flat object is as deep as the pulse is long
-NEAREST = 0.5  # wavelengths between the wall and the nearest voxels of a default box
+MIN_WALL_DISTANCE = 0.5  # wavelengths between the wall and the nearest voxels of a default box
 MAX_VOXELS = 2**27  # 1 GiB of complex numbers
 
 
@@ -117,5 +117,5 @@ def _default_box(scan: Scan, wavelength: float) -> Bounds:
     low = np.minimum(box[0], scan.hidden_aabb[0] - margin)
     high = np.maximum(box[1], scan.hidden_aabb[1] + margin)
     if scan.planar:
-        low[2] = max(low[2], min(NEAREST * wavelength, high[2] / 2))
+        low[2] = max(low[2], min(MIN_WALL_DISTANCE * wavelength, high[2] / 2))
     return low, high
