@@ -72,7 +72,7 @@ def _rows(plan: RenderPlan) -> Iterator[tuple[str, str]]:
         f"{readable_size(size.disk_bytes_estimate)} on disk ({size.assumption})",
     )
     if plan.seconds_estimate is None:
-        yield "takes", f"a time that cannot be told ({plan.estimate_basis})"
+        yield "takes", f"an unknown time ({plan.estimate_basis})"
     else:
         yield (
             "takes",
