@@ -7,8 +7,8 @@ from nlosrender.capture.time_axis import TimeAxis
 from nlosrender.config.capture import CaptureConfig
 from nlosrender.errors import ConfigError
 
-# 80 float64 per grid point: position, normal, uv, wall coordinates (10) and their copies, leg (1), and the difference
-# to eight corners of a box, squared and summed (56)
+# about 80 float64 per grid point: position, normal, wall coordinates and their copies (16), leg (1), and the difference
+# to eight corners of a box, its squares and their sums (56)
 POINT_BYTES = 640
 MAX_SAMPLES = 2**40  # 4 TiB of float32 per bounce
 MAX_BATCHES = 1_000_000  # at 0.1 s each more than a day

@@ -12,7 +12,7 @@ from nlosrender.errors import ConfigError
 if TYPE_CHECKING:
     from nlosrender.config.capture import TimeAxisConfig
 
-AUTO_BINS_MULTIPLE = 32  # rounding up keeps files of nearly equal scenes equally long
+AUTO_BINS_MULTIPLE = 32  # a choice: small changes of a scene then keep the length of its files
 MAX_AUTO_BINS = 65536  # 197 m in bins of 3 mm; more is a mistaken unit, and 0.5 MB of sums per pair
 
 

@@ -21,21 +21,16 @@ OWN_BUFFERS = ("vertex_positions", "vertex_normals", "vertex_texcoords", "vertex
 
 
 def check_attributes(shape: Element, with_id: Mapping[str, Element]) -> None:
-    """Refuse textures that read what a shape does not have, or take for reflectances what cannot be any.
+    """Raise ValueError for a texture that reads what a shape does not have, or reflectances above 1.
 
-    Mitsuba says nothing: the first are black, and 8-bit colours 0 to 255.
+    Mitsuba accepts both: the first are black, and 8-bit colours 0 to 255.
 
     Parameters
     ----------
     shape
-        A ``<shape>`` whose file, if it has one, has been read and found sound.
+        A ``<shape>`` whose file, if it has one, has been read and checked.
     with_id
         The BSDFs and textures of the scene that a shape may refer to, by their ids.
-
-    Raises
-    ------
-    ValueError
-        Says which shape, by its place, and what it has.
     """
     textures = [each for each in _textures(shape, with_id) if each[1].get("type") == "mesh_attribute"]
     if not textures:
@@ -54,17 +49,14 @@ def check_attributes(shape: Element, with_id: Mapping[str, Element]) -> None:
             raise ValueError(f"{place_of(shape)}: {named(shape)}: {error}") from error
 
 
-def picture_warnings(shape: Element, with_id: Mapping[str, Element], mesh: TriangleMesh | None) -> list[str]:
-    """Return a sentence for a mesh file without texture coordinates that has a picture: it lies on every triangle."""
-    if mesh is None or mesh.uvs is not None or shape.get("type") not in MESH_PLUGINS:
-        return []
-    textures = (texture for _, texture in _textures(shape, with_id))
-    if not any(texture.get("type") in TEXTURES_WITH_A_PLACE for texture in textures):
-        return []
-    return [
-        f"scene.mitsuba: {place_of(shape)}: {named(shape)} has a picture, but its file no texture coordinates at every "
-        "corner: Mitsuba puts the picture on each triangle. Give the file some, or take a plain reflectance."
-    ]
+def picture_warnings(shape: Element, with_id: Mapping[str, Element], mesh: TriangleMesh) -> Iterator[str]:
+    """Yield a sentence for a mesh file without texture coordinates that has a picture: it lies on every triangle."""
+    has_picture = any(texture.get("type") in TEXTURES_WITH_A_PLACE for _, texture in _textures(shape, with_id))
+    if has_picture and mesh.uvs is None:
+        yield (
+            f"scene.mitsuba: {place_of(shape)}: {named(shape)} has a picture, but its file no texture coordinates at "
+            "every corner: Mitsuba puts the picture on each triangle. Give the file some, or take a plain reflectance."
+        )
 
 
 def has_two_sides(shape: Element, with_id: Mapping[str, Element]) -> bool:
