@@ -219,11 +219,9 @@ class Config(Section):
 
 def _film_of_scene(raw: dict[str, Any], validation: ValidationInfo) -> dict[str, Any]:
     """Make the film of a Mitsuba scene the sensor grid where no camera is given."""
-    scene, capture = raw.get("scene"), raw.get("capture")
-    name = scene.get("mitsuba") if isinstance(scene, Mapping) else None
-    if not isinstance(name, str) or not isinstance(capture, Mapping) or capture.get("camera") is not None:
-        return raw
-    if capture.get("scan_type") != "line_of_sight" or "sensor_grid" in capture:
+    name, capture = _mapping(raw, "scene").get("mitsuba"), _mapping(raw, "capture")
+    has_pixels = capture.get("camera") is not None or "sensor_grid" in capture
+    if not isinstance(name, str) or capture.get("scan_type") != "line_of_sight" or has_pixels:
         return raw
     try:
         _, size = read_mitsuba_xml(config_folder(validation) / name)
@@ -235,14 +233,17 @@ def _film_of_scene(raw: dict[str, Any], validation: ValidationInfo) -> dict[str,
 
 def _grids_on_patch(raw: dict[str, Any]) -> dict[str, Any]:
     """Give grids without an extent the ``width`` and ``height`` of a sphere wall, whose whole is rarely meant."""
-    scene, capture = raw.get("scene"), raw.get("capture")
-    wall = scene.get("relay_wall") if isinstance(scene, Mapping) else None
-    if not isinstance(wall, Mapping) or wall.get("type") != "sphere" or not isinstance(capture, Mapping):
+    wall, capture = _mapping(_mapping(raw, "scene"), "relay_wall"), _mapping(raw, "capture")
+    grids = {key: capture[key] for key in ("sensor_grid", "laser_grid") if isinstance(capture.get(key), Mapping)}
+    if wall.get("type") != "sphere" or not grids:
         return raw
-    patch = {key: wall[key] for key in ("width", "height") if wall.get(key) is not None}
-    changed = {
-        key: {**grid, **{axis: size for axis, size in patch.items() if grid.get(axis) is None}}
-        for key in ("sensor_grid", "laser_grid")
-        if isinstance(grid := capture.get(key), Mapping)
+    patch = {axis: wall[axis] for axis in ("width", "height") if wall.get(axis) is not None}
+    on_patch = {
+        key: grid | {axis: size for axis, size in patch.items() if grid.get(axis) is None}
+        for key, grid in grids.items()
     }
-    return {**raw, "capture": {**capture, **changed}}
+    return {**raw, "capture": {**capture, **on_patch}}
+
+
+def _mapping(raw: Mapping[str, Any], key: str) -> Mapping[str, Any]:
+    return raw[key] if isinstance(raw.get(key), Mapping) else {}

@@ -109,7 +109,9 @@ def _number(need: str, span: tuple[float, float, str] | None = None, **bounds: f
     return Checked(check, {"type": "number", **bounds, **({"maximum": largest} if span else {})})
 
 
-def _integer(need: str, minimum: float, maximum: int | None = None, too_large: str = "", advice: str = "") -> Checked:
+def integer(need: str, minimum: float, maximum: int | None = None, too_large: str = "", advice: str = "") -> Checked:
+    """Return the check of an integer; ``too_large`` instead of ``need`` is told above the maximum."""
+
     def check(value: object) -> int:
         if isinstance(value, bool) or not isinstance(value, int) or value < minimum:
             raise invalid_value(value, need, _unquote(value) or _without_exponent(value) or advice)
@@ -203,7 +205,7 @@ def _name(value: object) -> str:
 
 
 def _bin_count(value: object) -> int | str:
-    return "auto" if value == "auto" else int(_integer("auto or an integer >= 1", 1).check(value))
+    return "auto" if value == "auto" else int(integer("auto or an integer >= 1", 1).check(value))
 
 
 def _memory(value: object) -> str:
@@ -240,16 +242,16 @@ OpenUnit = Annotated[float, _number("a number between 0 and 1 (both excluded)", 
 FieldOfView = Annotated[
     float, _number("an angle between 0 and 180 degrees (both excluded)", exclusiveMinimum=0, exclusiveMaximum=180)
 ]
-SampleCount = Annotated[int, _integer("an integer >= 1", 1, _MAX_SAMPLES, f"at most {_MAX_SAMPLES:_}")]
-GridCount = Annotated[int, _integer("an integer >= 1", 1, advice="Use scan_type: single for one laser point.")]
+SampleCount = Annotated[int, integer("an integer >= 1", 1, _MAX_SAMPLES, f"at most {_MAX_SAMPLES:_}")]
+GridCount = Annotated[int, integer("an integer >= 1", 1, advice="Use scan_type: single for one laser point.")]
 BounceCount = Annotated[  # the least depends on the scan type: document.Config.rule_enough_bounces
     int,
     Checked(
-        _integer("an integer, or null for no limit", -math.inf, _MAX_BOUNCES, f"at most {_MAX_BOUNCES:_}").check,
+        integer("an integer, or null for no limit", -math.inf, _MAX_BOUNCES, f"at most {_MAX_BOUNCES:_}").check,
         {"type": "integer", "minimum": 0, "maximum": _MAX_BOUNCES},
     ),
 ]
-Seed = Annotated[int, _integer("an integer from 0 to 4294967295", 0, 2**32 - 1)]
+Seed = Annotated[int, integer("an integer from 0 to 4294967295", 0, 2**32 - 1)]
 Vector3 = tuple[float, float, float]
 Scale = Annotated[
     float | Vector3,

@@ -46,18 +46,7 @@ def load_config(path: Path, overrides: Sequence[str] = ()) -> Config:
 
 
 def parse_config(text: str, source: str, folder: Path, overrides: Sequence[str] = ()) -> Config:
-    """Validate the text of a config; as ``load_config``.
-
-    Parameters
-    ----------
-    text
-        YAML.
-    source
-        What to call it in messages; its stem is the default name of the capture.
-    folder
-        Where relative file names start.
-    overrides
-        ``a.b.c=VALUE`` each.
+    """Validate the text of a config; as ``load_config``, with parameters as ``parse_document``.
 
     Raises
     ------
@@ -99,6 +88,17 @@ def load_document(path: Path, overrides: Sequence[str] = ()) -> Document:
 
 def parse_document(text: str, source: str, folder: Path, overrides: Sequence[str] = ()) -> Document:
     """Return the values of a config's text with the overrides put over them; the root is a mapping.
+
+    Parameters
+    ----------
+    text
+        YAML.
+    source
+        What to call it in messages; its stem is the default name of the capture.
+    folder
+        Where relative file names start.
+    overrides
+        ``a.b.c=VALUE`` each.
 
     Raises
     ------

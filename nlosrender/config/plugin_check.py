@@ -13,6 +13,7 @@ from nlosrender.config.encodable import is_encodable
 from nlosrender.config.fields import LONGEST, as_finite, finite_numbers
 from nlosrender.config.frozen import freeze
 from nlosrender.config.issues import InvalidValue, did_you_mean, mismatch, shown
+from nlosrender.config.vectors import cross, dot
 from nlosrender.errors import KeyPath, ValidationIssue, nearest
 
 TRANSFORM_KEYS = ("to_world", "to_uv")
@@ -96,7 +97,7 @@ class PluginCheck:
         matrix = [row for row in rows if row is not None]
         if matrix[3] != [0, 0, 0, 1]:
             self.note_mismatch((*path, 3), value[3], "[0, 0, 0, 1] as last row")
-        elif abs(_determinant(matrix)) < 1e-30:
+        elif abs(dot(cross(matrix[0][:3], matrix[1][:3]), matrix[2][:3])) < 1e-30:
             self.note(path, "the matrix is singular: it flattens space, need one that can be inverted.")
         return matrix
 
@@ -173,11 +174,3 @@ def mitsuba_file(name: str, folder: Path, start: str = "the YAML's folder") -> t
         what = f"got {shown(name)}; Mitsuba opens files with names in UTF-8 only, not {path}."
         problem = f"{what} Rename it, or its folder."
     return path, problem
-
-
-def _determinant(m: list[list[float]]) -> float:
-    return (
-        m[0][0] * (m[1][1] * m[2][2] - m[1][2] * m[2][1])
-        - m[0][1] * (m[1][0] * m[2][2] - m[1][2] * m[2][0])
-        + m[0][2] * (m[1][0] * m[2][1] - m[1][1] * m[2][0])
-    )

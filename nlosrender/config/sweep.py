@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
-from nlosrender.config.fields import Checked, Seed, as_finite, finite_numbers
+from nlosrender.config.fields import Checked, Seed, as_finite, finite_numbers, integer
 from nlosrender.config.issues import invalid_value, mismatch
 from nlosrender.config.section import MAPPING, ONE_OF, Section
 from nlosrender.errors import ValidationIssue
@@ -110,53 +110,25 @@ def _draw(value: object) -> Draw:
     return Draw(kind, tuple(among) if kind == "integers" else tuple(ends))
 
 
-_RANGE_SCHEMA = {"type": "object", "required": ["start", "stop"], "additionalProperties": {"type": "number"}}
-_ENDS_SCHEMA = {"type": "array", "items": {"type": "number"}, "minItems": 2, "maxItems": 2}
+def _one_key(**properties: dict[str, Any]) -> dict[str, Any]:
+    """Return the JSON Schema of a mapping with one of some keys."""
+    return {
+        "type": "object",
+        "properties": properties,
+        "additionalProperties": False,
+        "minProperties": 1,
+        "maxProperties": 1,
+    }
+
+
+_LIST = {"type": "array", "minItems": 1}
+_RANGE = {"type": "object", "required": ["start", "stop"], "additionalProperties": {"type": "number"}}
+_ENDS = {"type": "array", "items": {"type": "number"}, "minItems": 2, "maxItems": 2}
 Values = Annotated[
-    tuple[Any, ...],
-    Checked(
-        _swept_values,
-        {
-            "anyOf": [
-                {"type": "array", "minItems": 1},
-                {
-                    "type": "object",
-                    "properties": {"range": _RANGE_SCHEMA, "log_range": _RANGE_SCHEMA},
-                    "additionalProperties": False,
-                    "minProperties": 1,
-                    "maxProperties": 1,
-                },
-            ]
-        },
-    ),
+    tuple[Any, ...], Checked(_swept_values, {"anyOf": [_LIST, _one_key(range=_RANGE, log_range=_RANGE)]})
 ]
-RandomDraw = Annotated[
-    Draw,
-    Checked(
-        _draw,
-        {
-            "type": "object",
-            "properties": {
-                "uniform": _ENDS_SCHEMA,
-                "log_uniform": _ENDS_SCHEMA,
-                "integers": _ENDS_SCHEMA,
-                "choice": {"type": "array", "minItems": 1},
-            },
-            "additionalProperties": False,
-            "minProperties": 1,
-            "maxProperties": 1,
-        },
-    ),
-]
-
-
-def _count(value: object) -> int:
-    if isinstance(value, bool) or not isinstance(value, int) or not 1 <= value <= MAX_CAPTURES:
-        raise invalid_value(value, f"an integer from 1 to {MAX_CAPTURES}")
-    return value
-
-
-DrawCount = Annotated[int, Checked(_count, {"type": "integer", "minimum": 1, "maximum": MAX_CAPTURES})]
+RandomDraw = Annotated[Draw, Checked(_draw, _one_key(uniform=_ENDS, log_uniform=_ENDS, integers=_ENDS, choice=_LIST))]
+DrawCount = Annotated[int, integer(f"an integer from 1 to {MAX_CAPTURES}", 1, MAX_CAPTURES)]
 
 
 class RandomSweep(Section):

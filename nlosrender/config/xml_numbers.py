@@ -39,8 +39,9 @@ def check_numbers(element: Element) -> None:
     is_share = name == "reflectance" or name.endswith(("_reflectance", "_transmittance"))
     for key in _NUMERIC.get(element.tag, ()):
         for text in _SEPARATOR.split(element.get(key, "").strip()):
-            number = _number(text)
-            if number is None:
+            try:
+                number = float(text)
+            except ValueError:
                 continue
             shown = f"<{element.tag} {key}={element.get(key)!r:.60}>"
             if not abs(number) <= LONGEST:
@@ -50,10 +51,3 @@ def check_numbers(element: Element) -> None:
             # of a spectrum's pairs the wavelengths are larger
             if is_share and number > 1 and ":" not in element.get(key, ""):
                 raise ValueError(f"{shown} holds {text}, need numbers from 0 to 1 for {name}")
-
-
-def _number(text: str) -> float | None:
-    try:
-        return float(text)
-    except ValueError:
-        return None

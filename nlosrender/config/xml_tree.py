@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from pathlib import Path
 from xml.etree.ElementTree import Element
 from xml.parsers import expat
@@ -62,7 +63,35 @@ def read_xml(path: Path, name: str = "") -> Element:
         raise ValueError(f"cannot be read: {error.strerror}") from error
     if len(content) > MAX_XML_BYTES:
         raise ValueError(f"it is larger than {MAX_XML_BYTES // 2**20} MiB; keep meshes in files of their own")
-    return _LimitedTree(name).read(content)
+    return _parsed(content, name)
+
+
+def _parsed(content: bytes, name: str) -> Element:
+    """Return the root of a document; what no scene needs is refused while it is read, before it grows."""
+    parser = expat.ParserCreate()
+    opened: list[Element] = [Element("document")]
+    count = itertools.count(1)
+
+    def start(tag: str, attributes: dict[str, str]) -> None:
+        if next(count) > MAX_ELEMENTS:
+            raise ValueError(f"it has more than {MAX_ELEMENTS} elements")
+        if len(opened) > MAX_DEPTH:
+            raise ValueError(f"its elements lie in each other more than {MAX_DEPTH} deep")
+        element = SceneElement(tag, attributes)
+        element.line, element.file = parser.CurrentLineNumber, name
+        opened[-1].append(element)
+        opened.append(element)
+
+    def doctype(*_: object) -> None:
+        raise ValueError("it declares a document type or entities, which no Mitsuba scene needs")
+
+    parser.StartElementHandler, parser.EndElementHandler = start, lambda _: opened.pop()
+    parser.StartDoctypeDeclHandler = doctype
+    try:
+        parser.Parse(content, True)
+    except (expat.ExpatError, LookupError) as error:  # LookupError: an encoding nobody knows
+        raise ValueError(f"it is not well-formed XML: {error}") from error
+    return opened[0][0]  # expat refuses a document without an element
 
 
 def numbered_text(root: Element) -> tuple[str, list[Element]]:
@@ -82,47 +111,3 @@ def numbered_text(root: Element) -> tuple[str, list[Element]]:
 
     write(root)
     return "\n".join(lines), sources
-
-
-class _LimitedTree:
-    """Builds a tree, or says what no scene needs while it is read, before it grows."""
-
-    def __init__(self, name: str) -> None:
-        self._name = name
-        self._parser = expat.ParserCreate()
-        self._parser.StartElementHandler = self._start
-        self._parser.EndElementHandler = self._end
-        self._parser.StartDoctypeDeclHandler = self._doctype
-        self._open: list[Element] = []
-        self._root: Element | None = None
-        self._count = 0
-
-    def read(self, content: bytes) -> Element:
-        """Return the root of a document."""
-        try:
-            self._parser.Parse(content, True)
-        except (expat.ExpatError, LookupError) as error:  # LookupError: an encoding nobody knows
-            raise ValueError(f"it is not well-formed XML: {error}") from error
-        if self._root is None:  # expat refuses a document without an element
-            raise ValueError("it is not well-formed XML: no element found")
-        return self._root
-
-    def _doctype(self, name: str, system: str | None, public: str | None, has_internal_subset: int) -> None:
-        raise ValueError("it declares a document type or entities, which no Mitsuba scene needs")
-
-    def _start(self, tag: str, attributes: dict[str, str]) -> None:
-        self._count += 1
-        if self._count > MAX_ELEMENTS:
-            raise ValueError(f"it has more than {MAX_ELEMENTS} elements")
-        if len(self._open) == MAX_DEPTH:
-            raise ValueError(f"its elements lie in each other more than {MAX_DEPTH} deep")
-        element = SceneElement(tag, attributes)
-        element.line, element.file = self._parser.CurrentLineNumber, self._name
-        if self._open:
-            self._open[-1].append(element)
-        else:
-            self._root = element
-        self._open.append(element)
-
-    def _end(self, tag: str) -> None:
-        self._open.pop()
