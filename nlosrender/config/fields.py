@@ -19,7 +19,10 @@ from nlosrender.config.encodable import is_encodable
 from nlosrender.config.issues import InvalidValue, Wrong, invalid_value
 from nlosrender.config.vectors import length
 
-SHORTEST, LONGEST = 1e-9, 1e9  # m; shorter or longer lengths are slips of the pen, and float32 has no room for them
+MIN_LENGTH, MAX_LENGTH = (
+    1e-9,
+    1e9,
+)  # m; shorter or longer lengths are slips of the pen, and float32 has no room for them
 MAX_NAME_BYTES = 1000  # file systems take 255 or so and say so themselves
 _MIN_JOULES, _MAX_JOULES = 1e-15, 1e15  # the square of H stays a float32 number
 _MAX_SAMPLES = 10**12  # a path tracer takes years for them
@@ -175,8 +178,8 @@ def _sizes(value: object) -> tuple[float, ...]:
     numbers = finite_numbers(value, 3)
     if numbers is None or min(numbers) <= 0:
         raise invalid_value(value, "3 numbers > 0 [x, y, z]")
-    if not SHORTEST <= min(numbers) <= max(numbers) <= LONGEST:
-        raise invalid_value(value, f"{SHORTEST:g} to {LONGEST:g} m")
+    if not MIN_LENGTH <= min(numbers) <= max(numbers) <= MAX_LENGTH:
+        raise invalid_value(value, f"{MIN_LENGTH:g} to {MAX_LENGTH:g} m")
     return tuple(numbers)
 
 
@@ -226,7 +229,7 @@ def _has_direction(vector: Sequence[float]) -> bool:
     return _MIN_DIRECTION < length(vector) < 1 / _MIN_DIRECTION
 
 
-_LENGTHS = (SHORTEST, LONGEST, "m")
+_LENGTHS = (MIN_LENGTH, MAX_LENGTH, "m")
 _NOT_ZERO = {"type": "number", "not": {"const": 0}}
 _XYZ = "3 finite numbers [x, y, z]"
 _TEXT = {"type": "string", "minLength": 1}
@@ -234,7 +237,7 @@ _TEXT = {"type": "string", "minLength": 1}
 Positive = Annotated[float, _number("a number > 0", exclusiveMinimum=0)]
 Energy = Annotated[float, _number("a number > 0", (_MIN_JOULES, _MAX_JOULES, "J"), exclusiveMinimum=0)]
 Coordinate = Annotated[
-    float, _number(f"a number from -{LONGEST:g} to {LONGEST:g} m", (0.0, LONGEST, "m"), minimum=-LONGEST)
+    float, _number(f"a number from -{MAX_LENGTH:g} to {MAX_LENGTH:g} m", (0.0, MAX_LENGTH, "m"), minimum=-MAX_LENGTH)
 ]
 Length = Annotated[float, _number("a number > 0", _LENGTHS, exclusiveMinimum=0)]
 LengthOrZero = Annotated[float, _number("a number >= 0", _LENGTHS, minimum=0)]
@@ -260,8 +263,8 @@ Scale = Annotated[
 Brightness = Annotated[
     float | Vector3, Checked(_brightness, {"anyOf": [{"type": "number", "minimum": 0}, _array(3, minimum=0)]})
 ]
-Point2 = Annotated[tuple[float, float], _vector("2 finite numbers [x, y]", 2, most=LONGEST)]
-Point3 = Annotated[Vector3, _vector(_XYZ, most=LONGEST)]
+Point2 = Annotated[tuple[float, float], _vector("2 finite numbers [x, y]", 2, most=MAX_LENGTH)]
+Point3 = Annotated[Vector3, _vector(_XYZ, most=MAX_LENGTH)]
 Angles3 = Annotated[Vector3, _vector(_XYZ)]
 Direction = Annotated[Vector3, _vector(f"{_XYZ}, not all zero", allows=_has_direction)]
 Sizes3 = Annotated[Vector3, Checked(_sizes, _array(3, exclusiveMinimum=0))]

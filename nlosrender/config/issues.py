@@ -11,7 +11,7 @@ from typing import Any
 
 from nlosrender.errors import ValidationIssue, nearest
 
-_LONGEST_SHOWN = 60  # characters of a wrong value that still help
+_MAX_SHOWN = 60  # characters of a wrong value that still help
 
 
 class InvalidValue(ValueError):
@@ -92,4 +92,4 @@ def _element(value: object) -> str:
 
 
 def _cut(text: str) -> str:
-    return text if len(text) <= _LONGEST_SHOWN else text[: _LONGEST_SHOWN - 3] + "..."
+    return text if len(text) <= _MAX_SHOWN else text[: _MAX_SHOWN - 3] + "..."

@@ -15,7 +15,7 @@ from nlosrender.errors import ConfigError, KeyPath, ValidationIssue
 
 _NOTHING = ("", "~", "null", "Null", "NULL")
 _GOALS = ("spp", "target_error")  # exclude each other
-_LONGEST_PLACE = 80  # characters of an absurd override that still help
+_MAX_PLACE = 80  # characters of an absurd override that still help
 
 
 def apply_overrides(document: Document, overrides: Sequence[str]) -> None:
@@ -40,7 +40,7 @@ def apply_overrides(document: Document, overrides: Sequence[str]) -> None:
             continue
         if len(parts) > MAX_DEPTH:
             message = f"got {len(parts)} keys, one inside the other; need at most {MAX_DEPTH}."
-            document.issues.append(ValidationIssue((), message, place=place[:_LONGEST_PLACE]))
+            document.issues.append(ValidationIssue((), message, place=place[:_MAX_PLACE]))
             continue
         try:
             value = _value(parts, key, text, place)

@@ -10,7 +10,7 @@ from typing import Any
 from pydantic import ValidationInfo
 
 from nlosrender.config.encodable import is_encodable
-from nlosrender.config.fields import LONGEST, as_finite, finite_numbers
+from nlosrender.config.fields import MAX_LENGTH, as_finite, finite_numbers
 from nlosrender.config.frozen import freeze
 from nlosrender.config.issues import InvalidValue, did_you_mean, mismatch, shown
 from nlosrender.config.vectors import cross, dot
@@ -71,7 +71,7 @@ class PluginCheck:
     def numbers(self, value: Any, path: KeyPath, size: int, need: str) -> Any:
         """Return a list of ``size`` finite numbers as floats."""
         found = finite_numbers(value, size)
-        if found is None or any(abs(number) > LONGEST for number in found):
+        if found is None or any(abs(number) > MAX_LENGTH for number in found):
             self.note_mismatch(path, value, need)
         return found
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from nlosrender.config.bsdf_table import SHAPE_TYPES
-from nlosrender.config.fields import LONGEST, SHORTEST, as_finite
+from nlosrender.config.fields import MAX_LENGTH, MIN_LENGTH, as_finite
 from nlosrender.config.plugin_check import PluginCheck
 
 _ROUND = ("sphere", "cylinder")  # shapes whose parameters give their box before Mitsuba loads them
@@ -28,8 +28,8 @@ def check_shape(check: PluginCheck, value: Any) -> Any:
             result[key] = check.numbers(item, (key,), 3, "3 finite numbers [x, y, z]")
         elif key == "radius" and value["type"] in _ROUND:
             number = as_finite(item)
-            if number is None or not SHORTEST <= number <= LONGEST:
-                check.note_mismatch((key,), item, f"a number from {SHORTEST:g} to {LONGEST:g} m")
+            if number is None or not MIN_LENGTH <= number <= MAX_LENGTH:
+                check.note_mismatch((key,), item, f"a number from {MIN_LENGTH:g} to {MAX_LENGTH:g} m")
             result[key] = item
         else:
             result[key] = check.generic(item, (key,))

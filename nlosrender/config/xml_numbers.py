@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from xml.etree.ElementTree import Element
 
-from nlosrender.config.fields import LONGEST
+from nlosrender.config.fields import MAX_LENGTH
 
 _NUMERIC = {  # element: the attributes that hold numbers
     "float": ("value",),
@@ -44,8 +44,8 @@ def check_numbers(element: Element) -> None:
             except ValueError:
                 continue
             shown = f"<{element.tag} {key}={element.get(key)!r:.60}>"
-            if not abs(number) <= LONGEST:
-                raise ValueError(f"{shown} holds {text}, need finite numbers up to {LONGEST:g}")
+            if not abs(number) <= MAX_LENGTH:
+                raise ValueError(f"{shown} holds {text}, need finite numbers up to {MAX_LENGTH:g}")
             if number < 0 and (is_light or is_share):
                 raise ValueError(f"{shown} holds {text}, need numbers >= 0")
             # of a spectrum's pairs the wavelengths are larger

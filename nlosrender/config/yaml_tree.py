@@ -28,7 +28,7 @@ from nlosrender.errors import ConfigError, KeyPath, ValidationIssue
 MAX_BYTES = 2**20
 MAX_NODES = 100_000  # keys and values after every alias is written out
 MAX_DEPTH = 32
-_LONGEST_INTEGER = 100  # digits; Python itself refuses more than 4300, slowly
+_MAX_DIGITS = 100  # Python itself refuses more than 4300, slowly
 _TAG = "tag:yaml.org,2002:"
 _KNOWN_TAGS = tuple(_TAG + name for name in ("null", "bool", "int", "float", "str", "map", "seq"))
 
@@ -258,8 +258,8 @@ class _Builder:
             return None
         if kind == "bool":
             return text.lower() == "true"
-        if kind == "int" and len(text) > _LONGEST_INTEGER:
-            return self._unread(node, path, f"got an integer of {len(text)} digits, need at most {_LONGEST_INTEGER}.")
+        if kind == "int" and len(text) > _MAX_DIGITS:
+            return self._unread(node, path, f"got an integer of {len(text)} digits, need at most {_MAX_DIGITS}.")
         try:
             if kind == "int":
                 return int(text, 0) if text[:2] in ("0x", "0o") else int(text)

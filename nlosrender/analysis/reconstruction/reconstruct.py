@@ -12,7 +12,7 @@ from nlosrender.analysis.reconstruction.backprojection import backproject, lapla
 from nlosrender.analysis.reconstruction.phasor import phasor_field, refuse_curved
 from nlosrender.analysis.reconstruction.pulse import DEFAULT_CYCLES, Pulse, default_wavelength, pulse_warnings
 from nlosrender.analysis.reconstruction.voxel_grid import VoxelGrid, expected_box, voxel_grid
-from nlosrender.config.fields import LONGEST
+from nlosrender.config.fields import MAX_LENGTH
 from nlosrender.errors import FileError, OptionError
 from nlosrender.files.layout import Float64
 from nlosrender.files.reading.reader import open_capture
@@ -57,12 +57,12 @@ class ReconstructionSettings:
             ("voxel-size", None if self.voxel_size is None else (self.voxel_size,), (1,)),
             ("volume-size", self.volume_size, (1, 3)),
         ):
-            if lengths is not None and not (len(lengths) in counts and all(0 < x <= LONGEST for x in lengths)):
-                need = f"{' or '.join(map(str, counts))} length > 0, at most {LONGEST:g} [m]"
+            if lengths is not None and not (len(lengths) in counts and all(0 < x <= MAX_LENGTH for x in lengths)):
+                need = f"{' or '.join(map(str, counts))} length > 0, at most {MAX_LENGTH:g} [m]"
                 raise OptionError(f"--{option}: got {_listed(lengths)}, need {need}")
         center = self.volume_center
-        if center is not None and not (len(center) == 3 and all(abs(x) <= LONGEST for x in center)):
-            raise OptionError(f"--volume-center: got {_listed(center)}, need x, y, z of at most {LONGEST:g} [m]")
+        if center is not None and not (len(center) == 3 and all(abs(x) <= MAX_LENGTH for x in center)):
+            raise OptionError(f"--volume-center: got {_listed(center)}, need x, y, z of at most {MAX_LENGTH:g} [m]")
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,7 +11,7 @@ from xml.etree.ElementTree import Element
 import mitsuba as mi
 import numpy as np
 
-from nlosrender.config.fields import LONGEST, SHORTEST
+from nlosrender.config.fields import MAX_LENGTH, MIN_LENGTH
 from nlosrender.config.mitsuba_xml import image_files, read_mitsuba_xml
 from nlosrender.config.xml_shapes import named, placement, shape_parameters
 from nlosrender.config.xml_tree import numbered_text, place_of
@@ -114,10 +114,10 @@ def _check_shape(shape: Element) -> FileMesh | None:
             return None  # only Mitsuba knows its extent
         corners = box_corners(box) @ to_world[:3, :3].T + to_world[:3, 3]
         extent, reach = float(np.ptp(corners, axis=0).max()), float(np.abs(corners).max())
-        if not extent >= SHORTEST:
-            raise ValueError(f"it is {extent:.3g} m large, need at least {SHORTEST:g} m. {_ADVICE}")
-        if not reach <= LONGEST:
-            raise ValueError(f"it reaches {reach:.4g} m from the origin, need at most {LONGEST:g} m. {_ADVICE}")
+        if not extent >= MIN_LENGTH:
+            raise ValueError(f"it is {extent:.3g} m large, need at least {MIN_LENGTH:g} m. {_ADVICE}")
+        if not reach <= MAX_LENGTH:
+            raise ValueError(f"it reaches {reach:.4g} m from the origin, need at most {MAX_LENGTH:g} m. {_ADVICE}")
         if _rounded_to_nothing(mesh, corners, to_world):
             raise ValueError(f"float32 rounds it to nothing where it is. {_ADVICE}")
         return read
@@ -185,7 +185,7 @@ def _rounded_to_nothing(mesh: TriangleMesh | None, corners: Float64, to_world: F
 def _check_bounds(shape: mi.Shape, path: Path) -> None:
     """Refuse what transformations have made of a shape's numbers: nothing, or more than float32 can square."""
     box = shape_bounds(shape, 1.0)
-    if box is None or not float(np.abs(box).max()) <= LONGEST:
+    if box is None or not float(np.abs(box).max()) <= MAX_LENGTH:
         extent = "has no extent" if box is None else f"reaches {float(np.abs(box).max()):.4g} m from the origin"
         identity = f" {shape.id()!r}" if shape.id() else ""
         raise ConfigError.at(WHERE, f"{path}: its {shape.class_name()}{identity} {extent}. {_ADVICE}")

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from nlosrender.config.fields import LONGEST, SHORTEST
+from nlosrender.config.fields import MAX_LENGTH, MIN_LENGTH
 from nlosrender.errors import ConfigError
 from nlosrender.scene.bounding_box import Bounds
 from nlosrender.scene.meshes.file_mesh import FileMesh
@@ -143,8 +143,8 @@ def mesh_wall_from_config(config: MeshWallConfig) -> MeshWall:
         mesh = with_normals(read.mesh, "flat")[0].transformed(mesh_matrix(config))
         mesh = mesh.turned_round() if config.flip_normals else mesh
         size = float(np.ptp(mesh.bounds(), axis=0).max())
-        if not SHORTEST <= size <= LONGEST:
-            raise ValueError(f"it is {size:.4g} m large, need {SHORTEST:g} to {LONGEST:g} m; check its scale")
+        if not MIN_LENGTH <= size <= MAX_LENGTH:
+            raise ValueError(f"it is {size:.4g} m large, need {MIN_LENGTH:g} to {MAX_LENGTH:g} m; check its scale")
         coordinates = _checked_uvs(mesh, read.no_uvs)
         if kind == "obj":  # reading one turns v round, as Mitsuba's textures need it
             coordinates = coordinates * [1.0, -1.0] + [0.0, 1.0]
