@@ -8,8 +8,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Annotated, Any
 
-from pydantic import ValidationInfo
-
 from nlosrender.config.bsdf_table import (
     BSDF_PARAMETERS,
     BSDF_REQUIRED,
@@ -24,10 +22,10 @@ from nlosrender.config.bsdf_table import (
     TRANSMITTING,
     Kind,
 )
-from nlosrender.config.fields import Checked, as_finite
+from nlosrender.config.fields import as_finite
 from nlosrender.config.frozen import FrozenDict
 from nlosrender.config.issues import did_you_mean
-from nlosrender.config.plugin_check import TRANSFORM_KEYS, PluginCheck, checked_plugin
+from nlosrender.config.plugin_check import TRANSFORM_KEYS, PluginCheck, plugin_mapping
 from nlosrender.errors import KeyPath
 
 _NAMES = {  # known ones only: Mitsuba makes a file name of a metal's
@@ -46,25 +44,6 @@ _NUMBER_RANGES = {  # lowest and highest number allowed
 }
 
 
-def check_bsdf(value: Any, validation: ValidationInfo) -> FrozenDict:
-    """Return the BSDF dictionary frozen, numbers as floats and file names absolute.
-
-    Raises
-    ------
-    InvalidValue
-        Unknown type or parameter, a value out of range, a missing file; all of them at once.
-    """
-    return checked_plugin(lambda check, bsdf: _bsdf(check, bsdf, ()), value, validation)
-
-
-BsdfMapping = Annotated[
-    FrozenDict,
-    Checked(
-        check_bsdf,
-        {"type": "object", "required": ["type"], "properties": {"type": {"enum": list(BSDF_TYPES)}}},
-        with_context=True,
-    ),
-]
 WHITE_DIFFUSE = FrozenDict(type="diffuse", reflectance=1.0)
 
 
@@ -203,3 +182,6 @@ def _channels(check: PluginCheck, value: Any, path: KeyPath, unit: bool) -> Any:
     if len(numbers) != 3 or any(number is None or number < 0 or (unit and number > 1) for number in numbers):
         check.note_mismatch(path, value, f"[r, g, b] with each {'from 0 to 1' if unit else '>= 0'}")
     return numbers or value
+
+
+BsdfMapping = Annotated[FrozenDict, plugin_mapping(lambda check, bsdf: _bsdf(check, bsdf, ()), BSDF_TYPES)]

@@ -22,7 +22,7 @@ from nlosrender.config.vectors import length
 MIN_LENGTH, MAX_LENGTH = (
     1e-9,
     1e9,
-)  # m; shorter or longer lengths are slips of the pen, and float32 has no room for them
+)  # m; beyond them lengths are slips of the pen, and float32 has no room
 MAX_NAME_BYTES = 1000  # file systems take 255 or so and say so themselves
 _MIN_JOULES, _MAX_JOULES = 1e-15, 1e15  # the square of H stays a float32 number
 _MAX_SAMPLES = 10**12  # a path tracer takes years for them

@@ -5,7 +5,7 @@ from __future__ import annotations
 import string
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 from pydantic import Field, ValidationInfo
 
@@ -26,7 +26,7 @@ from nlosrender.config.fields import (
 )
 from nlosrender.config.frozen import FrozenDict
 from nlosrender.config.issues import InvalidValue, invalid_value, mismatch, shown
-from nlosrender.config.plugin_check import checked_plugin, config_folder, existing_file
+from nlosrender.config.plugin_check import config_folder, existing_file, plugin_mapping
 from nlosrender.config.section import BY_TYPE, ONE_OF, Section, pose_issues
 from nlosrender.config.shape_check import check_shape
 from nlosrender.errors import ValidationIssue
@@ -63,22 +63,11 @@ def _mesh_file(value: object, validation: ValidationInfo) -> Path:
     return path
 
 
-def _shape(value: Any, validation: ValidationInfo) -> FrozenDict:
-    return checked_plugin(check_shape, value, validation)
-
-
 LetterText = Annotated[str, Checked(_letters, {"type": "string", "pattern": "^[A-Z0-9 ]*[A-Z0-9][A-Z0-9 ]*$"})]
 MeshFilename = Annotated[
     Path, Checked(_mesh_file, {"type": "string", "pattern": r"\.([pP][lL][yY]|[oO][bB][jJ])$"}, with_context=True)
 ]
-ShapeMapping = Annotated[
-    FrozenDict,
-    Checked(
-        _shape,
-        {"type": "object", "required": ["type"], "properties": {"type": {"enum": list(SHAPE_TYPES)}}},
-        with_context=True,
-    ),
-]
+ShapeMapping = Annotated[FrozenDict, plugin_mapping(check_shape, SHAPE_TYPES)]
 
 
 class _HiddenItem(Section):

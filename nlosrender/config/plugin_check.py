@@ -10,7 +10,7 @@ from typing import Any
 from pydantic import ValidationInfo
 
 from nlosrender.config.encodable import is_encodable
-from nlosrender.config.fields import MAX_LENGTH, as_finite, finite_numbers
+from nlosrender.config.fields import MAX_LENGTH, Checked, as_finite, finite_numbers
 from nlosrender.config.frozen import freeze
 from nlosrender.config.issues import InvalidValue, did_you_mean, mismatch, shown
 from nlosrender.config.vectors import cross, dot
@@ -129,19 +129,18 @@ class PluginCheck:
         return {"axis": axis, "angle_deg": angle}
 
 
-def checked_plugin(walk: Callable[[PluginCheck, Any], Any], value: Any, validation: ValidationInfo) -> Any:
-    """Run ``walk`` over a plugin dictionary and return its result frozen.
+def plugin_mapping(walk: Callable[[PluginCheck, Any], Any], types: Sequence[str]) -> Checked:
+    """Return the check of a plugin dictionary: ``walk`` goes over it and returns the result, which is then frozen."""
 
-    Raises
-    ------
-    InvalidValue
-        With every issue found.
-    """
-    check = PluginCheck(config_folder(validation))
-    result = walk(check, value)
-    if check.issues:
-        raise InvalidValue(*check.issues)
-    return freeze(result)
+    def check(value: object, validation: ValidationInfo) -> Any:
+        found = PluginCheck(config_folder(validation))
+        result = walk(found, value)
+        if found.issues:
+            raise InvalidValue(*found.issues)
+        return freeze(result)
+
+    schema = {"type": "object", "required": ["type"], "properties": {"type": {"enum": list(types)}}}
+    return Checked(check, schema, with_context=True)
 
 
 def config_folder(validation: ValidationInfo) -> Path:

@@ -268,10 +268,10 @@ def test_a_worker_refuses_what_it_would_render_otherwise(folder: Path) -> None:
         job = Job(config, WHOLE, there, "llvm", cluster.processes)
         everything = WorkItem(Tile(0, 3, 0, 5), Tile(0, 1, 0, 1), ())
         future = cluster.client.submit(render_remotely, job, everything, {}, None, pure=False)
-        error = future.result(timeout=60)
-    assert isinstance(error, RemoteError)
+        remote = future.result(timeout=60)
+    assert isinstance(remote, RemoteError)
     with pytest.raises(BackendError, match=r"hidden_geometry\.1\.filename: \"sha256:0\" there, .*versions\.drjit"):
-        raise error.error()
+        raise remote.error()
 
 
 @pytest.mark.slow
