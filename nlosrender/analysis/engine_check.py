@@ -30,9 +30,8 @@ from nlosrender.rendering.outcome import missing_light
 from nlosrender.rendering.stages import bounce_axis, describe_capture, load_scene, prepare, started_backend
 
 if TYPE_CHECKING:
-    from nlosrender.engine.engines import Engine
+    from nlosrender.engine.interface import Budget, Engine
     from nlosrender.engine.launch.pilot_points import Pilot
-    from nlosrender.engine.launch.sample_schedule import Budget
     from nlosrender.engine.preflight.unsampled_paths import UnsampledPaths
 
 Float64 = NDArray[np.float64]
@@ -177,8 +176,8 @@ def check_engines(
     if config.capture.is_line_of_sight:
         raise OptionError("check-engines: one technique renders line_of_sight captures; there is nothing to compare.")
     backend = started_backend(config)
+    from nlosrender.engine.interface import Budget
     from nlosrender.engine.launch.pilot_points import pilot_of
-    from nlosrender.engine.path.engine import Budget
 
     built = load_scene(config)
     capture, time_axis = describe_capture(config, built.wall, built)
@@ -190,7 +189,7 @@ def check_engines(
         progress(technique.name)
         changes = {"spp": None, "temporal_kernel_opl": 0.0, **technique.changes}
         changed = config.model_copy(update={"render": config.render.model_copy(update=changes)})
-        _, engine = prepare(changed, backend, built, capture, time_axis, replicas=replicas)
+        _, engine = prepare(changed, backend, built, capture, time_axis, changes={"replicas": replicas})
         missing = missing or missing_light(engine)
         trials.append(try_technique(technique, engine, pilot, budget))
     pairs = compare_trials(trials, bounce_axis(config), pilot, significance)

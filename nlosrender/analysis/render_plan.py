@@ -71,8 +71,7 @@ def plan_render(config: Config) -> RenderPlan:
     warnings = Warnings(lambda text: None)
     warnings.emit(config_warnings(config))
     backend = started_backend(config)  # chooses LLVM, which has to come before Dr.Jit is imported:
-    from nlosrender.engine.path.engine import Budget
-    from nlosrender.engine.preflight.batch_memory import batch_bytes
+    from nlosrender.engine.interface import Budget
     from nlosrender.engine.preflight.omitted_work import omitted_work
     from nlosrender.engine.preflight.time_estimate import estimate_render_time
 
@@ -83,7 +82,7 @@ def plan_render(config: Config) -> RenderPlan:
     set_up_seconds = time.perf_counter() - begun
 
     render, capture, time_axis = config.render, engine.capture, engine.time_axis
-    n_bytes = batch_bytes(engine, plan)  # refuses what is too large before the pilot allocates a part of it
+    n_bytes = engine.batch_bytes(plan)  # refuses what is too large before the pilot allocates a part of it
     budget = Budget(render.spp, render.target_error, render.time_limit_s)
     rendering = estimate_render_time(engine, plan, budget, backend.lanes)
     size = expected_file_size(config, header, engine, rendering.lit_shares)

@@ -41,7 +41,7 @@ def trace_any_hit(loaded: LoadedScene, lit: ShadowRayTargets, *, only_asked: boo
 
     from nlosrender.engine.launch.device_arrays import on_device
     from nlosrender.engine.launch.morton import morton_order
-    from nlosrender.engine.path.laser_connections import WALL_OFFSET
+    from nlosrender.engine.launch.ray_offsets import WALL_OFFSET
 
     built, n_sensors = loaded.built, loaded.capture.n_sensors
     points = loaded.capture.sensor_grid.positions.reshape(-1, 3) / built.unit

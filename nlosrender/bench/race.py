@@ -58,7 +58,7 @@ class OwnContender:
         RenderError
             The result is not finite, or does not fit the memory.
         """
-        from nlosrender.engine.path.engine import Budget
+        from nlosrender.engine.interface import Budget
 
         if self.options["engine"] == "path":
             budget = Budget(spp=FIRST_SAMPLES * 4**level)

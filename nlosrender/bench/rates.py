@@ -32,7 +32,7 @@ def gather_rate(loaded: LoadedScene) -> dict[str, Any]:
     RenderError
         The virtual-light engine does not take the scene.
     """
-    from nlosrender.engine.path.engine import Budget
+    from nlosrender.engine.interface import Budget
 
     plan, engine = virtual_lights_of(loaded)
     patch_scale = engine.calibrate(Budget(target_error=GATHER_TARGET)).patch_scale or 1.0

@@ -44,7 +44,7 @@ def find_reference(loaded: LoadedScene, seconds: float) -> Reference:
 
 def _refined(loaded: LoadedScene, seconds: float) -> Reference:
     """Gather at finer and finer targets while the next one can be expected to fit."""
-    from nlosrender.engine.path.engine import Budget
+    from nlosrender.engine.interface import Budget
 
     timer, target = Timer(), FIRST_TARGET
     options = {"engine": "virtual_lights"}
@@ -60,7 +60,7 @@ def _refined(loaded: LoadedScene, seconds: float) -> Reference:
 
 def _long_run(loaded: LoadedScene, seconds: float) -> Reference:
     """Gather the third bounce as finely as a third of the time allows, and trace the rest of the light in the rest."""
-    from nlosrender.engine.path.engine import Budget
+    from nlosrender.engine.interface import Budget
 
     timer = Timer()
     options = {"engine": "virtual_lights"}

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +19,7 @@ from nlosrender.rendering import stages
 
 if TYPE_CHECKING:
     from nlosrender.capture.plan import Plan
-    from nlosrender.engine.path.engine import Budget
+    from nlosrender.engine.interface import Budget
     from nlosrender.engine.virtual_lights.engine import VirtualLightEngine
     from nlosrender.scene.build import BuiltScene
 
@@ -98,13 +98,11 @@ def virtual_lights_of(loaded: LoadedScene) -> tuple[Plan, VirtualLightEngine]:
     RenderError
         The engine does not take the scene.
     """
-    from nlosrender.engine.virtual_lights.engine import VirtualLightEngine
-
     config = loaded.scene.config(engine="virtual_lights", split_bounces=False)
     plan, engine = stages.prepare(config, loaded.backend, loaded.built, loaded.capture, loaded.time_axis)
-    if not isinstance(engine, VirtualLightEngine):
+    if engine.name != "virtual_lights":
         raise RenderError(f"{loaded.scene.name}: the virtual-light engine does not take this scene")
-    return plan, engine
+    return plan, cast("VirtualLightEngine", engine)
 
 
 def render(loaded: LoadedScene, budget: Budget, seed: int = 0, options: Mapping[str, Any] | None = None) -> Run:
@@ -123,7 +121,6 @@ def render(loaded: LoadedScene, budget: Budget, seed: int = 0, options: Mapping[
         The result is not finite, or does not fit the memory.
     """
     from nlosrender.engine.launch.histogram import relative_l2_error
-    from nlosrender.engine.virtual_lights.engine import VirtualLightEngine
 
     config = loaded.scene.config(split_bounces=False, seed=seed, **(options or {}))
     values = np.zeros(loaded.shape)
@@ -131,8 +128,7 @@ def render(loaded: LoadedScene, budget: Budget, seed: int = 0, options: Mapping[
     samples: list[int] = []
     timer = Timer()
     plan, engine = stages.prepare(config, loaded.backend, loaded.built, loaded.capture, loaded.time_axis)
-    if isinstance(engine, VirtualLightEngine):
-        engine.set_up()
+    engine.set_up()
     _, setup_seconds = timer.read()
     for batch in plan.batches:
         histogram = engine.render(batch, budget)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
@@ -14,8 +14,8 @@ from nlosrender.bench.scenes import WALL_SIZE, BenchScene, closed_room, many_las
 
 if TYPE_CHECKING:
     from nlosrender.capture.plan import Batch
-    from nlosrender.engine.engines import Engine
-    from nlosrender.engine.path.engine import Budget, PathEngine
+    from nlosrender.engine.interface import Budget, Engine
+    from nlosrender.engine.path.engine import PathEngine
     from nlosrender.engine.virtual_lights.engine import VirtualLightEngine
 
 ROUNDS = 3
@@ -70,7 +70,7 @@ def measure_skips(scenes: Sequence[BenchScene]) -> list[Saving]:
 
 def of_gather(loaded: LoadedScene) -> Iterator[Saving]:
     """Yield what the gather leaves out: rays nothing can stop, the dark patches, colour."""
-    from nlosrender.engine.path.engine import Budget
+    from nlosrender.engine.interface import Budget
 
     plan, engine = virtual_lights_of(loaded)
     patch_scale = engine.calibrate(Budget(target_error=GATHER_TARGET)).patch_scale or 1.0
@@ -123,7 +123,7 @@ def _of_regions(loaded: LoadedScene) -> Iterator[Saving]:
     plan, engine = virtual_lights_of(loaded)
     third, bin_width = engine.third, engine.tessellator.size_field.bin_width
     undivided = Tessellator(engine.built, engine.capture, bin_width, may_divide=False)
-    one = ThirdBounce(third.paths, undivided, third.settings, third.lanes)
+    one = ThirdBounce(third.device, undivided, third.settings, third.lanes)
     ways = [lambda of=of: of.gather(plan.batches[0], FINENESS).values for of in (third, one)]
     yield _saving("patches of other regions of the wall", loaded, *ways)
 
@@ -134,62 +134,58 @@ def _of_reciprocity(loaded: LoadedScene) -> Iterator[Saving]:
 
     plan, engine = virtual_lights_of(loaded)
     third = engine.third
-    every = ThirdBounce(third.paths, third.tessellator, third.settings, third.lanes, is_reciprocal=False)
+    every = ThirdBounce(third.device, third.tessellator, third.settings, third.lanes, is_reciprocal=False)
     ways = [lambda of=of: of.gather(plan.batches[0], FINENESS).values for of in (third, every)]
     yield _saving("pairs of points that reciprocity gives", loaded, *ways)
 
 
 def of_paths(loaded: LoadedScene) -> Iterator[Saving]:
     """Yield what the path engine leaves out: rays nothing can stop, the technique that is not needed."""
-    from nlosrender.engine.path.engine import PathEngine
-    from nlosrender.engine.path.full_loop import load_path_integrator
     from nlosrender.rendering import stages
 
     config = loaded.scene.config(engine="path", split_bounces=False, spp=PATHS)
     plan, engine = stages.prepare(config, loaded.backend, loaded.built, loaded.capture, loaded.time_axis)
-    if not isinstance(engine, PathEngine):
+    if engine.name != "path":
         return
 
     def render(other: PathEngine) -> Callable[[], Float64]:
-        from nlosrender.engine.path.engine import Budget
+        from nlosrender.engine.interface import Budget
 
         return lambda: np.concatenate([other.render(b, Budget(spp=PATHS)).mean for b in plan.batches], axis=3)
 
     def engine_with(**options: Any) -> PathEngine:
-        return PathEngine(loaded.built, loaded.capture, loaded.time_axis, replace(engine.options, **options))
+        parts = loaded.backend, loaded.built, loaded.capture, loaded.time_axis
+        return cast("PathEngine", stages.prepare(config, *parts, changes=options)[1])
 
-    if not engine.settings.needs_visibility:
+    usual = engine_with()
+    if not usual.settings.needs_visibility:
         tracing = engine_with()
-        tracing.integrator = load_path_integrator(replace(engine.settings, needs_visibility=True))
-        yield _saving("rays of paths where nothing can lie between", loaded, render(engine), render(tracing))
+        tracing.settings = replace(usual.settings, needs_visibility=True)
+        yield _saving("rays of paths where nothing can lie between", loaded, render(usual), render(tracing))
     by_bsdf = engine_with(hidden_geometry_sampling=False)
     if by_bsdf.hidden_aabb is not None:
         tracing = engine_with(hidden_geometry_sampling=False)
         tracing.hidden_aabb = None
         what = "rays of paths that pass the hidden geometry by (BSDF sampling)"
         yield _saving(what, loaded, render(by_bsdf), render(tracing))
-    if engine.p_hidden_sampling in (0.0, 1.0):
-        kept = "hidden geometry" if engine.p_hidden_sampling else "BSDF"
+    if usual.p_hidden_sampling in (0.0, 1.0):
+        kept = "hidden geometry" if usual.p_hidden_sampling else "BSDF"
         mixed = engine_with(p_hidden_sampling=MIXTURE)
-        yield _saving(f"MIS where {kept} sampling suffices", loaded, render(engine), render(mixed))
+        yield _saving(f"MIS where {kept} sampling suffices", loaded, render(usual), render(mixed))
 
 
 def _of_late_light(loaded: LoadedScene) -> Iterator[Saving]:
     """Yield what is left out that comes after the window: of as many paths, and of walks to the same error."""
-    from nlosrender.engine.path.engine import Budget, PathEngine
-    from nlosrender.engine.virtual_lights.engine import VirtualLightEngine
+    from nlosrender.engine.interface import Budget
     from nlosrender.rendering import stages
 
     built, capture, time_axis = loaded.built, loaded.capture, loaded.time_axis
     for name in ("path", "virtual_lights"):
         config = loaded.scene.config(engine=name, split_bounces=False)
         plan, engine = stages.prepare(config, loaded.backend, built, capture, time_axis)
-        options = replace(engine.options, has_time_gate=False)
-        if isinstance(engine, VirtualLightEngine):
-            patient: Engine = VirtualLightEngine(built, capture, time_axis, options, engine.lanes)
-            budget = Budget(target_error=ROOM_TARGET)
-        else:
-            patient, budget = PathEngine(built, capture, time_axis, options), Budget(spp=PATHS)
+        changes = {"has_time_gate": False}
+        _, patient = stages.prepare(config, loaded.backend, built, capture, time_axis, changes=changes)
+        budget = Budget(target_error=ROOM_TARGET) if engine.name == "virtual_lights" else Budget(spp=PATHS)
 
         def render(one: Engine, budget: Budget = budget, batches: Sequence[Batch] = plan.batches) -> Float64:
             return np.concatenate([one.render(batch, one.calibrate(budget)).mean for batch in batches], axis=3)

@@ -1,4 +1,4 @@
-"""Which engine renders a scene, and why: the cheapest one that is right."""
+"""The planner: which engine renders a scene, and why. The one place that knows which engines there are."""
 
 from __future__ import annotations
 
@@ -8,9 +8,10 @@ from nlosrender.capture.bounces import THIRD_BOUNCE
 from nlosrender.capture.grids import Capture
 from nlosrender.capture.time_axis import TimeAxis
 from nlosrender.config.render import RenderConfig
-from nlosrender.engine.engines import Engine
+from nlosrender.engine.interface import Engine
+from nlosrender.engine.launch.device_capture import DeviceCapture, RenderOptions
 from nlosrender.engine.line_of_sight.engine import LineOfSightEngine
-from nlosrender.engine.path.engine import PathEngine, RenderOptions
+from nlosrender.engine.path.engine import PathEngine
 from nlosrender.engine.virtual_lights.elements.tessellator import MAX_PATCHES, can_tessellate, wall_sees_itself
 from nlosrender.engine.virtual_lights.engine import VirtualLightEngine, is_lambertian
 from nlosrender.engine.virtual_lights.third_bounce import COARSEST_SCALE
@@ -18,7 +19,7 @@ from nlosrender.scene.build import BuiltScene
 from nlosrender.scene.view import BuiltView
 
 TOUCHING = 2e-3  # engine units: a surface this near to laser or sensor points takes patches of its own for each of them
-MOST_NEAR = 100_000  # patches of such surfaces at the coarsest, where paths find the same light
+MAX_NEAR_PATCHES = 100_000  # patches of such surfaces at the coarsest, where paths find the same light
 MAX_TRIANGLES = 5_000_000  # of all meshes: merging them takes about 1 kB each on the way
 
 
@@ -49,19 +50,21 @@ def choose_engine(
         reason = "some hidden surfaces are not Lambertian"
     if reason is None and render.engine == "auto" and wall_sees_itself(built) and built.wall_shape.is_mesh():
         reason = "the relay wall is a mesh that sees itself: the edges between its triangles take very many patches"
+    device = DeviceCapture(built, capture, time_axis, options)
     if reason is not None:
-        return PathEngine(built, capture, time_axis, options, reason=reason)
-    engine = VirtualLightEngine(built, capture, time_axis, options, lanes)
+        return PathEngine(device, reason=reason)
+    further = PathEngine(device, first_bounce=THIRD_BOUNCE + 1)
+    engine = VirtualLightEngine(device, further, lanes)
     if engine.tessellator.nearest_round < TOUCHING:
         reason = "a round surface, which is cut into patches of one size, touches a laser or sensor point"
-        return PathEngine(built, capture, time_axis, options, reason=reason)
+        return PathEngine(device, reason=reason)
     if engine.tessellator.n_round_elements > MAX_PATCHES:
         reason = "a round surface is so narrow that it would be cut into millions of patches"
-        return PathEngine(built, capture, time_axis, options, reason=reason)
+        return PathEngine(device, reason=reason)
     if render.engine == "virtual_lights":
         engine.reason = "asked for"
     elif (reason := _obstacle_close_by(engine, capture)) is not None:
-        return PathEngine(built, capture, time_axis, options, reason=reason)
+        return PathEngine(device, reason=reason)
     return engine
 
 
@@ -75,7 +78,7 @@ def _obstacle_close_by(engine: VirtualLightEngine, capture: Capture) -> str | No
         return None
     if capture.scan_type == "confocal":
         return "hidden geometry touches a laser or sensor point"
-    most = MAX_PATCHES if tessellator.nearest_to_laser < TOUCHING else MOST_NEAR
+    most = MAX_PATCHES if tessellator.nearest_to_laser < TOUCHING else MAX_NEAR_PATCHES
     if tessellator.count(COARSEST_SCALE) > most:
         return "hidden geometry touches so many points that paths cost less"
     return None

@@ -27,7 +27,7 @@ from nlosrender.rendering.work_items import FinishedItem, ItemWriter
 if TYPE_CHECKING:
     from distributed import Future, as_completed
 
-    from nlosrender.engine.path.engine import Budget
+    from nlosrender.engine.interface import Budget
 
 STOP_SECONDS = 20.0  # grace for work items in flight after a signal: batch systems kill after 30 s
 PER_WORKER = 2  # work items on the way for each worker: the one it renders, and the next or the last

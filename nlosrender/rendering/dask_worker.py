@@ -98,7 +98,7 @@ def render_remotely(
             with stopwatch.stage("scene"):
                 engine, chunker = _WORKER.prepared(job)
                 limit_threads(threads or _threads_of_worker())
-            from nlosrender.engine.path.engine import Budget
+            from nlosrender.engine.interface import Budget
 
             finished = render_timed(engine, item, Budget(**budget), chunker, stopwatch)
         begun = time.perf_counter()

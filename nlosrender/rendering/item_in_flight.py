@@ -16,7 +16,7 @@ from nlosrender.interruption import StopRequest, uninterrupted
 from nlosrender.rendering.render_report import Progress, Warn
 
 if TYPE_CHECKING:
-    from nlosrender.engine.path.engine import Budget
+    from nlosrender.engine.interface import Budget
 
 KEEP_SECONDS = 30.0  # between two states: a kill costs about a minute at most, and quick work items write none
 KEEP_COST = 0.1  # largest share of the time spent on writing states, which may have gigabytes

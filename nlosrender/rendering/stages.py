@@ -5,7 +5,10 @@ Mitsuba and Dr.Jit are imported inside the functions: the backend has to be chos
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Mapping
+from dataclasses import replace
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any
 
 from nlosrender.capture.arrivals import latest_arrival
 from nlosrender.capture.bounces import BounceAxis, first_bounce_of
@@ -24,7 +27,7 @@ from nlosrender.scene.walls.wall import RelayWall
 from nlosrender.scene.walls.wall_from_config import relay_wall_from_config
 
 if TYPE_CHECKING:
-    from nlosrender.engine.path.engine import Budget
+    from nlosrender.engine.interface import Budget
     from nlosrender.rendering.work_items import Engine
     from nlosrender.scene.build import BuiltScene
     from nlosrender.scene.view import BuiltView
@@ -43,7 +46,11 @@ def started_backend(config: Config) -> Backend:
 
 
 def set_up_engine(
-    config: Config, backend: Backend, selection: Selection = WHOLE, processes: ProcessLayout = ONE_PROCESS
+    config: Config,
+    backend: Backend,
+    selection: Selection = WHOLE,
+    processes: ProcessLayout = ONE_PROCESS,
+    changes: Mapping[str, Any] = MappingProxyType({}),
 ) -> tuple[Plan, Engine, CaptureHeader]:
     """Stages 2 to 4 up to the first ray: scene, capture, plan, engine, and what the file will say of them."""
     from nlosrender.engine.preflight.omitted_work import shared_samples
@@ -51,13 +58,13 @@ def set_up_engine(
     built = load_view(config) if config.capture.is_line_of_sight else load_scene(config)
     capture, time_axis = describe_capture(config, built.wall, built)
     with processes.named(config.render.memory_limit_bytes):
-        plan, engine = prepare(config, backend, built, capture, time_axis, selection, processes)
+        plan, engine = prepare(config, backend, built, capture, time_axis, selection, processes, changes)
     return plan, engine, describe_file(config, built, capture, time_axis, shared_samples(engine))
 
 
 def calibrated_budget(config: Config, engine: Engine) -> Budget:
     """Return when to stop, settled for the whole capture at once: no result depends on how the work is cut."""
-    from nlosrender.engine.path.engine import Budget
+    from nlosrender.engine.interface import Budget
 
     return engine.calibrate(Budget(config.render.spp, config.render.target_error, config.render.time_limit_s))
 
@@ -119,10 +126,10 @@ def prepare(
     time_axis: TimeAxis,
     selection: Selection = WHOLE,
     processes: ProcessLayout = ONE_PROCESS,
-    replicas: int | None = None,
+    changes: Mapping[str, Any] = MappingProxyType({}),
 ) -> tuple[Plan, Engine]:
-    """Stages 3 and 4: cut the work into items and set up the engine; ``replicas`` other than the plan's on request."""
-    from nlosrender.engine.path.engine import RenderOptions
+    """Stages 3 and 4: cut the work into items and set up the engine; ``changes`` to ``RenderOptions`` on request."""
+    from nlosrender.engine.launch.device_capture import RenderOptions
     from nlosrender.engine.planner import choose_engine
 
     render = config.render
@@ -150,9 +157,10 @@ def prepare(
         russian_roulette=render.russian_roulette,
         channels=channels,
         seed=render.seed,
-        replicas=replicas or plan.replicas,
+        replicas=plan.replicas,
         temporal_kernel_bins=render.temporal_kernel_opl / time_axis.bin_width_opl,
     )
+    options = replace(options, **changes)
     return plan, choose_engine(render, built, capture, time_axis, options, backend.lanes)
 
 

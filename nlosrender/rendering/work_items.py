@@ -20,9 +20,8 @@ from nlosrender.interruption import uninterrupted
 from nlosrender.rendering.render_report import Stopwatch
 
 if TYPE_CHECKING:
-    from nlosrender.engine.engines import Engine
+    from nlosrender.engine.interface import Budget, Engine
     from nlosrender.engine.launch.histogram import Histogram
-    from nlosrender.engine.path.engine import Budget
 
 
 def render_item(engine: Engine, item: WorkItem, budget: Budget, passes: Passes) -> Histogram:

@@ -7,7 +7,6 @@ one sign, each sum off by at most 1e4 * 1.1e-16 = 1e-12.
 from __future__ import annotations
 
 import copy
-import sys
 
 import numpy as np
 import pytest
@@ -68,17 +67,14 @@ def test_cutting_a_capture_into_batches_changes_no_bit(scan: str, spot: float) -
 
 @pytest.mark.parametrize("spot", [0.0, 0.05])
 @pytest.mark.parametrize(("max_bounces", "p_hidden_sampling"), [(3, 1.0), (4, 0.0), (4, 0.5), (4, 1.0)])
-def test_cutting_a_render_into_launches_changes_no_bit(
-    max_bounces: int, p_hidden_sampling: float, spot: float, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_cutting_a_render_into_launches_changes_no_bit(max_bounces: int, p_hidden_sampling: float, spot: float) -> None:
     """The random state is carried on: how fast a machine is, and so how long its launches are, does not matter."""
     config = interreflections(max_bounces=max_bounces, capture={"laser_spot_radius": spot})
     usual = render(config, p_hidden_sampling=p_hidden_sampling)
-    # loaded by the render above, once the backend had been started
-    sampling = sys.modules["nlosrender.engine.launch.sample_schedule"]
-    monkeypatch.setattr(sampling, "FIRST_SAMPLES", 3)
-    monkeypatch.setattr(sampling, "PASS_SECONDS", 1e-9)  # one sample per lane and launch
-    assert_same(usual, render(config, p_hidden_sampling=p_hidden_sampling))
+    from nlosrender.engine.launch.schedule import ScheduleTuning  # the backend has been started
+
+    one_by_one = ScheduleTuning(pass_seconds=1e-9, first_samples=3)  # one sample per lane and launch
+    assert_same(usual, render(config, p_hidden_sampling=p_hidden_sampling, schedule=one_by_one))
 
 
 def test_bounces_sum_to_the_unsplit_total() -> None:

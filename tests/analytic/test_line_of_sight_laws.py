@@ -103,14 +103,13 @@ def test_batches_change_no_bit() -> None:
         assert np.array_equal(getattr(whole, name), getattr(rows, name))
 
 
-def test_samples_of_a_launch_all_count(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_samples_of_a_launch_all_count() -> None:
     """Many short launches are one long one, to the last bit."""
-    from nlosrender.engine.launch import sample_schedule as sampling
-
     long = see(crowded())
-    monkeypatch.setattr(sampling, "FIRST_SAMPLES", 3)
-    monkeypatch.setattr(sampling, "PASS_SECONDS", 1e-9)
-    assert np.array_equal(long.mean, see(crowded()).mean)
+    from nlosrender.engine.launch.schedule import ScheduleTuning  # the backend has been started
+
+    short = see(crowded(), schedule=ScheduleTuning(pass_seconds=1e-9, first_samples=3))
+    assert np.array_equal(long.mean, short.mean)
 
 
 def test_target_error_is_met() -> None:

@@ -76,7 +76,7 @@ def test_one_laser_lights_each_resolution_once(scan: str, lighting: list[int]) -
     from nlosrender.engine.launch.pilot_points import pilot_of
 
     third = gather_of(scan)
-    for batch in (pilot_of(third.paths.capture), *BATCHES[scan]):
+    for batch in (pilot_of(third.device.capture), *BATCHES[scan]):
         for patch_scale in (0.8, 0.5):
             third.gather(batch, patch_scale)
     assert len(lighting) == len(set(lighting)) == 2
@@ -108,7 +108,7 @@ def test_what_was_lit_for_a_few_points_is_cleared_for_many() -> None:
     from nlosrender.engine.launch.pilot_points import pilot_of
 
     third, batch = gather_of("single", min_mask_sensors=20), BATCHES["single"][0]
-    pilot = pilot_of(third.paths.capture, 3)
+    pilot = pilot_of(third.device.capture, 3)
     third.gather(pilot, 0.5)
     assert not third.shadow_ray_targets(pilot, 0.5).mask.any()
     known = third.shadow_ray_targets(batch, 0.5).mask

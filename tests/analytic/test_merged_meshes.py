@@ -136,7 +136,7 @@ def test_the_number_of_patches_follows_the_accuracy_not_the_triangles(tmp_path: 
 
 def rendered(config: dict[str, Any], folder: Path, target: float) -> tuple[Array, float, Array, int]:
     """Return H (laser, sensor, bin), the error stated, H with no triangles merged, and the number of patches."""
-    from nlosrender.engine.path.engine import Budget
+    from nlosrender.engine.interface import Budget
 
     stage = Stage.of(config, folder)
     engine = stage.engine
@@ -145,7 +145,7 @@ def rendered(config: dict[str, Any], folder: Path, target: float) -> tuple[Array
     stated = float(np.sqrt(result.variance.sum() / (result.mean**2).sum()))
     used = len(engine.tessellator.patches(budget.patch_scale))
     unmerged, scale = stage.tuned(merge_ratio=0.0).engine, min(budget.patch_scale, 1.0) / 2
-    truth = unmerged.third.gather(stage.batch, scale).values[0, 0, ..., :-1] * unmerged.paths.scale
+    truth = unmerged.third.gather(stage.batch, scale).values[0, 0, ..., :-1] * unmerged.device.scale
     return result.mean[0, stage.bounces.slot(3)], stated, truth, used
 
 
@@ -221,7 +221,7 @@ def smooth_ball(folder: Path, n: int) -> dict[str, Any]:
 
 def test_a_fine_mesh_of_a_ball_is_the_ball(tmp_path: Path) -> None:
     """Merged triangles with shading normals send on what Mitsuba's own sphere does, within what both state."""
-    from nlosrender.engine.path.engine import Budget
+    from nlosrender.engine.interface import Budget
 
     ball = {"type": "sphere", "center": [0.1, -0.1, 0.7], "radius": 0.25}
     ball["bsdf"] = {"type": "diffuse", "reflectance": 0.8}

@@ -65,10 +65,14 @@ def prepared(scene: dict[str, Any]) -> Callable[[Passes], Any]:
     """Return what renders all of a capture as one work item, every time as a process that has just been started."""
     config = configured(scene)
     backend = start_backend("llvm", colored=config.is_colored)
-    from nlosrender.engine.path.engine import Budget
+    from nlosrender.engine.interface import Budget
+    from nlosrender.engine.launch.schedule import ScheduleTuning
+
+    # passes of a few paths, patches and VPLs
+    short = ScheduleTuning(math.inf, max_first_pairs=2**9, first_gather_pairs=2**6, first_vpl_pairs=2**17)
 
     def render(passes: Passes) -> Any:
-        plan, engine, _ = stages.set_up_engine(config, backend)
+        plan, engine, _ = stages.set_up_engine(config, backend, changes={"schedule": short})
         budget = stages.calibrated_budget(config, engine)
         assert isinstance(budget, Budget)
         (item,) = plan.work_items
@@ -78,20 +82,6 @@ def prepared(scene: dict[str, Any]) -> Callable[[Passes], Any]:
         return render_item(engine, item, budget, passes)
 
     return render
-
-
-@pytest.fixture(autouse=True)
-def _short_passes(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Passes of a few paths, patches and sites."""
-    start_backend("llvm")
-    from nlosrender.engine.launch import sample_schedule as sampling
-    from nlosrender.engine.virtual_lights.gather import gather_passes
-    from nlosrender.engine.virtual_lights.vpls import gather as further_bounces
-
-    monkeypatch.setattr(sampling, "MOST_AT_FIRST", 2**9)
-    monkeypatch.setattr(sampling, "PASS_SECONDS", math.inf)
-    monkeypatch.setattr(gather_passes, "FIRST_PAIRS", 2**6)
-    monkeypatch.setattr(further_bounces, "FIRST_PAIRS", 2**17)
 
 
 @pytest.mark.parametrize(

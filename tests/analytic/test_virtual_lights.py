@@ -64,7 +64,7 @@ def start(config: dict):
 
 def gathered(*hidden: dict, scan: str = "single", error: float = 0.01, **more) -> tuple[np.ndarray, float, object]:
     """Return H (ly, lx, sy, sx, bin) of all bounces, the estimated relative error, and the engine that rendered."""
-    from nlosrender.engine.path.engine import Budget
+    from nlosrender.engine.interface import Budget
 
     config = flat_wall(*hidden, scan=scan, bins=BINS, spp=None, target_error=error, engine="virtual_lights", **more)
     _, capture, _, plan, engine = start(config)
@@ -150,7 +150,7 @@ def test_legs_and_start_shift_the_gather_as_they_shift_paths() -> None:
     }
     config = flat_wall(PLATE, capture=capture, bins=(1.5, 0.04, 100), spp=16384)
     paths = render(config, replicas=32)
-    from nlosrender.engine.path.engine import Budget
+    from nlosrender.engine.interface import Budget
 
     _, _, _, plan, engine = start(config | {"render": {"max_bounces": 3, "engine": "virtual_lights"}})
     histogram = engine.render(plan.batches[0], Budget(target_error=0.002))
@@ -164,7 +164,7 @@ def test_further_bounces_come_on_top(max_bounces: int | None) -> None:
     scene = (PLATE, BALL | {"center": [-0.45, 0.2, 0.7], "radius": 0.25})
     config = flat_wall(*scene, bins=(0.6, 0.08, 80), spp=60000, max_bounces=max_bounces)
     paths: Rendering = render(config, replicas=32)
-    from nlosrender.engine.path.engine import Budget
+    from nlosrender.engine.interface import Budget
 
     _, _, _, plan, engine = start(config | {"render": {"max_bounces": max_bounces, "engine": "virtual_lights"}})
     histogram = engine.render(plan.batches[0], Budget(target_error=0.005))
@@ -188,7 +188,7 @@ def test_leaving_out_visibility_rays_changes_nothing() -> None:
     """Before a planar wall nothing hides a convex object from it: with and without rays H is the same."""
     from dataclasses import replace
 
-    from nlosrender.engine.path.engine import Budget
+    from nlosrender.engine.interface import Budget
 
     config = flat_wall(BALL, bins=BINS, spp=None, target_error=0.02, engine="virtual_lights")
     results = []
@@ -366,7 +366,7 @@ def test_rough_surfaces_agree_with_the_path_engine() -> None:
     """Any smooth BSDF: a rough conductor's lobe, evaluated at the patches."""
     plate = PLATE | {"bsdf": {"type": "roughconductor", "alpha": 0.5}}
     paths = render(flat_wall(plate, bins=(0.6, 0.08, 80), spp=16384), replicas=32)
-    from nlosrender.engine.path.engine import Budget
+    from nlosrender.engine.interface import Budget
 
     config = flat_wall(plate, bins=(0.6, 0.08, 80)) | {"render": {"max_bounces": 3, "engine": "virtual_lights"}}
     _, _, _, plan, engine = start(config)
@@ -389,8 +389,8 @@ def test_a_cylinder_is_round(scan: str, inside: bool) -> None:
 
 def test_a_time_limit_that_the_gather_uses_up_still_gives_all_bounces() -> None:
     """What is left of the time may be nothing: the further bounces then get their shortest run."""
+    from nlosrender.engine.interface import Budget
     from nlosrender.engine.launch.passes import Passes
-    from nlosrender.engine.path.engine import Budget
 
     config = flat_wall(PLATE, BALL) | {"render": {"max_bounces": 5, "engine": "virtual_lights", "time_limit_s": 1e-6}}
     _, _, _, plan, engine = start(config)

@@ -167,7 +167,7 @@ def test_nor_of_regions(scan: str) -> None:
 
 def test_nor_of_further_bounces() -> None:
     """VPLs are seen past the same surfaces: from one seed the same contributions arrive."""
-    from nlosrender.engine.path.engine import Budget
+    from nlosrender.engine.interface import Budget
 
     results = []
     for least in (0, NEVER):

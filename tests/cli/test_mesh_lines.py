@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -42,9 +43,11 @@ def test_every_command_has_the_same_line(folder: Path, monkeypatch: pytest.Monke
     from nlosrender.engine.backend import start as backend
 
     backend.start_backend("llvm")
-    from nlosrender.engine.preflight import time_estimate as forecast
+    from nlosrender.engine.interface import PilotSeconds
+    from nlosrender.engine.preflight import time_estimate
 
-    monkeypatch.setattr(forecast, "PILOT_SECONDS", 0.02)
+    quick = partial(time_estimate.estimate_render_time, pilot=PilotSeconds(tracing=0.02))
+    monkeypatch.setattr(time_estimate, "estimate_render_time", quick)
     checked, planned = run(folder, "validate", "a.yaml"), run(folder, "plan", "a.yaml")
     rendered = run(folder, "render", "a.yaml", "--quiet")
     for done in (checked, planned, rendered):

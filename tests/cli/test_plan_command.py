@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from functools import partial
 from pathlib import Path
 
 import h5py
@@ -47,9 +48,11 @@ def short_pilot(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     from nlosrender.engine.backend import start as backend
 
     backend.start_backend("llvm")  # Mitsuba starts before the engine modules are imported
-    from nlosrender.engine.preflight import time_estimate as forecast
+    from nlosrender.engine.interface import PilotSeconds
+    from nlosrender.engine.preflight import time_estimate
 
-    monkeypatch.setattr(forecast, "PILOT_SECONDS", 0.02)
+    quick = partial(time_estimate.estimate_render_time, pilot=PilotSeconds(tracing=0.02))
+    monkeypatch.setattr(time_estimate, "estimate_render_time", quick)
     monkeypatch.chdir(tmp_path)
 
 

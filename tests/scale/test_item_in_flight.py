@@ -6,6 +6,7 @@ import errno
 import math
 import os
 import signal
+from functools import partial
 from pathlib import Path
 
 import h5py
@@ -13,6 +14,7 @@ import numpy as np
 import pytest
 from support.rendering import configured, flat_wall
 
+from nlosrender import pipeline
 from nlosrender.config.document import Config
 from nlosrender.engine.backend.start import start_backend
 from nlosrender.errors import FileError, IncompleteRender, InterruptedRender
@@ -27,9 +29,10 @@ PLATE = {"type": "rectangle", "width": 0.8, "height": 0.6, "center": [0.1, 0, 1.
 def config(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Config:
     """A capture of one unit in several launches, however fast the machine; a signal ends it at once."""
     start_backend("llvm")
-    from nlosrender.engine.launch import sample_schedule as sampling
+    from nlosrender.engine.launch.schedule import ScheduleTuning
 
-    monkeypatch.setattr(sampling, "PASS_SECONDS", math.inf)  # launches of 1, 4, 20, ... paths a lane
+    long_launches = {"schedule": ScheduleTuning(pass_seconds=math.inf)}  # of 1, 4, 20, ... paths a lane
+    monkeypatch.setattr(pipeline, "set_up_engine", partial(pipeline.set_up_engine, changes=long_launches))
     monkeypatch.setattr(item_in_flight, "SOON_SECONDS", 0.0)
     scene = flat_wall(PLATE, max_bounces=4, spp=60_000)
     return configured(scene | {"output": {"path": str(tmp_path / "a.hdf5")}})

@@ -52,7 +52,7 @@ def compare(
 ) -> None:
     """Render a wall with both engines, ``seeds`` times each, and compare sums."""
     start_backend("llvm")
-    from nlosrender.engine.path.engine import Budget
+    from nlosrender.engine.interface import Budget
 
     write_uv_ply(folder / "waves.ply", *sheet(wavy(2.0, 1.6, 0.1), 12, 10))
     stage = Stage.of(scene(name, scan, max_bounces=max_bounces), folder)

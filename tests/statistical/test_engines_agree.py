@@ -24,7 +24,7 @@ def compare(
 ) -> None:
     """Render a scene with both engines and compare."""
     start_backend("llvm")
-    from nlosrender.engine.path.engine import Budget
+    from nlosrender.engine.interface import Budget
 
     stage: Stage = TRAPS[name].stage(folder)
     assert stage.engine.name == "virtual_lights"
@@ -95,7 +95,7 @@ def test_how_a_capture_is_cut_changes_no_bit(scan: str, max_bounces: int) -> Non
 def test_a_part_of_the_lasers_and_sensors_has_the_bits_of_the_whole(max_bounces: int) -> None:
     """A shard of an exhaustive capture: columns 1 to 2 of the sensors, rows 1 to 2 and column 1 of the lasers."""
     stage = Stage.of(cut_scene("exhaustive", max_bounces))
-    from nlosrender.engine.path.engine import Budget
+    from nlosrender.engine.interface import Budget
 
     engine, batch = stage.engine, stage.batch
     part = replace(batch, sensors=replace(batch.sensors, x0=1), lasers=replace(batch.lasers, y0=1, x0=1))

@@ -30,12 +30,9 @@ def path_engine(config: dict, **options: object):
     """Return the path engine of a configuration with fields of its options, and its plan."""
     validated = configured(config)
     backend = start_backend("llvm", colored=False)
-    from nlosrender.engine.path.engine import PathEngine
-
     built = stages.load_scene(validated)
     capture, time_axis = stages.describe_capture(validated, built.wall, built)
-    plan, engine = stages.prepare(validated, backend, built, capture, time_axis)
-    return plan, PathEngine(built, capture, time_axis, replace(engine.options, **options))
+    return stages.prepare(validated, backend, built, capture, time_axis, changes=options)
 
 
 def assert_same_light(one: Rendering, other: Rendering) -> None:
@@ -77,7 +74,7 @@ def test_a_number_of_samples_that_is_no_multiple_is_not_biased() -> None:
     sums = {}
     for every, seeds in ((5, range(1, 9)), (1, range(101, 109))):
         plan, engine = path_engine(config, replicas=REPLICAS, p_hidden_sampling=1.0, continuation_period=every)
-        from nlosrender.engine.path.engine import Budget
+        from nlosrender.engine.interface import Budget
 
         sums[every] = []
         for seed in seeds:
@@ -96,12 +93,12 @@ def test_paths_that_begin_directly_agree_with_traced_ones(
     max_bounces: int | None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Both loops trace the same paths: all bounces of a mesh that hides parts of itself."""
-    from nlosrender.engine.path import full_loop as path_integrator
+    from nlosrender.engine.path import engine as path_engines
 
     box = {"type": "box", "center": [0.1, 0.1, 0.5], "size": [0.3, 0.2, 0.2], "rotate_deg": [10, 20, 30], "bsdf": GREY}
     config = scene(*HIDDEN, box, max_bounces=max_bounces, split_bounces=False)
     direct = render(config, replicas=REPLICAS, p_hidden_sampling=1.0, continuation_period=3)
-    monkeypatch.setattr(path_integrator, "are_direct", lambda settings, sampler: False)
+    monkeypatch.setattr(path_engines, "is_third_bounce_loop", lambda settings, sampler: False)
     traced = render(config, ["render.seed=1"], replicas=REPLICAS, p_hidden_sampling=1.0, continuation_period=1)
     assert_agrees(
         direct.total, direct.total_variance, traced.total, replicas=REPLICAS, reference_variance=traced.total_variance
@@ -109,17 +106,16 @@ def test_paths_that_begin_directly_agree_with_traced_ones(
 
 
 @pytest.mark.parametrize("p_hidden_sampling", [0.0, 1.0])
-def test_launches_and_batches_do_not_show(p_hidden_sampling: float, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_launches_and_batches_do_not_show(p_hidden_sampling: float) -> None:
     """The same bits in a few launches and in many, in one batch and in several."""
-    from nlosrender.engine.launch import sample_schedule as sampling
-
     config = scene(sensors=(5, 7), spp=200)
     options: dict = {"p_hidden_sampling": p_hidden_sampling, "continuation_period": 3}
     whole = render(config, **options)
     parts = render(config, batch_bytes=40_000, **options)
     assert len(parts.plan.batches) > 1
-    monkeypatch.setattr(sampling, "PASS_SECONDS", TINY_LAUNCHES)
-    pieces = render(config, **options)
+    from nlosrender.engine.launch.schedule import ScheduleTuning
+
+    pieces = render(config, schedule=ScheduleTuning(pass_seconds=TINY_LAUNCHES), **options)
     assert whole.bounce(4).sum() > 0
     for other in (parts, pieces):
         np.testing.assert_array_equal(other.mean, whole.mean)
@@ -167,28 +163,27 @@ def test_time_and_variance_are_balanced(third: float, further: float, expected: 
 @pytest.mark.parametrize("max_bounces", [3, None])
 def test_what_cannot_matter_is_not_thinned(max_bounces: int | None) -> None:
     """Every path goes on without roulette, where few are traced, and where bounces kept apart are found by BSDF."""
-    from nlosrender.engine.path.engine import Budget
+    from nlosrender.engine.interface import Budget
 
     many, few = Budget(spp=2**22), Budget(spp=64)
     _, engine = path_engine(scene(max_bounces=max_bounces, split_bounces=False))
-    assert (engine._continuation_period(many) > 1) == (max_bounces is None)
-    assert engine._continuation_period(few) == 1
+    assert (engine.continuation_period(many) > 1) == (max_bounces is None)
+    assert engine.continuation_period(few) == 1
     _, without = path_engine(scene(max_bounces=max_bounces, russian_roulette=False, split_bounces=False))
-    assert without._continuation_period(many) == 1
+    assert without.continuation_period(many) == 1
     _, split = path_engine(scene(max_bounces=max_bounces, hidden_geometry_sampling=False, split_bounces=True))
-    assert split._continuation_period(many) == 1
+    assert split.continuation_period(many) == 1
 
 
 @pytest.mark.parametrize("p_hidden_sampling", [0.0, 1.0])
 def test_any_frame_serves_where_only_normals_matter(p_hidden_sampling: float) -> None:
     """Grey diffuse surfaces look the same from frames of their textures and from any others around the normal."""
-    from nlosrender.engine.path.engine import Budget
-    from nlosrender.engine.path.full_loop import load_path_integrator
+    from nlosrender.engine.interface import Budget
 
     plan, engine = path_engine(scene(), replicas=REPLICAS, p_hidden_sampling=p_hidden_sampling)
     assert engine.settings.is_plain_diffuse
     quick = engine.render(plan.batches[0], Budget(spp=65536))
-    engine.integrator = load_path_integrator(replace(engine.settings, is_plain_diffuse=False))
+    engine.settings = replace(engine.settings, is_plain_diffuse=False)
     full = engine.render(plan.batches[0], Budget(spp=65536))
     mean, variance = (getattr(quick, name)[0].sum(axis=0) for name in ("mean", "variance"))
     reference, noise = (getattr(full, name)[0].sum(axis=0) for name in ("mean", "variance"))

@@ -48,7 +48,7 @@ def before_a_cylinder() -> Stage:
 
 def rendered(engine: Any, batch: Any, spp: int = SPP) -> Any:
     """Return mean and variance of a batch."""
-    from nlosrender.engine.launch.sample_schedule import Budget
+    from nlosrender.engine.interface import Budget
 
     histogram = engine.render(batch, Budget(spp=spp))
     return np.stack([histogram.mean, histogram.variance])
@@ -108,7 +108,7 @@ def test_rays_along_the_sides_count_as_meeting_it() -> None:
     start_backend("llvm")
     import mitsuba as mi
 
-    from nlosrender.engine.path.hidden_aabb import HiddenAabb
+    from nlosrender.engine.launch.hidden_aabb import HiddenAabb
 
     box = HiddenAabb.of(np.array([-0.5, -0.5, 0.5]), np.array([0.5, 0.5, 1.0]))
     x = np.array([0.0, 0.5, -0.5, 0.6, -0.6], np.float32)
@@ -136,7 +136,7 @@ def test_the_box_is_no_part_of_the_kernel() -> None:
     stage = stage_of(PLATE, max_bounces=3)
     import drjit as dr
 
-    from nlosrender.engine.path.hidden_aabb import HiddenAabb
+    from nlosrender.engine.launch.hidden_aabb import HiddenAabb
 
     hashes = []
     for size in (1.0, 2.0):

@@ -102,7 +102,7 @@ class Honesty:
 def judged(trap: Trap, folder: Path) -> Honesty:
     """Render a scene as a file would hold it, and once more far better."""
     start_backend("llvm")
-    from nlosrender.engine.path.engine import Budget
+    from nlosrender.engine.interface import Budget
 
     stage: Stage = trap.stage(folder)
     assert stage.engine.name == "virtual_lights"
@@ -187,7 +187,7 @@ def test_the_path_engine_confirms_the_error(number: int, tmp_path: Path) -> None
     """Errors against the other engine, its noise taken off: what both resolutions miss would show."""
     trap = random_trap(number)
     start_backend("llvm")
-    from nlosrender.engine.path.engine import Budget
+    from nlosrender.engine.interface import Budget
 
     stage = trap.stage(tmp_path)
     target = trap.settings["target_error"]
@@ -222,7 +222,7 @@ def touching_scene() -> Trap:
 def test_noise_falls_as_the_square_root_of_the_rounds(scene: Callable[[], Trap], tmp_path: Path) -> None:
     """From 1 to 64 rounds, with no bin far off: 1/r^2 near the sensor points is sampled for."""
     start_backend("llvm")
-    from nlosrender.engine.path.engine import Budget
+    from nlosrender.engine.interface import Budget
 
     stage, rounds, n_seeds = scene().stage(tmp_path), np.array([1, 4, 16, 64]), 8
     errors = []

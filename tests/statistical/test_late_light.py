@@ -10,6 +10,7 @@ import pytest
 from numpy.typing import NDArray
 from support.agreement import grouped
 from support.engine_sums import SHARE, Sums, assert_alike
+from support.engines import with_options
 from support.rendering import configured, flat_wall, render
 from support.varied_scenes import GREY_WALL, LEGS, SIDE, SLANTED, Item, Stage, room
 
@@ -31,7 +32,7 @@ def scene(*hidden: Item, scan: str = "single", n_bins: int = SHORT, width: float
 
 def with_outside(stage: Stage, engine: str, seeds: range) -> Array:
     """Render once per seed; return (seed, row, bin), the light outside the window as one more bin."""
-    from nlosrender.engine.path.engine import Budget
+    from nlosrender.engine.interface import Budget
 
     results = stage.repeated(Budget(**BUDGETS[engine]), seeds)
     rows = np.concatenate([results.means, results.outsides[..., None]], axis=-1)
@@ -92,23 +93,17 @@ def test_a_window_that_holds_everything_keeps_every_bit(
     engine: str, scan: str, max_bounces: int | None, width: float
 ) -> None:
     """Nothing is late: not a random number is drawn for it. Where bounces end, nothing is even compared."""
-    from nlosrender.engine.path.engine import Budget
+    from nlosrender.engine.interface import Budget
 
     config = scene(*OPEN, scan=scan, n_bins=LONG, width=width, max_bounces=max_bounces, engine=engine)
     stage = Stage.of(config)
     patient = Stage(with_options(stage.engine, has_time_gate=False), stage.batch, stage.bounces)
-    horizon = getattr(stage.engine, "paths", stage.engine).capture_gate
+    horizon = stage.engine.device.capture_gate
     assert (horizon is None) == (max_bounces is not None)
     ours, theirs = (one.repeated(Budget(**BUDGETS[engine]), range(1)) for one in (stage, patient))
     assert ours.means.any()
     assert not ours.outsides.any()
     np.testing.assert_array_equal(ours.means, theirs.means)
-
-
-def with_options(engine: Any, **options: Any) -> Any:
-    """Return the engine with other options."""
-    more = (engine.lanes,) if engine.name == "virtual_lights" else ()
-    return type(engine)(engine.built, engine.capture, engine.time_axis, replace(engine.options, **options), *more)
 
 
 @pytest.mark.parametrize("engine", ["path", "virtual_lights"])
@@ -130,7 +125,8 @@ def test_kernels_do_not_know_where_the_window_ends() -> None:
     stage = Stage.of(scene(ROOM, engine="virtual_lights"))
     import drjit as dr
 
-    from nlosrender.engine.path.engine import Budget
+    from nlosrender.engine.interface import Budget
+    from nlosrender.engine.launch.device_capture import DeviceCapture
 
     engine, lights = stage.engine.paths, stage.engine
     hashes = []
@@ -138,8 +134,9 @@ def test_kernels_do_not_know_where_the_window_ends() -> None:
     try:
         for start in (0.0, -1.0, 0.5):
             axis = replace(engine.time_axis, start_opl=start)
-            paths = type(engine)(engine.built, engine.capture, axis, engine.options)
-            further = type(lights.further)(paths, lights.tessellator, lights.further.masks)
+            device = DeviceCapture(engine.built, engine.capture, axis, engine.options)
+            paths = type(engine)(device)
+            further = type(lights.further)(device, lights.tessellator, lights.further.masks)
             dr.kernel_history_clear()
             paths.render(stage.batch, Budget(spp=16))
             further.accumulate(stage.batch, further.histogram(stage.batch, 2), 0)
@@ -158,7 +155,7 @@ def test_a_path_is_late_when_the_straight_way_to_the_laser_ends_after_the_window
 
     engine = stage.engine
     unit = engine.built.unit
-    deadline = engine.launch_params(stage.batch, engine.shape(stage.batch, 1)).time_gate
+    deadline = engine.device.launch_params(stage.batch, engine.device.shape(stage.batch, 1)).time_gate
     # the laser is at (0.3, -0.2, 0); 3 m end in the window
     away = mi.Point3f(0.3, -0.2, 0.8) / unit
     beside = mi.Point3f(-0.5, -0.2, 0.0) / unit
@@ -169,25 +166,22 @@ def test_a_path_is_late_when_the_straight_way_to_the_laser_ends_after_the_window
 
 @pytest.mark.parametrize("engine", ["path", "virtual_lights"])
 @pytest.mark.parametrize("scan", ["single", "confocal"])
-def test_without_survivors_no_light_comes_after_the_window(engine: str, scan: str, monkeypatch: Any) -> None:
+def test_without_survivors_no_light_comes_after_the_window(engine: str, scan: str) -> None:
     """Every path and subpath is stopped before the first connection that ends after the window, legs included.
 
     One sensor point and one laser point: the bound is exact. The third bounce of the virtual lights is no subpath's.
     """
     stage = Stage.of(scene(ROOM, engine=engine, scan=scan, sensors=(1, 1), capture=LEGS, width=0.2))
-    from nlosrender.engine.launch import time_gate as deadline
-    from nlosrender.engine.path.engine import Budget
-    from nlosrender.engine.virtual_lights.vpls import sampler, subpaths
+    from nlosrender.engine.interface import Budget
 
-    def outside_and_inside() -> tuple[float, float]:
+    def outside_and_inside(stage: Stage) -> tuple[float, float]:
         result = stage.seeded(3).render(stage.batch, Budget(**BUDGETS[engine]))
         further = slice(stage.bounces.slot(4), None)
         return float(result.outside[:, further].sum()), float(result.mean[:, further].sum())
 
-    usual = outside_and_inside()
-    for module in (deadline, sampler, subpaths):
-        monkeypatch.setattr(module, "GATE_SURVIVAL", 0.0)
-    outside, inside = outside_and_inside()
+    usual = outside_and_inside(stage)
+    closed = with_options(stage.engine, gate_survival=0.0)
+    outside, inside = outside_and_inside(Stage(closed, stage.batch, stage.bounces))
     assert usual[0] > 0.1 * usual[1] > 0
     # 1e-4: paths that end within rounding of the window's end
     assert outside < 1e-4 * usual[0]
@@ -199,8 +193,8 @@ def test_a_deadline_counts_the_legs(scan: str) -> None:
     """From the window's end go the sensor point's own leg and the least of a laser's, or its own."""
     stage = Stage.of(scene(ROOM, scan=scan, lasers=(2, 3), capture=LEGS))
     engine = stage.engine
-    capture, unit, shape = engine.capture, engine.built.unit, engine.shape(stage.batch, 1)
-    deadline = engine.launch_params(stage.batch, shape).time_gate
+    capture, unit, shape = engine.capture, engine.built.unit, engine.device.shape(stage.batch, 1)
+    deadline = engine.device.launch_params(stage.batch, shape).time_gate
     own = scan == "confocal"
     legs = capture.sensor_legs.ravel() + (capture.laser_legs.ravel() if own else capture.laser_legs.min())
     expected = np.tile(engine.time_axis.end_opl - legs, shape.replicas)
@@ -222,7 +216,7 @@ def test_one_late_path_in_eight_carries_the_light_of_all() -> None:
     n = 2**16
     lane = dr.arange(mi.UInt32, n)
     point = mi.Point3f(0, 0, dr.select(lane % 2 == 0, mi.Float(2.0), 0.5))
-    deadline = TimeGate(dr.full(mi.Float, 1.0, n), mi.Point3f(0), mi.Point3f(0), mi.Float(0))
+    deadline = TimeGate(dr.full(mi.Float, 1.0, n), mi.Point3f(0), mi.Point3f(0), 1 / 8, mi.Float(0))
     generator = mi.PCG32(size=n)
     before = np.array(generator.state)
     alive, thinned, carried = time_gate_roulette(
@@ -246,7 +240,7 @@ def test_one_late_path_in_eight_carries_the_light_of_all() -> None:
 def share_in_time(has_time_gate: bool) -> float:
     """Return the share of a round's contributions that could reach some sensor point within the window."""
     stage = Stage.of(scene(ROOM, engine="virtual_lights"))
-    from nlosrender.engine.virtual_lights.vpls import gather as further_bounces
+    from nlosrender.engine.virtual_lights.vpls import rounds as further_bounces
 
     engine = with_options(stage.engine, has_time_gate=has_time_gate)
     shares, vpl_contributions = [], further_bounces.vpl_contributions
@@ -278,7 +272,7 @@ def test_sites_that_only_late_light_reaches_are_few() -> None:
         vpls = sampler.sample(2**15, np.random.default_rng(5))
         heights = vpls.positions[:, 2] * unit
         far = heights > 1.999
-        assert stage.engine.paths.capture_gate.is_beyond(vpls.positions[far]).all()
+        assert stage.engine.device.capture_gate.is_beyond(vpls.positions[far]).all()
         ratios.append(far.mean() / (heights < 0.5).mean())
         areas.append(vpls.areas[far].sum() * unit**2)
     # 5 sigma of the fewest VPLs; they are stratified, which makes it less

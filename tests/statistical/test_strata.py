@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from support.agreement import assert_agrees
@@ -60,7 +62,7 @@ def test_the_place_within_the_parts_is_uniform(seed: int) -> None:
     import mitsuba as mi
     from scipy import stats
 
-    from nlosrender.engine.launch.launch_params import LaneRandomness
+    from nlosrender.engine.launch.lane_random_state import LaneRandomness
     from nlosrender.engine.launch.systematic_sequence import SystematicSequence, first_coordinate
 
     n = 5
@@ -72,15 +74,15 @@ def test_the_place_within_the_parts_is_uniform(seed: int) -> None:
 
 
 @pytest.mark.parametrize("max_bounces", [3, 5])
-def test_launches_do_not_show(max_bounces: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_launches_do_not_show(max_bounces: int) -> None:
     """The same samples give the same bits in three launches and in many."""
-    from nlosrender.engine.launch import sample_schedule as sampling
-    from nlosrender.engine.path.engine import Budget
+    from nlosrender.engine.interface import Budget
+    from nlosrender.engine.launch.schedule import ScheduleTuning
 
     plan, engine = path_engine(flat_wall(PLATE, BEHIND, max_bounces=max_bounces))
     budget = Budget(spp=165 * engine.options.replicas)  # the first two launches take 32 and 128
     whole = engine.render(plan.batches[0], budget)
-    monkeypatch.setattr(sampling, "PASS_SECONDS", TINY_LAUNCHES)
+    engine.options = replace(engine.options, schedule=ScheduleTuning(pass_seconds=TINY_LAUNCHES))
     pieces = engine.render(plan.batches[0], budget)
     assert whole.mean.sum() > 0
     for name in ("mean", "variance", "outside"):
@@ -91,11 +93,11 @@ def test_launches_do_not_show(max_bounces: int, monkeypatch: pytest.MonkeyPatch)
 @pytest.mark.parametrize("hidden", [(PLATE,), (PLATE, BEHIND)], ids=["alone", "occluded"])
 def test_direct_paths_agree_with_traced_ones(scan: str, hidden: tuple, monkeypatch: pytest.MonkeyPatch) -> None:
     """Asking whether a sampled point is seen gives what tracing a ray to it and looking what it meets gives."""
-    from nlosrender.engine.path import full_loop as path_integrator
+    from nlosrender.engine.path import engine as path_engines
 
     config = flat_wall(*hidden, scan=scan, spp=8192, bins=(1.0, 0.05, 60))
     direct = render(config, replicas=16)
-    monkeypatch.setattr(path_integrator, "are_direct", lambda settings, sampler: False)
+    monkeypatch.setattr(path_engines, "is_third_bounce_loop", lambda settings, sampler: False)
     traced = render(config, ["render.seed=1"], replicas=16)
     assert direct.mean.sum() > 0
     assert_agrees(
@@ -111,15 +113,12 @@ def test_direct_paths_agree_with_traced_ones(scan: str, hidden: tuple, monkeypat
 )
 def test_rays_that_nothing_can_stop_are_left_out(max_bounces: int, hidden: dict) -> None:
     """One convex object alone, or a convex room: the same numbers with and without visibility rays."""
-    from dataclasses import replace
-
-    from nlosrender.engine.path.engine import Budget
-    from nlosrender.engine.path.full_loop import load_path_integrator
+    from nlosrender.engine.interface import Budget
 
     plan, engine = path_engine(flat_wall(hidden, max_bounces=max_bounces, spp=512))
     assert not engine.settings.needs_visibility
     without = engine.render(plan.batches[0], Budget(spp=512))
-    engine.integrator = load_path_integrator(replace(engine.settings, needs_visibility=True))
+    engine.settings = replace(engine.settings, needs_visibility=True)
     with_rays = engine.render(plan.batches[0], Budget(spp=512))
     # a ray that grazes the edge of the wall or of the room may be taken for stopped
     np.testing.assert_allclose(without.mean.sum(), with_rays.mean.sum(), rtol=1e-3)

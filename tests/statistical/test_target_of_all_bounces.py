@@ -39,10 +39,10 @@ def test_the_second_bounce_counts_for_the_target(tmp_path: Path, engine: str) ->
         assert report.error_estimate > TARGET / 2
         return
     backend = start_backend("llvm")
-    from nlosrender.engine.path.engine import Budget
+    from nlosrender.engine.interface import Budget
 
     engines = [stages.set_up_engine(config, backend)[1] for _ in range(2)]
-    engines[1].paths.second_squares = lambda batch: 0.0  # as if the third bounce were all
+    engines[1].device.second_squares = lambda batch: 0.0  # as if the third bounce were all
     fine = [each.calibrate(Budget(target_error=TARGET)).patch_scale for each in engines]
     assert fine[0] > 1.2 * fine[1]
 

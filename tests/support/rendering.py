@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -125,14 +125,14 @@ def render(
         Fields of ``RenderOptions`` that no configuration has, such as ``p_hidden_sampling`` or ``replicas``.
     """
     validated = configured(config, overrides, folder)
+    if options:  # they are the path engine's
+        validated = validated.model_copy(update={"render": validated.render.model_copy(update={"engine": "path"})})
     backend = start_backend("llvm", colored=validated.is_colored, polarized=validated.render.polarized)
-    from nlosrender.engine.path.engine import Budget, PathEngine
+    from nlosrender.engine.interface import Budget
 
     built = stages.load_scene(validated)
     capture, time_axis = stages.describe_capture(validated, built.wall, built)
-    plan, engine = stages.prepare(validated, backend, built, capture, time_axis)
-    if options:
-        engine = PathEngine(built, capture, time_axis, replace(engine.options, **options))
+    plan, engine = stages.prepare(validated, backend, built, capture, time_axis, changes=options)
     bounces, channels = engine.options.bounces, engine.options.channels
     if batch_bytes is not None:
         rows = bounces.n_slots * channels

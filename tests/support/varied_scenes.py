@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from nlosrender.engine.backend.start import start_backend
 from nlosrender.rendering import stages
+from support.engines import with_options
 from support.rendering import configured, flat_wall
 
 Array = NDArray[np.float64]
@@ -99,9 +100,7 @@ class Stage:
 
     def seeded(self, seed: int) -> Any:
         """Return the engine with another seed."""
-        engine = self.engine
-        more = (engine.lanes,) if engine.name == "virtual_lights" else ()
-        return type(engine)(engine.built, engine.capture, engine.time_axis, replace(engine.options, seed=seed), *more)
+        return with_options(self.engine, seed=seed)
 
     def tuned(self, **changes: Any) -> Stage:
         """Return the stage with other numbers of ``VirtualLightTuning``."""

@@ -57,25 +57,24 @@ def view_config(
 
 
 def see(
-    config: Scene | str | Config, *, folder: Path | None = None, replicas: int = REPLICAS, batch_rows: int | None = None
+    config: Scene | str | Config,
+    *,
+    folder: Path | None = None,
+    replicas: int = REPLICAS,
+    batch_rows: int | None = None,
+    **options: Any,
 ) -> View:
     """Render a line-of-sight configuration, with ``replicas`` estimates behind every pixel.
 
-    ``batch_rows`` renders so many rows of pixels at a time.
+    ``batch_rows`` renders so many rows of pixels at a time; ``options`` are fields of ``RenderOptions``.
     """
-    from dataclasses import replace
-
     validated = config if isinstance(config, Config) else configured(config, folder=folder)
     backend = start_backend("llvm", colored=validated.is_colored, polarized=validated.render.polarized)
     from nlosrender.capture.plan import Batch
     from nlosrender.capture.tile import Tile
-    from nlosrender.engine.launch.sample_schedule import Budget
-    from nlosrender.engine.line_of_sight.engine import LineOfSightEngine
+    from nlosrender.engine.interface import Budget
 
-    _, engine, _ = stages.set_up_engine(validated, backend)
-    engine = LineOfSightEngine(
-        engine.built, engine.capture, engine.time_axis, replace(engine.options, replicas=replicas)
-    )
+    _, engine, _ = stages.set_up_engine(validated, backend, changes={"replicas": replicas} | options)
     ny, nx = engine.capture.sensor_grid.ny, engine.capture.sensor_grid.nx
     rows = batch_rows or ny
     tiles = [Tile(y, min(y + rows, ny), 0, nx) for y in range(0, ny, rows)]

@@ -293,12 +293,12 @@ def test_triangles_that_take_more_than_the_memory_limit_are_said():
     """A limit is for the process: what a mesh takes is in no batch."""
     from nlosrender.engine.preflight.batch_memory import memory_warnings
 
-    backend, plan, engine = prepared(configured(flat_wall(PLATE)))
+    _, plan, engine = prepared(configured(flat_wall(PLATE)))
     engine.built = replace(engine.built, n_triangles=10**6)
-    (warning,) = memory_warnings(engine, plan, 10**9, backend.lanes)
-    assert "1000000 triangles take about 0.7 GB beside the program's 0.4 GB, more than 1 GB" in warning
-    assert list(memory_warnings(engine, plan, 2 * 10**9, backend.lanes)) == []
-    assert list(memory_warnings(engine, plan, None, backend.lanes)) == []
+    (warning,) = memory_warnings(engine, plan, 10**9, 128)
+    assert "1000000 triangles take about 700 MB beside the program's 400 MB, more than 1 GB" in warning
+    assert list(memory_warnings(engine, plan, 2 * 10**9, 128)) == []
+    assert list(memory_warnings(engine, plan, None, 128)) == []
 
 
 def test_a_memory_limit_is_checked_against_machine_and_lanes():
@@ -307,8 +307,8 @@ def test_a_memory_limit_is_checked_against_machine_and_lanes():
 
     config = configured(flat_wall(PLATE, scan="exhaustive", sensors=(50, 30), lasers=(9, 8)))
     backend, plan, engine = prepared(config)
-    assert list(memory_warnings(engine, plan, None, backend.lanes)) == []
-    assert "is more than the machine's" in next(memory_warnings(engine, plan, 10**16, backend.lanes))
+    assert list(memory_warnings(engine, plan, None, 128)) == []
+    assert "is more than the machine's" in next(memory_warnings(engine, plan, 10**16, 128))
     cut = plan_of((Batch(Tile(0, 1, 0, 2), Tile(0, 8, 0, 9)),) * 750, plan.replicas, 10**6)
     (warning,) = memory_warnings(engine, cut, 10**9, backend.lanes)
     assert "batches of 2 sensor points, too few" in warning
@@ -325,16 +325,15 @@ def test_a_batch_larger_than_the_machine_is_the_configurations_fault(monkeypatch
     """The key that helps is named: only the gather needs rows for every processor."""
     from nlosrender.engine.preflight import batch_memory as memory
 
-    backend, plan, used = prepared(configured(flat_wall(PLATE, engine=engine, spp=None)))
+    _, plan, used = prepared(configured(flat_wall(PLATE, engine=engine, spp=None)))
     monkeypatch.setattr(memory, "physical_memory", lambda: 1000)
     monkeypatch.setattr(memory, "batch_memory", lambda limit, n_triangles: 10**12)
     with pytest.raises(ConfigError, match=message):
-        list(memory.memory_warnings(used, plan, None, backend.lanes))
+        list(memory.memory_warnings(used, plan, None, 128))
 
 
 def test_the_gather_takes_what_is_said():
     """Its sums, in whole blocks of bins; and a batch of few points does not take rows for every processor."""
-    from nlosrender.engine.preflight.batch_memory import batch_bytes
     from nlosrender.engine.virtual_lights.gather.block_histogram import BlockHistogram
 
     config = configured(flat_wall(PLATE, sensors=(50, 30), bins=(0.0, 9.0, 1), engine="auto", spp=None))
@@ -342,9 +341,9 @@ def test_the_gather_takes_what_is_said():
     shape = engine.third.shape(plan.batches[0])
     histogram = BlockHistogram(shape, np.arange(shape.sensors))
     n_sums = len(histogram.sums) + len(histogram.outside)
-    assert batch_bytes(engine, plan) == max(plan.bytes_per_batch, 8 * n_sums)
+    assert engine.batch_bytes(plan) == max(plan.bytes_per_batch, 8 * n_sums)
     small = plan_of((Batch(Tile(0, 1, 0, 2), Tile(0, 1, 0, 1)),) * 750, plan.replicas, 1)
-    assert batch_bytes(engine, small) == pytest.approx(8 * n_sums / 750)
+    assert engine.batch_bytes(small) == pytest.approx(8 * n_sums / 750)
 
 
 # --- how long ---
@@ -365,6 +364,11 @@ class _ClockworkPaths:
         target = budget.target_error
         return budget if target is None else replace(budget, spp=round(target**-2) if self.sees_light else None)
 
+    def cost_estimate(self, plan, budget, lanes, pilot):
+        from nlosrender.engine.launch.cost_pilot import sampling_estimate
+
+        return sampling_estimate(self, plan, budget, lanes, pilot)
+
     def render(self, batch, budget, passes=None):
         from nlosrender.engine.launch.histogram import Histogram
 
@@ -377,10 +381,10 @@ class _ClockworkPaths:
 
 @pytest.fixture
 def clockwork(monkeypatch):
-    from nlosrender.engine.preflight import time_estimate as forecast
+    from nlosrender.engine.launch import cost_pilot
 
     clock = SimpleNamespace(now=0.0)
-    monkeypatch.setattr(forecast.time, "perf_counter", lambda: clock.now)
+    monkeypatch.setattr(cost_pilot.time, "perf_counter", lambda: clock.now)
     return _ClockworkPaths(clock)
 
 
@@ -390,7 +394,7 @@ WHOLE = plan_of((Batch(Tile(0, 3, 0, 5), Tile(0, 1, 0, 1)),), 2, 1000)
 
 def test_time_is_linear_in_paths(clockwork):
     """A clockwork of known speed is extrapolated exactly: samples, sensor points, overhead."""
-    from nlosrender.engine.path.engine import Budget
+    from nlosrender.engine.interface import Budget
     from nlosrender.engine.preflight.time_estimate import estimate_render_time
 
     for spp in (100, 5000):
@@ -400,7 +404,7 @@ def test_time_is_linear_in_paths(clockwork):
 
 def test_half_the_error_takes_four_times_as_long(clockwork):
     """What the engine settles is what is extrapolated: 1 / sqrt(n) = target at n = target^-2."""
-    from nlosrender.engine.path.engine import Budget
+    from nlosrender.engine.interface import Budget
     from nlosrender.engine.preflight.time_estimate import estimate_render_time
 
     for target in (0.02, 0.01):
@@ -410,7 +414,7 @@ def test_half_the_error_takes_four_times_as_long(clockwork):
 
 def test_a_time_limit_is_never_exceeded(clockwork):
     """Alone it is the answer; beside another goal it caps it."""
-    from nlosrender.engine.path.engine import Budget
+    from nlosrender.engine.interface import Budget
     from nlosrender.engine.preflight.time_estimate import estimate_render_time
 
     assert estimate_render_time(clockwork, WHOLE, Budget(time_limit_s=7), lanes=8).seconds == 7
@@ -420,23 +424,23 @@ def test_a_time_limit_is_never_exceeded(clockwork):
 
 def test_pure_noise_gives_no_number(clockwork):
     """No estimate is better than a wrong one."""
-    from nlosrender.engine.path.engine import Budget
-    from nlosrender.engine.preflight import time_estimate as forecast
+    from nlosrender.engine.interface import Budget
+    from nlosrender.engine.preflight.time_estimate import estimate_render_time
 
     clockwork.sees_light = False
-    estimate = forecast.estimate_render_time(clockwork, WHOLE, Budget(target_error=0.01), lanes=8)
+    estimate = estimate_render_time(clockwork, WHOLE, Budget(target_error=0.01), lanes=8)
     assert estimate.seconds is None
     assert "noise" in estimate.basis
 
 
 def test_the_pilot_lies_within_a_batch_and_its_memory():
     """However large the batch, the pilot takes PILOT_BYTES or one sensor point, in the middle of it."""
-    from nlosrender.engine.preflight.time_estimate import PILOT_BYTES, pilot_batch
+    from nlosrender.engine.launch.cost_pilot import PILOT_BYTES, pilot_batch
 
-    engine = SimpleNamespace(capture=SimpleNamespace(scan_type="single"))
+    capture = SimpleNamespace(scan_type="single")
     for rows, columns, n_bytes in ((30, 50, 10**10), (3, 500, 10**9), (40, 1, 10**9), (2, 3, 10**12), (3, 5, 10)):
         whole = Tile(10, 10 + rows, 20, 20 + columns)
-        pilot = pilot_batch(engine, plan_of((Batch(whole, Tile(0, 1, 0, 1)),), 2, n_bytes)).sensors
+        pilot = pilot_batch(capture, plan_of((Batch(whole, Tile(0, 1, 0, 1)),), 2, n_bytes)).sensors
         assert whole.y0 <= pilot.y0 < pilot.y1 <= whole.y1
         assert whole.x0 <= pilot.x0 < pilot.x1 <= whole.x1
         assert pilot.size == 1 or pilot.size * n_bytes / whole.size <= PILOT_BYTES
@@ -446,12 +450,12 @@ def test_the_pilot_lies_within_a_batch_and_its_memory():
 
 def test_many_lasers_are_cut_once_the_pilot_is_down_to_one_sensor_point():
     """An exhaustive capture with a million lasers must not make the forecast as heavy as the render."""
-    from nlosrender.engine.preflight.time_estimate import PILOT_BYTES, pilot_batch
+    from nlosrender.engine.launch.cost_pilot import PILOT_BYTES, pilot_batch
 
-    engine = SimpleNamespace(capture=SimpleNamespace(scan_type="exhaustive"))
+    capture = SimpleNamespace(scan_type="exhaustive")
     lasers = Tile(0, 1000, 0, 999)
     few, many = (
-        pilot_batch(engine, plan_of((Batch(Tile(0, 1, 0, 2), lasers),), 2, int(n_bytes)))
+        pilot_batch(capture, plan_of((Batch(Tile(0, 1, 0, 2), lasers),), 2, int(n_bytes)))
         for n_bytes in (2 * PILOT_BYTES, 20 * PILOT_BYTES)
     )
     assert (few.sensors.size, few.lasers) == (1, lasers)

@@ -50,7 +50,7 @@ for engine in ("virtual_lights", "path"):
     built = stages.load_scene(config)
     capture, time_axis = stages.describe_capture(config, built.wall, built)
     plan, renderer = stages.prepare(config, backend, built, capture, time_axis)
-    from nlosrender.engine.path.engine import Budget
+    from nlosrender.engine.interface import Budget
     energy = renderer.render(plan.batches[0], Budget(target_error=0.2)).mean.sum()
     print("works" if energy > 0 else "no light")
 """

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from nlosrender.capture.relative_error import relative_l2_error
 from nlosrender.engine.launch.temporal_kernel import TemporalKernel
+from nlosrender.errors import RenderError
 
 
 @dataclass(frozen=True)
@@ -170,3 +171,15 @@ class Histogram:
     outside: NDArray[np.float64]  # (channel, bounce, laser, sensor): H outside the time window
     samples: int  # per sensor point; 0 for a deterministic engine
     contrasts: NDArray[np.float64]  # (contrast, channel, bounce) of the energy, see ``energy_contrasts``
+
+    @classmethod
+    def of_rows(
+        cls, mean: NDArray[np.float64], variance: NDArray[np.float64], samples: int, contrasts: NDArray[np.float64]
+    ) -> Histogram:
+        """Return the histogram of rows whose last entry is what lies outside the time window; no copies."""
+        return cls(mean[..., :-1], variance[..., :-1], mean[..., -1], samples, contrasts)
+
+    def refuse_not_finite(self) -> None:
+        """Raise ``RenderError`` where a value is NaN or infinite."""
+        if not all(np.isfinite(values).all() for values in (self.mean, self.variance, self.outside)):
+            raise RenderError("the engine produced a value that is not finite; please report the configuration")

@@ -7,7 +7,7 @@ import mitsuba as mi
 
 from nlosrender.engine.launch.histogram import DeviceHistogram
 from nlosrender.engine.launch.launch_params import LaunchParams
-from nlosrender.engine.path.laser_connections import connection_segment, delay_bin
+from nlosrender.engine.launch.ray_offsets import connection_segment
 
 COINCIDENT = 1e-6  # engine units; a confocal pair has no path between its points
 
@@ -36,5 +36,5 @@ def deposit_second_bounce(params: LaunchParams, histogram: DeviceHistogram) -> N
         active &= ~built.scene.ray_test(
             connection_segment(built, sensor, direction, lit), coherent=False, active=active
         )
-        histogram.deposit(lane, laser, mi.UInt32(0), delay_bin(params, points, distance), value, active)
+        histogram.deposit(lane, laser, mi.UInt32(0), params.delay_bin(points, distance), value, active)
         laser += 1

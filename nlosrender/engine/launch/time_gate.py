@@ -24,8 +24,6 @@ from nlosrender.scene.bounding_box import Bounds, distance_to_box
 from nlosrender.scene.build import BuiltScene
 from nlosrender.scene.pose import Float64
 
-GATE_SURVIVAL = 1 / 8  # chance of a path to go on once all its light comes after the window
-
 
 @dataclass(frozen=True, eq=False)
 class TimeGate:
@@ -34,6 +32,7 @@ class TimeGate:
     latest: mi.Float  # per lane: longest way from where its paths begin to a laser point that ends in the window
     low: mi.Point3f  # box around the laser points, or around the lane's own
     high: mi.Point3f
+    survival: float  # probability of a path to go on once all its light comes after the window
     detour: mi.Float  # height to which light leaves a planar wall and comes back to it, there and back
 
     def is_past(self, opl: mi.Float, point: mi.Point3f, on_wall: mi.Bool) -> mi.Bool:
@@ -77,8 +76,8 @@ def time_gate_roulette(
     if time_gate is None:
         return alive, is_past_gate, throughput
     late = alive & ~is_past_gate & time_gate.is_past(opl, point, on_wall)
-    survives = generator.next_float32(late) < GATE_SURVIVAL
-    return alive & (~late | survives), is_past_gate | late, dr.select(late, throughput / GATE_SURVIVAL, throughput)
+    survives = generator.next_float32(late) < time_gate.survival
+    return alive & (~late | survives), is_past_gate | late, dr.select(late, throughput / time_gate.survival, throughput)
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,11 +89,12 @@ class CaptureTimeGate:
 
     sensor_box: Bounds
     laser_box: Bounds
+    survival: float  # as ``TimeGate.survival``
     longest: float  # way from a sensor point to a laser point
     detour: float
 
     @classmethod
-    def of(cls, built: BuiltScene, capture: Capture, time_axis: TimeAxis) -> CaptureTimeGate:
+    def of(cls, built: BuiltScene, capture: Capture, time_axis: TimeAxis, survival: float) -> CaptureTimeGate:
         """Return the horizon of a capture."""
         lowest = built.hidden_bounds[0][2] if built.wall.is_planar and built.hidden_bounds is not None else 0.0
         sensor_legs, laser_legs = capture.sensor_legs.reshape(-1), capture.laser_legs.reshape(-1)
@@ -103,6 +103,7 @@ class CaptureTimeGate:
         return cls(
             _box(capture.sensor_grid, built.unit),
             _box(capture.laser_grid, built.unit),
+            survival,
             float(time_axis.end_opl - legs + capture.laser_spot_radius) / built.unit,
             2 * max(float(lowest), 0.0) / built.unit,
         )
@@ -116,7 +117,7 @@ class CaptureTimeGate:
         """Return the deadline of walks from ``points`` (n, 3), one lane each, that sensor points look at."""
         latest = self.longest - distance_to_box(points, self.sensor_box)
         low, high = (_opaque_point(corner) for corner in self.laser_box)
-        return TimeGate(on_device(mi.Float, latest), low, high, dr.opaque(mi.Float, self.detour))
+        return TimeGate(on_device(mi.Float, latest), low, high, self.survival, dr.opaque(mi.Float, self.detour))
 
     def of_sensors(
         self, built: BuiltScene, capture: Capture, time_axis: TimeAxis, index: NDArray[np.integer], sensor: mi.UInt32
@@ -132,7 +133,7 @@ class CaptureTimeGate:
             low = high = dr.gather(mi.Point3f, points, sensor)
         per_lane = dr.gather(mi.Float, on_device(mi.Float, latest), sensor)
         dr.eval(per_lane, low)
-        return TimeGate(per_lane, low, high, dr.opaque(mi.Float, self.detour))
+        return TimeGate(per_lane, low, high, self.survival, dr.opaque(mi.Float, self.detour))
 
 
 def light_leaves_window(built: BuiltScene, capture: Capture, time_axis: TimeAxis, bounces: BounceAxis) -> bool:

@@ -1,8 +1,9 @@
-"""The line-of-sight engine: ``render(batch) -> Histogram`` of pixels, as the path engine's of sensor points."""
+"""The line-of-sight engine: what a camera sees of a scene that emits one pulse, pixel by pixel."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import replace
 
 import drjit as dr
@@ -10,30 +11,19 @@ import mitsuba as mi
 import numpy as np
 
 from nlosrender.capture.grids import Capture
-from nlosrender.capture.plan import MAX_SUMS, Batch
+from nlosrender.capture.plan import Batch, Plan
 from nlosrender.capture.time_axis import TimeAxis
+from nlosrender.engine.interface import Budget, OmittedWork, PilotSeconds, TimeEstimate
+from nlosrender.engine.launch.accumulation import Accumulation
+from nlosrender.engine.launch.cost_pilot import sampled_batch_bytes, sampling_estimate
+from nlosrender.engine.launch.device_capture import RenderOptions
 from nlosrender.engine.launch.histogram import DeviceHistogram, Histogram, HistogramShape
-from nlosrender.engine.launch.launch_params import LaneRandomness
+from nlosrender.engine.launch.lane_random_state import LaneRandomness
 from nlosrender.engine.launch.passes import Passes
 from nlosrender.engine.launch.pilot_points import Pilot, pilot_of
-from nlosrender.engine.launch.sample_schedule import (
-    FIRST_SAMPLES,
-    Budget,
-    Sampled,
-    Schedule,
-    accumulate,
-    calibrated_by_pilot,
-    pilot_replicas,
-)
+from nlosrender.engine.launch.schedule import Schedule, calibrated_by_pilot, pilot_replicas
 from nlosrender.engine.line_of_sight.loop import trace_view
-from nlosrender.engine.line_of_sight.view_params import (
-    ViewLaunchParams,
-    ViewSettings,
-    crosses_rough_surfaces,
-    view_launch_params,
-)
-from nlosrender.engine.path.engine import RenderOptions
-from nlosrender.errors import RenderError
+from nlosrender.engine.line_of_sight.view_params import ViewSettings, crosses_rough_surfaces, view_launch_params
 from nlosrender.scene.view import BuiltView
 
 
@@ -51,6 +41,7 @@ class LineOfSightEngine:
     """
 
     name = "line_of_sight"
+    traces_paths = True
 
     def __init__(
         self,
@@ -71,87 +62,73 @@ class LineOfSightEngine:
             has_sky=any(far),
             bends=crosses_rough_surfaces(built.scene),
         )
-        self.scale = 1.0
         self.compile_seconds = 0.0
 
-    @property
-    def n_slots(self) -> int:
-        """Bounce slots that are sampled: all."""
-        return self.options.bounces.n_slots
+    def set_up(self) -> None:
+        """Do nothing: batches share the scene alone; see ``Engine.set_up``."""
 
-    def shape(self, batch: Batch | Pilot, slots: int) -> HistogramShape:
-        """Return the shape of a batch's histogram with ``slots`` bounce slots."""
-        options = self.options
-        return HistogramShape(options.replicas, batch.sensors.size, 1, slots, options.channels, self.time_axis.n_bins)
-
-    def render(
-        self, batch: Batch, budget: Budget, passes: Passes | None = None, known_squares: float = 0.0
-    ) -> Histogram:
-        """Render one batch.
-
-        Parameters
-        ----------
-        batch, budget, passes, known_squares
-            As for the path engine.
+    def render(self, batch: Batch, budget: Budget, passes: Passes | None = None) -> Histogram:
+        """Render one batch; see ``Engine.render``.
 
         Returns
         -------
         Histogram
             Axes (channel, bounce, 1, pixel, bin), pixels flattened row by row; radiance [W m^-2 sr^-1].
-
-        Raises
-        ------
-        RenderError
-            The batch is too large for 32-bit indices, or the result is not finite.
         """
-        shape = self.shape(batch, self.n_slots)
-        if shape.size > MAX_SUMS:
-            raise RenderError(
-                f"a batch of {shape.size:.2e} sums is more than 32-bit indices reach; lower render.memory_limit"
-            )
-        schedule = Schedule(budget, shape.replicas, known_squares, shape.lanes)
-        sampled = self._accumulate(batch, shape, schedule, passes or Passes())
-        mean, variance = sampled.mean, sampled.variance
-        if not (np.isfinite(mean).all() and np.isfinite(variance).all()):
-            raise RenderError("the line-of-sight engine produced a value that is not finite; please report the scene")
-        return Histogram(
-            mean[..., :-1], variance[..., :-1], mean[..., -1], sampled.per_lane * shape.replicas, sampled.contrasts
-        )
+        accumulation = self._accumulation(batch, self._shape(batch))
+        shape = accumulation.shape
+        schedule = Schedule(budget, shape.replicas, lanes=shape.lanes, tuning=self.options.schedule)
+        result = accumulation.run(schedule, passes or Passes())
+        self.compile_seconds += accumulation.compile_seconds
+        return result
 
-    def calibrate(self, budget: Budget, known_squares: float = 0.0, seconds: float = math.inf) -> Budget:
-        """Turn a target error into samples for the whole capture, found by a pilot on a few of its pixels.
-
-        Parameters
-        ----------
-        budget, known_squares, seconds
-            As for the path engine.
-        """
+    def calibrate(self, budget: Budget, seconds: float = math.inf) -> Budget:
+        """Turn a target error into samples by a pilot on a few pixels; see ``Engine.calibrate``."""
         if budget.is_calibrated:
             return budget
-        pilot = pilot_of(self.capture)
-        replicas = pilot_replicas(self.options.replicas, pilot.sensors.size)
-        shape = replace(self.shape(pilot, self.n_slots), replicas=replicas)
+        pilot, options = pilot_of(self.capture), self.options
+        shape = replace(self._shape(pilot), replicas=pilot_replicas(options.replicas, pilot.sensors.size))
+        accumulation = self._accumulation(pilot, shape)
+        replicas = options.replicas, shape.replicas
+        calibrated = calibrated_by_pilot(budget, replicas, accumulation.run, seconds=seconds, tuning=options.schedule)
+        self.compile_seconds += accumulation.compile_seconds
+        return calibrated
 
-        def look(schedule: Schedule, passes: Passes) -> None:
-            self._accumulate(pilot, shape, schedule, passes)
+    def _shape(self, batch: Batch | Pilot) -> HistogramShape:
+        options = self.options
+        slots, channels = options.bounces.n_slots, options.channels
+        return HistogramShape(options.replicas, batch.sensors.size, 1, slots, channels, self.time_axis.n_bins)
 
-        least = FIRST_SAMPLES * self.options.replicas
-        return calibrated_by_pilot(budget, replicas, look, known_squares, seconds, least)
-
-    def _accumulate(self, batch: Batch | Pilot, shape: HistogramShape, schedule: Schedule, passes: Passes) -> Sampled:
+    def _accumulation(self, batch: Batch | Pilot, shape: HistogramShape) -> Accumulation:
         pixels = np.array(batch.sensors.flat_indices(self.capture.sensor_grid.nx), dtype=np.uint32)
         params = view_launch_params(self.built, self.capture, self.time_axis, pixels, shape.lanes)
 
-        def launch(histogram: DeviceHistogram, randomness: LaneRandomness, more: int) -> LaneRandomness:
-            return self._launch(params, histogram, randomness, more)
+        def launch(histogram: DeviceHistogram, randomness: LaneRandomness, more: int, _: range) -> LaneRandomness:
+            advanced = trace_view(self.settings, params, histogram, randomness, dr.opaque(mi.UInt32, more))
+            dr.eval(histogram.sums, advanced.generator, advanced.sequence)
+            return advanced
 
-        sampled = accumulate(shape, pixels, self.options.seed, launch, schedule, passes, self.scale)
-        self.compile_seconds += sampled.compile_seconds
-        return sampled
+        return Accumulation(shape, pixels, self.options.seed, launch)
 
-    def _launch(
-        self, params: ViewLaunchParams, histogram: DeviceHistogram, randomness: LaneRandomness, more: int
-    ) -> LaneRandomness:
-        advanced = trace_view(self.settings, params, histogram, randomness, dr.opaque(mi.UInt32, more))
-        dr.eval(histogram.sums, advanced.generator, advanced.sequence)
-        return advanced
+    # What ``preflight`` and reports ask
+
+    def omitted_work(self) -> Iterator[OmittedWork]:
+        """Yield the work that is left out; see ``Engine.omitted_work``."""
+        if not self.settings.polarized:
+            yield OmittedWork("polarisation", "render.polarized is false")
+
+    def shared_samples(self) -> str:
+        """Return nothing: pixels have samples of their own; see ``Engine.shared_samples``."""
+        return ""
+
+    def batch_bytes(self, plan: Plan, available: float = math.inf) -> int:
+        """Return the memory of the largest batch; see ``Engine.batch_bytes``."""
+        return sampled_batch_bytes(plan, self._shape)
+
+    def warnings(self) -> Iterator[str]:
+        """Yield nothing; see ``Engine.warnings``."""
+        return iter(())
+
+    def cost_estimate(self, plan: Plan, budget: Budget, lanes: int, pilot: PilotSeconds) -> TimeEstimate:
+        """Estimate the seconds of a render; see ``Engine.cost_estimate``."""
+        return sampling_estimate(self, plan, budget, lanes, pilot)

@@ -13,7 +13,8 @@ import drjit as dr
 import mitsuba as mi
 
 from nlosrender.engine.launch.histogram import DeviceHistogram
-from nlosrender.engine.launch.launch_params import HIGHEST_SURVIVAL, LaneRandomness
+from nlosrender.engine.launch.lane_random_state import LaneRandomness
+from nlosrender.engine.launch.launch_params import MAX_SURVIVAL
 from nlosrender.engine.launch.recurrence import recurrence_steps
 from nlosrender.engine.line_of_sight.view_params import ViewLaunchParams, ViewSettings
 
@@ -134,7 +135,7 @@ def trace_view(
         alive = go_on & (brightness > 0)
         if dr.hint(settings.russian_roulette, mode="scalar"):
             # radiance is compressed by the index squared, and is no reason to end
-            survival = dr.minimum(brightness * dr.square(medium), HIGHEST_SURVIVAL)
+            survival = dr.minimum(brightness * dr.square(medium), MAX_SURVIVAL)
             survival = dr.select(bounce < ROULETTE_AFTER, 1, survival)
             alive &= generator.next_float32(alive) < survival
             throughput *= dr.rcp(dr.maximum(survival, 1e-9))

@@ -1,129 +1,86 @@
-"""The path engine: ``render(batch) -> Histogram`` until the asked-for error, sample count or time is reached."""
+"""The path engine: unbiased path tracing of a capture, batch by batch, to an error, a sample count or a time."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from collections.abc import Iterator
+from dataclasses import replace
 from functools import cached_property
 
 import drjit as dr
 import mitsuba as mi
-import numpy as np
-from numpy.typing import NDArray
 
-from nlosrender.capture.bounces import THIRD_BOUNCE, BounceAxis
-from nlosrender.capture.grids import Capture
-from nlosrender.capture.plan import MAX_SUMS, Batch
-from nlosrender.capture.time_axis import TimeAxis
-from nlosrender.engine.launch.device_arrays import laser_points, on_device, sensor_points
-from nlosrender.engine.launch.energy_contrasts import no_contrasts
+from nlosrender.capture.bounces import THIRD_BOUNCE
+from nlosrender.capture.plan import Batch, Plan
+from nlosrender.engine.interface import Budget, OmittedWork, PilotSeconds, TimeEstimate
+from nlosrender.engine.launch.accumulation import Accumulation, lane_randomness
+from nlosrender.engine.launch.cost_pilot import sampled_batch_bytes, sampling_estimate
+from nlosrender.engine.launch.device_capture import DeviceCapture
+from nlosrender.engine.launch.hidden_aabb import HiddenAabb
 from nlosrender.engine.launch.histogram import DeviceHistogram, Histogram, HistogramShape
-from nlosrender.engine.launch.launch_params import LaneRandomness, LaunchParams, PathSettings
-from nlosrender.engine.launch.morton import morton_order
+from nlosrender.engine.launch.lane_random_state import LaneRandomness
+from nlosrender.engine.launch.near_surfaces import rare_light_warnings
 from nlosrender.engine.launch.occlusion import nothing_occludes
+from nlosrender.engine.launch.omissions import omitted_by_time_gate, omitted_triangles, omitted_visibility
 from nlosrender.engine.launch.passes import Passes
 from nlosrender.engine.launch.pilot_points import Pilot, pilot_of
 from nlosrender.engine.launch.plain_diffuse import is_plain_diffuse
-from nlosrender.engine.launch.sample_schedule import (
-    FIRST_SAMPLES,
-    Budget,
-    Schedule,
-    accumulate,
-    calibrated_by_pilot,
-    lane_randomness,
-    pilot_replicas,
-)
-from nlosrender.engine.launch.second_bounce import deposit_second_bounce
-from nlosrender.engine.launch.surface_sampler import SurfaceSampler
+from nlosrender.engine.launch.schedule import Schedule, calibrated_by_pilot, pilot_replicas
 from nlosrender.engine.launch.systematic_sequence import SystematicSequence
 from nlosrender.engine.launch.temporal_kernel import TemporalKernel
-from nlosrender.engine.launch.time_gate import CaptureTimeGate, light_leaves_window
-from nlosrender.engine.path.full_loop import load_path_integrator
-from nlosrender.engine.path.hidden_aabb import HiddenAabb
-from nlosrender.engine.path.roulette import (
-    DIRECT,
-    LEAST_PATHS,
-    PILOT_SAMPLES,
-    PILOT_SEED,
-    TRACED,
-    best_continuation_period,
-    first_phases,
-)
-from nlosrender.engine.path.technique_mixture import box_often_missed, choose_p_hidden_sampling
-from nlosrender.engine.path.third_bounce_loop import are_direct
-from nlosrender.errors import RenderError
-from nlosrender.scene.build import BuiltScene
-
-
-@dataclass(frozen=True)
-class RenderOptions:
-    """The techniques of Royo et al. 2022 and what is computed."""
-
-    bounces: BounceAxis
-    laser_sampling: bool = True
-    hidden_geometry_sampling: bool = True
-    russian_roulette: bool = True
-    channels: int = 1
-    seed: int = 0
-    replicas: int = 2
-    has_time_gate: bool = True  # few paths go on that can only bring light after the time window
-    temporal_kernel_bins: float = 0.0  # full width of the kernel in time [bins]; 0: a plain histogram
-    p_hidden_sampling: float | None = None  # share of hidden geometry sampling on the wall; None: chosen from the scene
-    continuation_period: int | None = None  # one path in so many goes on after bounce 3; None: by a pilot
+from nlosrender.engine.path.full_loop import trace_paths
+from nlosrender.engine.path.roulette import best_continuation_period, first_phases
+from nlosrender.engine.path.settings import PathParams, PathSettings
+from nlosrender.engine.path.technique_mixture import box_often_missed, choose_p_hidden_sampling, omitted_techniques
+from nlosrender.engine.path.third_bounce_loop import is_third_bounce_loop, trace_third_bounce
+from nlosrender.engine.path.tuning import DEFAULT_TUNING, PILOT_SEED, PathTuning
 
 
 class PathEngine:
-    """Unbiased path tracing of a capture, batch by batch.
+    """Unbiased path tracing of a capture.
 
     Parameters
     ----------
-    built, capture, time_axis
-        The scene and what is measured of it.
-    options
-        Techniques, bounces, seed.
+    device
+        The capture on the device.
     first_bounce
         Lowest bounce to compute, >= 3, for engines that know the lower ones.
     reason
         Why this engine renders the scene, in plain words.
+    tuning
+        Its numbers.
     """
 
     name = "path"
 
     def __init__(
         self,
-        built: BuiltScene,
-        capture: Capture,
-        time_axis: TimeAxis,
-        options: RenderOptions,
+        device: DeviceCapture,
         first_bounce: int = THIRD_BOUNCE,
         reason: str = "asked for",
+        tuning: PathTuning = DEFAULT_TUNING,
     ):
-        self.reason = reason
-        self.built, self.capture, self.time_axis, self.options = built, capture, time_axis, options
-        self.sampler = SurfaceSampler(built)
-        self.first_bounce = first_bounce
-        # Throughput is per (engine unit)^2: H falls with the square of a scene's size.
-        self.scale = capture.laser_energy / built.unit**2
-        self.kernel = TemporalKernel(options.temporal_kernel_bins) if options.temporal_kernel_bins > 0 else None
-        # None: nothing can arrive after the window, and no path is ended for it
-        has_time_gate = options.has_time_gate and light_leaves_window(built, capture, time_axis, options.bounces)
-        self.capture_gate = CaptureTimeGate.of(built, capture, time_axis) if has_time_gate else None
+        self.device, self.first_bounce, self.reason, self.tuning = device, first_bounce, reason, tuning
+        self.built, self.capture, self.time_axis = device.built, device.capture, device.time_axis
+        self.options, self.sampler = device.options, device.sampler
+        width = self.options.temporal_kernel_bins
+        self.kernel = TemporalKernel(width) if width > 0 else None
         self.compile_seconds = 0.0
 
-    # Made when they are needed: an engine that only lends its points to a gather samples no surfaces.
+    # Made when they are needed: they cast rays, and ``plan`` asks engines that never trace a path.
 
     @cached_property
     def p_hidden_sampling(self) -> float:
-        """Share of hidden geometry sampling at a vertex of the wall."""
+        """Probability of hidden geometry sampling at a vertex of the wall."""
         if self.options.p_hidden_sampling is not None:
             return self.options.p_hidden_sampling
         if not self.options.hidden_geometry_sampling:
             return 0.0
-        return choose_p_hidden_sampling(self.built, self.sampler, self.capture, self.time_axis)
+        return choose_p_hidden_sampling(self.device, self.tuning)
 
     @cached_property
     def settings(self) -> PathSettings:
-        """What the integrator computes, and how."""
+        """What the kernels compute, and how."""
         flags = [shape.bsdf().flags() for shape in self.built.hidden_shapes]
         return PathSettings(
             bounces=self.options.bounces,
@@ -135,99 +92,19 @@ class PathEngine:
             needs_visibility=not nothing_occludes(self.built),
             has_transmission=any(bool(flag & mi.BSDFFlags.Transmission) for flag in flags),
             is_plain_diffuse=is_plain_diffuse(self.built),
+            max_tries=self.tuning.max_tries,
         )
 
     @cached_property
     def hidden_aabb(self) -> HiddenAabb | None:
         """Box around the hidden geometry; None where few rays from the wall miss it, or all are sent to points."""
-        if self.p_hidden_sampling > 0:
-            return None
-        return box_often_missed(self.built, self.capture, self.time_axis)
+        return None if self.p_hidden_sampling > 0 else box_often_missed(self.device, self.tuning)
 
-    @cached_property
-    def integrator(self) -> mi.Integrator:
-        """Mitsuba's plugin that traces the paths."""
-        return load_path_integrator(self.settings)
-
-    def render(
-        self,
-        batch: Batch,
-        budget: Budget,
-        passes: Passes | None = None,
-        known_squares: float = 0.0,
-    ) -> Histogram:
-        """Render one batch.
-
-        Parameters
-        ----------
-        batch, budget, passes
-            What to render, when to stop; who is told between two launches how far it is.
-        known_squares
-            Sum of the squares of H known from elsewhere, which ``target_error`` counts in [(engine unit)^-4]; those of
-            the second bounce not among them.
-
-        Returns
-        -------
-        Histogram
-            Axes (channel, bounce, laser, sensor, bin), laser and sensor flattened row by row.
-
-        Raises
-        ------
-        RenderError
-            The batch is too large for 32-bit indices, or the result is not finite.
-        """
-        bounces = self.options.bounces
-        shape = self.shape(batch, self.n_slots)
-        if shape.size > MAX_SUMS:
-            raise RenderError(
-                f"a batch of {shape.size:.2e} sums is more than 32-bit indices reach; lower render.memory_limit"
-            )
-        if self._has_bounces:
-            params = self._of_paths(batch, shape, self._continuation_period(budget))
-            if budget.target_error is not None:
-                known_squares += self.second_squares(batch)
-            schedule = Schedule(budget, shape.replicas, known_squares, shape.lanes * shape.lasers)
-            mean, variance, per_lane, contrasts = self._accumulate(batch, shape, params, schedule, passes or Passes())
-        else:
-            axes = (shape.channels, bounces.n_slots, shape.lasers, shape.sensors, shape.row)
-            mean, variance, per_lane = np.zeros(axes), np.zeros(axes), 0
-            contrasts = no_contrasts(shape.channels, bounces.n_slots)
-        if not self.built.wall.is_planar:
-            mean[:, :1] += self.second_bounce(batch)
-        if not (np.isfinite(mean).all() and np.isfinite(variance).all()):
-            raise RenderError("the path engine produced a value that is not finite; please report the configuration")
-        return Histogram(mean[..., :-1], variance[..., :-1], mean[..., -1], per_lane * shape.replicas, contrasts)
-
-    def calibrate(self, budget: Budget, known_squares: float = 0.0, seconds: float = math.inf) -> Budget:
-        """Turn a target error into samples for the whole capture, found by a pilot on a few of its points.
-
-        The number does not depend on how the capture is cut. Budgets with ``spp`` or a time limit stay as they are.
-
-        Parameters
-        ----------
-        budget
-            What is asked for.
-        known_squares
-            As for ``render``, over the pilot's points.
-        seconds
-            As for ``calibrated_by_pilot``.
-        """
-        if budget.is_calibrated:
-            return budget
-        if not self._has_bounces:
-            return budget
-        pilot = pilot_of(self.capture)
-        shape = replace(
-            self.shape(pilot, self.n_slots), replicas=pilot_replicas(self.options.replicas, pilot.sensors.size)
-        )
-        params = self._of_paths(pilot, shape, self._continuation_period(budget))
-
-        def look(schedule: Schedule, passes: Passes) -> None:
-            self._accumulate(pilot, shape, params, schedule, passes)
-
-        known_squares += self.second_squares(pilot)
-        least = FIRST_SAMPLES * self.options.replicas
-        return calibrated_by_pilot(budget, shape.replicas, look, known_squares, seconds, least)
+    @property
+    def traces_paths(self) -> bool:
+        """Whether any bounce that this engine computes is asked for."""
+        highest = self.options.bounces.max_bounces
+        return highest is None or highest >= self.first_bounce
 
     @property
     def n_slots(self) -> int:
@@ -235,149 +112,156 @@ class PathEngine:
         bounces = self.options.bounces
         return max(1, bounces.n_slots - 1) if bounces.split else 1
 
-    @property
-    def _has_bounces(self) -> bool:
-        highest = self.options.bounces.max_bounces
-        return highest is None or highest >= self.first_bounce
+    def set_up(self) -> None:
+        """Make the table of sampled surfaces; see ``Engine.set_up``."""
+        self.sampler.set_up()
 
-    def _accumulate(
-        self, batch: Batch | Pilot, shape: HistogramShape, params: LaunchParams, schedule: Schedule, passes: Passes
-    ) -> tuple[np.ndarray, np.ndarray, int, np.ndarray]:
-        bounces, row_points = self.options.bounces, self.sensor_indices(batch)
-        points = row_points[self.lane_order(batch)]
-        seed, kernel = self.options.seed, self.kernel
+    def render(
+        self, batch: Batch, budget: Budget, passes: Passes | None = None, known_squares: float = 0.0
+    ) -> Histogram:
+        """Render one batch; see ``Engine.render``.
 
-        def launch(histogram: DeviceHistogram, randomness: LaneRandomness, more: int) -> LaneRandomness:
+        ``known_squares``: sum of the squares of H known from elsewhere, which ``target_error`` counts in
+        [(engine unit)^-4], without those of the second bounce.
+        """
+        if not self.traces_paths:
+            return self.device.histogram_without_samples(batch)
+        accumulation = self._accumulation(batch, self.device.shape(batch, self.n_slots), budget)
+        shape = accumulation.shape
+        if budget.target_error is not None:
+            known_squares += self.device.second_squares(batch)
+        lanes, tuning = shape.lanes * shape.lasers, self.options.schedule
+        schedule = Schedule(budget, shape.replicas, known_squares, lanes, tuning)
+        result = accumulation.run(schedule, passes or Passes())
+        self.compile_seconds += accumulation.compile_seconds
+        self.device.add_second_bounce(batch, result)
+        return result
+
+    def calibrate(self, budget: Budget, seconds: float = math.inf, known_squares: float = 0.0) -> Budget:
+        """Turn a target error into samples; see ``Engine.calibrate``, and ``render`` for ``known_squares``."""
+        if budget.is_calibrated or not self.traces_paths:
+            return budget
+        pilot, options = pilot_of(self.capture), self.options
+        shape = self._pilot_shape(pilot)
+        accumulation = self._accumulation(pilot, shape, budget)
+        known_squares += self.device.second_squares(pilot)
+        replicas = options.replicas, shape.replicas
+        calibrated = calibrated_by_pilot(budget, replicas, accumulation.run, known_squares, seconds, options.schedule)
+        self.compile_seconds += accumulation.compile_seconds
+        return calibrated
+
+    def trace(
+        self,
+        params: PathParams,
+        histogram: DeviceHistogram,
+        randomness: LaneRandomness,
+        systematic: SystematicSequence,
+        n_samples: int,
+    ) -> tuple[LaneRandomness, SystematicSequence]:
+        """Trace ``n_samples`` more paths per lane into ``histogram``; return the advanced random state."""
+        loop = trace_third_bounce if is_third_bounce_loop(self.settings, self.sampler) else trace_paths
+        count = dr.opaque(mi.UInt32, n_samples)
+        advanced, systematic = loop(self.settings, params, histogram, randomness, systematic, count)
+        dr.eval(histogram.sums, advanced.generator, advanced.sequence, advanced.phase, systematic.at)
+        return advanced, systematic
+
+    def _accumulation(self, batch: Batch | Pilot, shape: HistogramShape, budget: Budget) -> Accumulation:
+        """Return the sampling of a batch's paths."""
+        bounces, row_points = self.options.bounces, self.device.sensor_indices(batch)
+        points, nx = row_points[self.device.lane_order(batch)], self.capture.sensor_grid.nx
+        period = self.continuation_period(budget)
+        params = self._path_params(batch, shape, period)
+        seed = self.options.seed
+
+        def launch(histogram: DeviceHistogram, randomness: LaneRandomness, more: int, stage: range) -> LaneRandomness:
             if randomness.phase is None:
-                phases = first_phases(
-                    seed, points, self.capture.sensor_grid.nx, shape.lanes, params.continuation_period
-                )
+                phases = first_phases(seed, points, nx, shape.lanes, params.continuation_period)
                 randomness = replace(randomness, phase=phases)
             systematic = randomness.systematic
-            if systematic is None or systematic.stage != schedule.stage:
-                systematic = SystematicSequence.of_paths(schedule.stage, randomness.sequence[0])
-            advanced, systematic = self.integrator.accumulate(params, histogram, randomness, systematic, more)
-            return replace(advanced, systematic=replace(systematic, stage=schedule.stage))
+            if systematic is None or systematic.stage != stage:
+                systematic = SystematicSequence.of_paths(stage, randomness.sequence[0])
+            advanced, systematic = self.trace(params, histogram, randomness, systematic, more)
+            return replace(advanced, systematic=replace(systematic, stage=stage))
 
         first = 1 if bounces.split else 0  # the second bounce has slot 0
         slots = range(-first, bounces.n_slots - first)
-        result = accumulate(shape, points, seed, launch, schedule, passes, self.scale, slots, kernel, row_points)
-        self.compile_seconds += result.compile_seconds
-        return result.mean, result.variance, result.per_lane, result.contrasts
+        return Accumulation(shape, points, seed, launch, self.device.scale, slots, self.kernel, row_points)
 
-    def shape(self, batch: Batch | Pilot, slots: int) -> HistogramShape:
-        """Return the shape of a batch's histogram with ``slots`` bounce slots."""
-        lasers = batch.lasers.size if self.capture.scan_type == "exhaustive" else 1
-        options = self.options
-        return HistogramShape(
-            options.replicas, batch.sensors.size, lasers, slots, options.channels, self.time_axis.n_bins
-        )
-
-    def launch_params(
-        self,
-        batch: Batch | Pilot,
-        shape: HistogramShape,
-        order: NDArray[np.int64] | None = None,
-    ) -> LaunchParams:
-        """Return what the lanes of a batch read, whether they trace paths or not.
-
-        Parameters
-        ----------
-        batch, shape
-            What is rendered, and the shape of its histogram.
-        order
-            (n,) the batch's sensor points in the order in which lanes take them; None: as they are.
-        """
-        index, capture_gate = self.sensor_indices(batch), self.capture_gate
-        sensors = sensor_points(self.built, self.capture, self.time_axis, index)
-        lasers = laser_points(self.built, self.capture, self.time_axis, self.laser_indices(batch))
-        lane = dr.arange(mi.UInt32, shape.lanes)
-        sensor = lane % shape.sensors
-        if order is not None:
-            sensor = dr.gather(mi.UInt32, on_device(mi.UInt32, order), sensor)
-        row_of_lane = lane // shape.sensors * shape.sensors + sensor
-        confocal = self.capture.scan_type == "confocal"
-        first_laser = mi.UInt32(sensor) if confocal else dr.zeros(mi.UInt32, shape.lanes)
-        per_lane = sensors.gather(sensor)
-        dr.eval(per_lane.interaction, per_lane.delay_bins, per_lane.delay_fraction, first_laser, row_of_lane)
-        time_gate = None
-        if capture_gate is not None:
-            time_gate = capture_gate.of_sensors(self.built, self.capture, self.time_axis, index, sensor)
-        return LaunchParams(
-            built=self.built,
-            sampler=self.sampler,
-            sensors=per_lane,
-            lasers=lasers,
-            first_laser=first_laser,
-            lasers_per_lane=shape.lasers,
-            n_lasers=dr.opaque(mi.UInt32, shape.lasers),
-            bins_per_unit=dr.opaque(mi.Float, self.built.unit / self.time_axis.bin_width_opl),
-            time_gate=time_gate,
-            hidden_aabb=None,
-            row_of_lane=row_of_lane,
-            continuation_period=dr.opaque(mi.UInt32, 1),
-        )
-
-    def _of_paths(self, batch: Batch | Pilot, shape: HistogramShape, continuation_period: int) -> LaunchParams:
-        """Return what the lanes of a batch read that trace paths, neighbours together; see ``LaunchParams``."""
-        params = self.launch_params(batch, shape, self.lane_order(batch))
+    def _path_params(self, batch: Batch | Pilot, shape: HistogramShape, period: int) -> PathParams:
+        params = self.device.launch_params(batch, shape, self.device.lane_order(batch))
         if self.p_hidden_sampling > 0:
             self.sampler.set_up()
-        return replace(
-            params, hidden_aabb=self.hidden_aabb, continuation_period=dr.opaque(mi.UInt32, continuation_period)
-        )
+        own = {"hidden_aabb": self.hidden_aabb, "continuation_period": dr.opaque(mi.UInt32, period)}
+        return PathParams(**vars(params), **own)
 
-    def lane_order(self, batch: Batch | Pilot) -> NDArray[np.int64]:
-        """Return the order in which lanes take a batch's sensor points: rays of a packet start near each other."""
-        positions = self.capture.sensor_grid.positions.reshape(-1, 3)[self.sensor_indices(batch)]
-        return np.argsort(morton_order(positions), kind="stable")
+    def _pilot_shape(self, pilot: Pilot) -> HistogramShape:
+        replicas = pilot_replicas(self.options.replicas, pilot.sensors.size)
+        return replace(self.device.shape(pilot, self.n_slots), replicas=replicas)
 
-    def _continuation_period(self, budget: Budget) -> int:
-        """Return of how many paths one goes on beyond the third bounce: the same however the capture is cut."""
+    def continuation_period(self, budget: Budget) -> int:
+        """Return n of the roulette after bounce 3: the same however the capture is cut."""
         if not self.settings.has_continuation_roulette:
             return 1
         if self.options.continuation_period is not None:
             return self.options.continuation_period
         has_end = budget.target_error is None and budget.time_limit_s is None
-        if has_end and (budget.spp or 0) * self.capture.n_sensors < LEAST_PATHS:
+        if has_end and (budget.spp or 0) * self.capture.n_sensors < self.tuning.min_paths_for_pilot:
             return 1
         return self._best_period
 
     @cached_property
     def _best_period(self) -> int:
-        direct, split = are_direct(self.settings, self.sampler), self.options.bounces.split
-        return best_continuation_period(self._pilot_variance, DIRECT if direct else TRACED, split)
+        is_quick = is_third_bounce_loop(self.settings, self.sampler)
+        cost = self.tuning.direct if is_quick else self.tuning.traced
+        return best_continuation_period(self._pilot_variance, cost, self.options.bounces.split)
 
-    def _pilot_variance(self, continuation_period: int) -> float:
+    def _pilot_variance(self, period: int) -> float:
         """Return the variance of H, summed, of a few samples at a few points: in arbitrary units."""
-        pilot, nx = pilot_of(self.capture), self.capture.sensor_grid.nx
-        replicas = pilot_replicas(self.options.replicas, pilot.sensors.size)
-        shape, order = replace(self.shape(pilot, self.n_slots), replicas=replicas), self.lane_order(pilot)
-        params, histogram = self._of_paths(pilot, shape, continuation_period), DeviceHistogram(shape, self.kernel)
-        points = self.sensor_indices(pilot)[order]
+        pilot, nx, samples = pilot_of(self.capture), self.capture.sensor_grid.nx, self.tuning.pilot_samples
+        shape, order = self._pilot_shape(pilot), self.device.lane_order(pilot)
+        params, histogram = self._path_params(pilot, shape, period), DeviceHistogram(shape, self.kernel)
+        points = self.device.sensor_indices(pilot)[order]
         phases = first_phases(PILOT_SEED, points, nx, shape.lanes, params.continuation_period)
         random = replace(lane_randomness(shape, points, PILOT_SEED), phase=phases)
-        systematic = SystematicSequence.of_paths(range(PILOT_SAMPLES), random.sequence[0])
-        self.integrator.accumulate(params, histogram, random, systematic, PILOT_SAMPLES)
-        return float(histogram.on_host(histogram.statistics(PILOT_SAMPLES)[1])[..., :-1].sum())
+        systematic = SystematicSequence.of_paths(range(samples), random.sequence[0])
+        self.trace(params, histogram, random, systematic, samples)
+        return float(histogram.on_host(histogram.statistics(samples)[1])[..., :-1].sum())
 
-    def second_squares(self, batch: Batch | Pilot) -> float:
-        """Return the sum of the squares of the second bounce, which a target error counts in [(engine unit)^-4]."""
-        if self.built.wall.is_planar:
-            return 0.0
-        return float(np.square(self.second_bounce(batch)[..., :-1] / self.scale).sum())
+    # What ``preflight`` and reports ask
 
-    def second_bounce(self, batch: Batch | Pilot) -> np.ndarray:
-        """Return the second bounce (channel, 1, laser, sensor, row): exact, so one replica computes it."""
-        shape = replace(self.shape(batch, 1), replicas=1)
-        histogram = DeviceHistogram(shape)
-        deposit_second_bounce(self.launch_params(batch, shape), histogram)
-        return histogram.on_host(histogram.total(self.scale))
+    def omitted_work(self) -> Iterator[OmittedWork]:
+        """Yield the work that is left out; see ``Engine.omitted_work``."""
+        if not self.settings.needs_visibility:
+            yield omitted_visibility()
+        if self.p_hidden_sampling > 0:
+            yield from omitted_triangles(self.device)
+        yield from self.omitted_path_work()
 
-    def sensor_indices(self, batch: Batch | Pilot) -> np.ndarray:
-        """Return the flat indices of a batch's sensor points."""
-        return np.array(batch.sensors.flat_indices(self.capture.sensor_grid.nx), dtype=np.uint32)
+    def omitted_path_work(self) -> Iterator[OmittedWork]:
+        """Yield the part of ``omitted_work`` that is about paths; nothing where none is traced."""
+        if not self.traces_paths:
+            return
+        if self.settings.has_time_gate:
+            yield from omitted_by_time_gate(self.device)
+        if self.hidden_aabb is not None:
+            why = "such a path ends where it began"
+            yield OmittedWork("rays from the wall that miss the box around all hidden geometry", why)
+        yield from omitted_techniques(self.device, self.p_hidden_sampling)
 
-    def laser_indices(self, batch: Batch | Pilot) -> np.ndarray:
-        """Return the flat indices of a batch's laser points."""
-        return np.array(batch.lasers.flat_indices(self.capture.laser_grid.nx), dtype=np.uint32)
+    def shared_samples(self) -> str:
+        """Return what makes errors correlated; see ``Engine.shared_samples``."""
+        return "all laser points share the paths of a sensor point" if self.device.is_exhaustive else ""
+
+    def batch_bytes(self, plan: Plan, available: float = math.inf) -> int:
+        """Return the memory of the largest batch; see ``Engine.batch_bytes``."""
+        return sampled_batch_bytes(plan, lambda batch: self.device.shape(batch, self.n_slots))
+
+    def warnings(self) -> Iterator[str]:
+        """Yield what paths find by chance only; see ``Engine.warnings``."""
+        return rare_light_warnings(self.device, lambda: self.p_hidden_sampling)
+
+    def cost_estimate(self, plan: Plan, budget: Budget, lanes: int, pilot: PilotSeconds) -> TimeEstimate:
+        """Estimate the seconds of a render; see ``Engine.cost_estimate``."""
+        if not self.traces_paths:
+            return TimeEstimate(0.0, "nothing to compute")
+        return sampling_estimate(self, plan, budget, lanes, pilot)

@@ -1,28 +1,44 @@
-"""The transient path tracer: a Mitsuba integrator plugin whose one loop is the whole of Royo et al. 2022, section 4.
+"""The transient path tracer: one loop that is the whole of Royo et al. 2022, section 4.
 
-Paths start at sensor points. A lane belongs to one sensor point; when its path ends it starts the next one in
-the same iteration, so lanes stay busy whatever the path lengths. At every vertex the path is connected to the
-laser points (laser sampling) and goes on in a direction from the BSDF or, on the relay wall, towards a point
-sampled on the hidden geometry (hidden geometry sampling); see ``path_steps``. A sampled point that turns out to be
-occluded contributes nothing. Where hidden geometry sampling does alone, ``direct_paths`` has a quicker loop.
+Paths start at sensor points. A lane belongs to one sensor point; when its path ends it starts the next one in the same
+iteration (``PathStarts.begin``), so lanes stay busy whatever the path lengths. Where hidden geometry sampling does
+alone, ``third_bounce_loop`` has a quicker loop.
+
+The estimator. A path x_0 (sensor point), x_1, ..., x_k is extended from x_k in a direction w of density p(w), and its
+throughput (product of BSDF f, cosines and 1 / p, the wall's f at x_0 included) is
+
+    T_0 = 1,    T_{k+1} = T_k  f(x_k, w) cos(w) / p(w)                        [``way.value`` / ``there.density``]
+
+At a vertex of the wall p is a mixture of two techniques, q = ``p_hidden_sampling`` (one-sample MIS with the balance
+heuristic, Veach 1997, 9.2.4), elsewhere q = 0:
+
+    p(w) = (1 - q) p_bsdf(w) + q (1 / A) |x_{k+1} - x_k|^2 / cos(x_{k+1})     [A: area of the hidden geometry]
+
+Every vertex x_k is connected to every laser point l of the lane (laser sampling), whose wall reflects the laser's
+energy E with f_l; V is visibility. With bounce index b = k + 2 the deposit, in the bin of the path's length, is
+
+    H_b += E  T_k  f(x_k) cos  f_l cos_l  V / |x_k - l|^2                     [``laser_connections``]
+
+Russian roulette divides T by the survival probability: by the albedo after bounce 3, by the continuation period at
+bounce 3 (``roulette``), once by the time gate where a path can only bring light after the time window.
 """
 
 from __future__ import annotations
 
-import functools
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
 
-from nlosrender.capture.bounces import FIRST_BOUNCE, THIRD_BOUNCE, BounceAxis
+from nlosrender.capture.bounces import FIRST_BOUNCE, THIRD_BOUNCE
 from nlosrender.engine.launch.histogram import DeviceHistogram
-from nlosrender.engine.launch.launch_params import LaneRandomness, LaunchParams, PathSettings
+from nlosrender.engine.launch.lane_random_state import LaneRandomness
 from nlosrender.engine.launch.recurrence import recurrence_steps
+from nlosrender.engine.launch.surface_sampler import SurfaceSample
 from nlosrender.engine.launch.systematic_sequence import SystematicSequence, first_coordinate
 from nlosrender.engine.launch.time_gate import time_gate_roulette
-from nlosrender.engine.path.laser_connections import connect_to_lasers, deposit_spot
-from nlosrender.engine.path.third_bounce_loop import are_direct, trace_direct_paths
+from nlosrender.engine.path.laser_connections import PathVertex, connect_to_lasers, deposit_spot
+from nlosrender.engine.path.settings import PathParams, PathSettings
 from nlosrender.engine.path.vertex_steps import (
     Departure,
     DirectionNumbers,
@@ -33,14 +49,40 @@ from nlosrender.engine.path.vertex_steps import (
     unit_interval,
 )
 
-PLUGIN_NAME = "nlos_path"
-MOST_TRIES = 4  # of a lane whose paths miss everything, before the others of its packet go on
+
+@dataclass(eq=False)
+class PathStarts:
+    """Paths that a lane has begun, and where its low-discrepancy sequence is; not frozen, for it is state of a loop."""
+
+    count: mi.UInt32
+    position: mi.UInt64  # first coordinate, see ``SystematicSequence``
+    seq_v: mi.UInt32  # second coordinate
+    seq_t: mi.UInt32  # third: chooses the technique
+
+    def begin(
+        self, stride: mi.UInt64, steps: tuple[int, ...], active: mi.Bool | bool = True
+    ) -> tuple[PathStarts, DirectionNumbers, mi.Float]:
+        """Begin a path on the lanes ``active``: the one place that does.
+
+        Returns
+        -------
+        tuple
+            The advanced state; what the first direction is sampled with; the number that chooses its technique.
+        """
+        numbers = DirectionNumbers(first_coordinate(self.position), unit_interval(self.seq_v))
+        advanced = PathStarts(
+            dr.select(active, self.count + 1, self.count),
+            dr.select(active, self.position + stride, self.position),
+            dr.select(active, self.seq_v + steps[0], self.seq_v),
+            dr.select(active, self.seq_t + steps[1], self.seq_t),
+        )
+        return advanced, numbers, unit_interval(self.seq_t)
 
 
 @dr.syntax
 def trace_paths(
     settings: PathSettings,
-    params: LaunchParams,
+    params: PathParams,
     histogram: DeviceHistogram,
     randomness: LaneRandomness,
     systematic: SystematicSequence,
@@ -50,21 +92,17 @@ def trace_paths(
 
     Throughput is in units of radiance per (engine unit)^-2; the caller scales by energy and unit.
     """
-    built, sampler, sensors = params.built, params.sampler, params.sensors
+    built, sampler, sensor = params.built, params.sampler, params.sensors.interaction
     wall = mi.ShapePtr(built.wall_shape)
-    lane = params.row_of_lane
-    q = settings.p_hidden_sampling  # probability of hidden geometry sampling at a wall vertex
-    steps = recurrence_steps(2) if 0 < q < 1 else (*recurrence_steps(1), 1)  # the second chooses the technique
+    q = settings.p_hidden_sampling
+    steps = recurrence_steps(2) if 0 < q < 1 else (*recurrence_steps(1), 1)
     stride = systematic.stride
-    max_bounces, last_vertex = settings.bounces.max_bounces, settings.last_vertex
     time_gate = params.time_gate if settings.has_time_gate else None
-    further_share = 1.0 / mi.Float(params.continuation_period)
 
     # ---- State -------------------------------------------------------------------------------------------------
     generator = mi.PCG32(randomness.generator)
-    at = mi.UInt64(systematic.at)
     seq_v, seq_t = (mi.UInt32(start) for start in randomness.sequence[1:])
-    started = mi.UInt32(0)  # paths begun by this lane
+    starts = PathStarts(mi.UInt32(0), mi.UInt64(systematic.at), seq_v, seq_t)
     alive = mi.Bool(False)  # a ray is under way
     way = Departure.none(built)  # that ray
     bounce = mi.UInt32(FIRST_BOUNCE)  # bounce index that a laser connection at the last vertex has
@@ -75,85 +113,44 @@ def trace_paths(
 
     # what a launch reads is no state of the loop
     while dr.hint(
-        alive | (started < n_samples),
-        exclude=[settings, params, histogram, built, sampler, sensors, time_gate, further_share],
+        alive | (starts.count < n_samples),
+        exclude=[settings, params, histogram, built, sampler, sensor, time_gate, n_samples, stride],
     ):
         # ---- Intersect -----------------------------------------------------------------------------------------
         there = arrive(settings, params, way, alive)
-        si, hit = there.si, there.is_reached
         opl += medium * there.distance
-
-        # ---- Laser spot found by chance --------------------------------------------------------------------------
+        hit = mi.Bool(there.is_reached)
         if dr.hint(settings.finds_spot, mode="scalar"):
-            deposit_spot(
-                settings,
-                params,
-                histogram,
-                lane,
-                si,
-                way.ray,
-                hit & there.on_wall,
-                way.is_delta,
-                bounce,
-                opl,
-                throughput,
-                way.value,
-                there.density,
-                there.distance2,
-            )
-
+            deposit_spot(settings, params, histogram, there, way, bounce, opl, throughput)
         throughput = dr.select(hit, throughput * way.value / there.density, 0)
         bounce += 1
         hit &= dr.any(mi.unpolarized_spectrum(throughput) != 0)
-
-        # ---- Thin out what comes after the window, once a path ---------------------------------------------------
         hit, is_past_gate, throughput = time_gate_roulette(
-            time_gate, generator, hit, is_past_gate, opl, si.p, there.on_wall, throughput
+            time_gate, generator, hit, is_past_gate, opl, there.si.p, there.on_wall, throughput
         )
 
-        # ---- Connect to the lasers and deposit ---------------------------------------------------------------------
+        # ---- Connect to the lasers and deposit -----------------------------------------------------------------
         if dr.hint(settings.laser_sampling, mode="scalar"):
-            in_reach = mi.Bool(hit)
-            if dr.hint(settings.first_bounce > FIRST_BOUNCE + 1, mode="scalar"):
-                in_reach &= bounce >= settings.first_bounce
-            if dr.hint(settings.goes_on and max_bounces is not None, mode="scalar"):
-                in_reach &= bounce <= max_bounces
-            leg = there.leg
-            connect_to_lasers(
-                settings, params, histogram, generator, lane, si, in_reach, bounce, opl, throughput, way.origin, leg
-            )
+            lit_vertex = PathVertex(there.si, way.origin, there.leg, opl, throughput, bounce)
+            connect_to_lasers(settings, params, histogram, generator, lit_vertex, hit & settings.is_deposited(bounce))
 
-        # ---- Continue, or start the next path ----------------------------------------------------------------------
-        go_on = mi.Bool(hit)
-        if dr.hint(not settings.goes_on, mode="scalar"):
-            go_on = mi.Bool(False)
-        elif dr.hint(last_vertex is not None, mode="scalar"):
-            go_on &= bounce < last_vertex
-        start = ~go_on & (started < n_samples)
-        started = dr.select(start, started + 1, started)
+        # ---- Continue, or start the next path ------------------------------------------------------------------
+        go_on = hit & settings.may_go_on(bounce)
+        start = ~go_on & (starts.count < n_samples)
         alive = go_on | start
-        if dr.hint(settings.goes_on, mode="scalar"):
-            vertex = dr.select(start, sensors.interaction, si)
-            throughput = dr.select(start, _at_sensor(sensors.interaction), throughput)
-            opl = dr.select(start, 0, opl)
-            bounce = dr.select(start, mi.UInt32(FIRST_BOUNCE), bounce)
-            medium = dr.select(start, 1, medium)
-            is_past_gate &= ~start
-        else:
-            vertex = sensors.interaction
-            throughput = _at_sensor(sensors.interaction)
-            opl, bounce, medium = mi.Float(0), mi.UInt32(FIRST_BOUNCE), mi.Float(1)
+        starts, numbers, t = starts.begin(stride, steps, start)
+        vertex = dr.select(start, sensor, there.si) if settings.goes_on else sensor
+        throughput = dr.select(start, _at_sensor(sensor), throughput)
+        opl, medium = dr.select(start, 0, opl), dr.select(start, 1, medium)
+        bounce = dr.select(start, mi.UInt32(FIRST_BOUNCE), bounce)
+        is_past_gate &= ~start
         on_wall = vertex.shape == wall
 
-        # ---- Sample the next direction -----------------------------------------------------------------------------
-        numbers, t = DirectionNumbers(first_coordinate(at), unit_interval(seq_v)), unit_interval(seq_t)
+        # ---- Sample the next direction -------------------------------------------------------------------------
         if dr.hint(settings.goes_on, mode="scalar"):
             further = DirectionNumbers.drawn(generator, go_on)
             numbers = dr.select(start, numbers, further)
             t = dr.select(start, t, unit_interval(generator.next_uint32(go_on)))
-        at = dr.select(start, at + stride, at)
-        seq_v = dr.select(start, seq_v + steps[0], seq_v)
-        seq_t = dr.select(start, seq_t + steps[1], seq_t)
         has_target = alive & on_wall & (t < q)
         by_bsdf = alive & ~has_target
         sample = None
@@ -161,52 +158,93 @@ def trace_paths(
             sample = sampler.sample(numbers.bits_u, numbers.v, has_target)
             dark = has_target & turns_away(params, sample, vertex.p)
             if dr.hint(q == 1 and sampler.dark_behind, mode="scalar"):
-                # the next path starts at once
-                while dr.hint(dark & start & (started < n_samples), exclude=[params, sampler, vertex, start]):
-                    started += 1
-                    again = sampler.sample(first_coordinate(at), unit_interval(seq_v), dark)
-                    at += stride
-                    seq_v += steps[0]
-                    sample = again
-                    dark = turns_away(params, again, vertex.p)
+                starts, sample, dark = _begin_until_lit(
+                    params, starts, stride, steps, n_samples, vertex.p, start, sample, dark
+                )
             alive &= ~dark
             has_target &= ~dark
         way, survival, eta = leave(settings, params, generator, vertex, on_wall, numbers, sample, by_bsdf, has_target)
         if dr.hint(params.hidden_aabb is not None, mode="scalar"):
-            # before a planar wall all surfaces lie in the box: the next path starts at once
-            misses, tries = start & by_bsdf & misses_hidden(params, way.ray), mi.UInt32(0)
-            while dr.hint(
-                misses & (started < n_samples) & (tries < MOST_TRIES),
-                exclude=[settings, params, sensors, on_wall, start],
-            ):
-                started += 1
-                tries += 1
-                following = DirectionNumbers(first_coordinate(at), unit_interval(seq_v))
-                at += stride
-                seq_v += steps[0]
-                seq_t += steps[1]
-                point, nowhere = sensors.interaction, mi.Bool(False)
-                way, survival, eta = leave(
-                    settings, params, generator, point, on_wall, following, None, misses, nowhere
-                )
-                misses &= misses_hidden(params, way.ray)
+            misses = start & by_bsdf & misses_hidden(params, way.ray)
+            generator, starts, way, survival, eta, misses = _begin_until_near(
+                settings, params, generator, starts, stride, steps, n_samples, on_wall, way, survival, eta, misses
+            )
             alive &= ~misses
         medium *= eta
 
-        # ---- Stop ----------------------------------------------------------------------------------------------------
+        # ---- Stop ----------------------------------------------------------------------------------------------
         if dr.hint(settings.goes_on and settings.russian_roulette, mode="scalar"):
-            # after the connections of this vertex, by the albedo just met; never before it could deposit;
-            # after the third bounce by a share besides (``further_paths``)
-            if dr.hint(settings.first_bounce == THIRD_BOUNCE, mode="scalar"):
-                survival *= dr.select(bounce == THIRD_BOUNCE, further_share, 1)
-            survival = dr.select(start | (bounce < settings.first_bounce), 1, survival)
+            survival = _survival(settings, params, survival, start, bounce)
             alive &= generator.next_float32(alive & ~start) < survival
             way.value /= dr.maximum(survival, 1e-9)
         alive &= dr.any(mi.unpolarized_spectrum(way.value) != 0)
 
-    return replace(
-        randomness, generator=generator, sequence=[randomness.sequence[0], seq_v, seq_t]
-    ), SystematicSequence(at, stride)
+    advanced = replace(randomness, generator=generator, sequence=[randomness.sequence[0], starts.seq_v, starts.seq_t])
+    return advanced, SystematicSequence(starts.position, stride)
+
+
+@dr.syntax
+def _begin_until_lit(
+    params: PathParams,
+    starts: PathStarts,
+    stride: mi.UInt64,
+    steps: tuple[int, ...],
+    n_samples: mi.UInt32,
+    origin: mi.Point3f,
+    start: mi.Bool,
+    sample: SurfaceSample,
+    dark: mi.Bool,
+) -> tuple[PathStarts, SurfaceSample, mi.Bool]:
+    """Begin other paths at once on lanes whose first sampled point shows its dark side; no ray is traced for those."""
+    while dr.hint(dark & start & (starts.count < n_samples), exclude=[params, stride, n_samples, origin, start]):
+        starts, numbers, _ = starts.begin(stride, steps)
+        sample = params.sampler.sample(numbers.bits_u, numbers.v, dark)
+        dark = turns_away(params, sample, origin)
+    return starts, sample, dark
+
+
+@dr.syntax
+def _begin_until_near(
+    settings: PathSettings,
+    params: PathParams,
+    generator: mi.PCG32,
+    starts: PathStarts,
+    stride: mi.UInt64,
+    steps: tuple[int, ...],
+    n_samples: mi.UInt32,
+    on_wall: mi.Bool,
+    way: Departure,
+    survival: mi.Float,
+    eta: mi.Float,
+    misses: mi.Bool,
+) -> tuple[mi.PCG32, PathStarts, Departure, mi.Float, mi.Float, mi.Bool]:
+    """Begin other paths at once on lanes whose first ray misses the box around the hidden geometry, a few times.
+
+    Before a planar wall all surfaces lie in the box, so those paths end without a ray.
+    """
+    sensor, nowhere, tries = params.sensors.interaction, mi.Bool(False), mi.UInt32(0)
+    while dr.hint(
+        misses & (starts.count < n_samples) & (tries < settings.max_tries),
+        exclude=[settings, params, stride, n_samples, sensor, nowhere, on_wall],
+    ):
+        starts, numbers, _ = starts.begin(stride, steps)
+        tries += 1
+        way, survival, eta = leave(settings, params, generator, sensor, on_wall, numbers, None, misses, nowhere)
+        misses &= misses_hidden(params, way.ray)
+    return generator, starts, way, survival, eta, misses
+
+
+def _survival(
+    settings: PathSettings, params: PathParams, albedo: mi.Float, start: mi.Bool, bounce: mi.UInt32
+) -> mi.Float:
+    """Return the probability to go on after the connections of a vertex: by the albedo just met, at most.
+
+    Never before a vertex could deposit; after bounce 3 one path in ``continuation_period`` goes on besides.
+    """
+    survival = albedo
+    if settings.first_bounce == THIRD_BOUNCE:
+        survival *= dr.select(bounce == THIRD_BOUNCE, 1.0 / mi.Float(params.continuation_period), 1)
+    return dr.select(start | (bounce < settings.first_bounce), 1, survival)
 
 
 def _at_sensor(point: mi.SurfaceInteraction3f) -> mi.Spectrum:
@@ -219,72 +257,3 @@ def _at_sensor(point: mi.SurfaceInteraction3f) -> mi.Spectrum:
     out = point.to_world(point.wi)
     horizontal = dr.normalize(dr.cross(-out, mi.Vector3f(0, 1, 0)))
     return mi.Spectrum(mi.mueller.rotate_stokes_basis_m(out, mi.mueller.stokes_basis(out), horizontal))
-
-
-@functools.cache
-def _plugin_class(variant: str) -> type:
-    """Return the plugin's class for an active variant: Mitsuba's base classes differ between variants."""
-
-    class NlosPathIntegrator(mi.SamplingIntegrator):
-        """``nlos_path``: the fields of ``PathSettings`` as plugin parameters.
-
-        ``max_bounces`` is -1 for no limit; lengths are in engine units.
-        """
-
-        def __init__(self, properties: mi.Properties):
-            super().__init__(properties)
-            max_bounces = int(properties.get("max_bounces", -1))
-            self.settings = PathSettings(
-                bounces=BounceAxis(
-                    None if max_bounces < 0 else max_bounces, bool(properties.get("split_bounces", True))
-                ),
-                first_bounce=int(properties.get("first_bounce", FIRST_BOUNCE + 1)),
-                p_hidden_sampling=float(properties.get("hidden_fraction", 1.0)),
-                laser_sampling=bool(properties.get("laser_sampling", True)),
-                russian_roulette=bool(properties.get("russian_roulette", True)),
-                spot_radius=float(properties.get("spot_radius", 0.0)),
-                needs_visibility=bool(properties.get("needs_visibility", True)),
-                has_transmission=bool(properties.get("has_transmission", False)),
-                is_plain_diffuse=bool(properties.get("only_normals_matter", False)),
-            )
-
-        def accumulate(
-            self,
-            params: LaunchParams,
-            histogram: DeviceHistogram,
-            randomness: LaneRandomness,
-            systematic: SystematicSequence,
-            n_samples: int,
-        ) -> tuple[LaneRandomness, SystematicSequence]:
-            """Trace ``n_samples`` more paths per lane into ``histogram``; return the advanced random state."""
-            trace = trace_direct_paths if are_direct(self.settings, params.sampler) else trace_paths
-            count = dr.opaque(mi.UInt32, n_samples)
-            advanced, systematic = trace(self.settings, params, histogram, randomness, systematic, count)
-            dr.eval(histogram.sums, advanced.generator, advanced.sequence, advanced.phase, systematic.at)
-            return advanced, systematic
-
-        def to_string(self) -> str:
-            return f"NlosPathIntegrator[{self.settings}]"
-
-    return NlosPathIntegrator
-
-
-def load_path_integrator(settings: PathSettings) -> mi.Integrator:
-    """Register the plugin with the active variant and load it with ``settings``."""
-    mi.register_integrator(PLUGIN_NAME, _plugin_class(mi.variant()))
-    bounces = settings.bounces
-    return mi.load_dict(
-        {
-            "type": PLUGIN_NAME,
-            "max_bounces": -1 if bounces.max_bounces is None else bounces.max_bounces,
-            "first_bounce": settings.first_bounce,
-            "split_bounces": bounces.split,
-            "hidden_fraction": settings.p_hidden_sampling,
-            "laser_sampling": settings.laser_sampling,
-            "russian_roulette": settings.russian_roulette,
-            "spot_radius": settings.spot_radius,
-            "needs_visibility": settings.needs_visibility,
-            "has_transmission": settings.has_transmission,
-            "only_normals_matter": settings.is_plain_diffuse,
-        }
-    )

@@ -1,15 +1,15 @@
-"""How many paths go on beyond the third bounce: of n paths one does, and carries the light of all n.
+"""Russian roulette after bounce 3: one path in n continues, with weight n; n minimises variance x time.
 
-What all paths cost and what the further bounces add, in time and in variance, differs: with n the variance is A + n B
-and the time a + b / n, and their product is least at n = sqrt(A b / (B a)) (efficiency-optimised roulette, Veach 1997,
-section 10.4). A and B are measured by a pilot; b / a is a property of the loops.
+The third bounce has most of the variance, the further ones most of the cost. With period n the variance is A + n B and
+the time a + b / n; their product is least at n = sqrt(A b / (B a)) (efficiency-optimised roulette, Veach 1997, section
+10.4). A and B are measured by a pilot; b / a is a property of the loop (``LoopCost``). Which path of n it is, the
+phase, is random per tile of sensor points, so the estimate is unbiased and the lanes of a packet continue together.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
@@ -18,28 +18,7 @@ from numpy.typing import NDArray
 
 from nlosrender.engine.launch.device_arrays import on_device
 from nlosrender.engine.launch.systematic_sequence import GOLDEN
-
-PILOT_SAMPLES = 64  # per lane
-PILOT_SEED = 0x5EED  # of its own: the choice does not depend on the render's seed
-LEAST_PATHS = 2**20  # of a capture: fewer are traced faster than tried out
-PHASE_TILE = 4  # sensor points along either axis whose paths go on at the same time
-
-
-@dataclass(frozen=True)
-class LoopCost:
-    """What going on costs in one of the loops, and of how many paths at most one goes on.
-
-    A pilot does not see what is rare: it must not become much rarer. Where bounces are kept apart, none of them may
-    take longer to the same error than if all paths went on.
-    """
-
-    relative: float  # b / a, measured on open scenes
-    most: int
-    most_split: int
-
-
-DIRECT = LoopCost(2.0, 8, 3)  # ``trace_direct_paths``
-TRACED = LoopCost(0.5, 8, 1)  # ``trace_paths``
+from nlosrender.engine.path.tuning import PHASE_TILE, LoopCost
 
 
 def best_continuation_period(variance: Callable[[int], float], cost: LoopCost, split: bool) -> int:
@@ -54,11 +33,11 @@ def best_continuation_period(variance: Callable[[int], float], cost: LoopCost, s
     split
         Whether bounces are kept apart.
     """
-    most = cost.most_split if split else cost.most
+    most = cost.max_period_split if split else cost.max_period
     if most == 1:
         return 1
-    at_one, at_most = variance(1), variance(cost.most)
-    further = (at_most - at_one) / (cost.most - 1)
+    at_one, at_most = variance(1), variance(cost.max_period)
+    further = (at_most - at_one) / (cost.max_period - 1)
     third = max(at_one - further, 0.0)
     if further <= 0:  # lost in the pilot's noise, or there is no light at all
         return most if at_one > 0 else 1

@@ -1,65 +1,73 @@
-"""Which share of a path's vertices on the wall samples the hidden geometry: chosen from the scene."""
+"""The technique mixture: with which probability a path's vertex on the wall samples the hidden geometry."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from nlosrender.capture.grids import Capture
-from nlosrender.capture.time_axis import TimeAxis
+from nlosrender.engine.interface import OmittedWork
 from nlosrender.engine.launch.device_arrays import sensor_points
-from nlosrender.engine.launch.surface_sampler import SurfaceSampler
-from nlosrender.engine.path.hidden_aabb import HiddenAabb
-from nlosrender.engine.path.laser_connections import offset_origin
-from nlosrender.scene.build import BuiltScene
-
-NEAR_RATIO = 4.0  # hidden area over pi times (its distance from the wall)^2 above which its density is too peaked
-SURROUNDED = 0.75  # share of the hemisphere above which BSDF sampling alone does better
-OFTEN = 0.2  # of the rays from the wall miss the box: asking it costs less than it saves
-BOX_MARGIN = 1e-5  # of the largest coordinate: float32 places of surfaces are within it
+from nlosrender.engine.launch.device_capture import DeviceCapture
+from nlosrender.engine.launch.hidden_aabb import HiddenAabb
+from nlosrender.engine.launch.ray_offsets import offset_origin
+from nlosrender.engine.path.tuning import PathTuning
 
 
-def choose_p_hidden_sampling(
-    built: BuiltScene, sampler: SurfaceSampler, capture: Capture, time_axis: TimeAxis
-) -> float:
+def choose_p_hidden_sampling(device: DeviceCapture, tuning: PathTuning) -> float:
     """Return the mixture on the relay wall; one technique alone where it suffices: cheaper and less noisy."""
+    built, sampler = device.built, device.sampler
     if sampler.is_empty or built.hidden_bounds is None:
         return 0.0
     distance = built.hidden_bounds[0][2] / built.unit
     # All light comes from sampled surfaces, and the wall has no mirror lobe that only its own sampling finds.
     only_hidden = built.wall.is_planar and sampler.covers_everything
     only_hidden &= not built.wall_bsdf.flags() & mi.BSDFFlags.Delta
-    if only_hidden and distance > 0 and sampler.area < NEAR_RATIO * math.pi * distance**2:
+    if only_hidden and distance > 0 and sampler.area < tuning.max_area_ratio * math.pi * distance**2:
         return 1.0
-    return 0.0 if surrounded_share(built, capture, time_axis) > SURROUNDED else 0.5
+    # cosine-weighted share of directions from the sensor points that meet hidden geometry
+    is_met = built.scene.ray_test(_rays_from_sensors(device))
+    return 0.0 if _share(is_met) > tuning.surrounded_share else 0.5
 
 
-def surrounded_share(built: BuiltScene, capture: Capture, time_axis: TimeAxis) -> float:
-    """Return the cosine-weighted share of directions from the sensor points that meet hidden geometry."""
-    is_met = built.scene.ray_test(_rays_from_sensors(built, capture, time_axis))
-    return float(dr.mean(dr.select(is_met, mi.Float(1), 0))[0])
-
-
-def box_often_missed(built: BuiltScene, capture: Capture, time_axis: TimeAxis) -> HiddenAabb | None:
+def box_often_missed(device: DeviceCapture, tuning: PathTuning) -> HiddenAabb | None:
     """Return the box around the hidden geometry, or None where few rays from the wall miss it."""
+    built = device.built
     if not built.wall.is_planar or built.hidden_bounds is None:
         return None
-    least, most = (np.asarray(corner, dtype=np.float64) / built.unit for corner in built.hidden_bounds)
-    margin = BOX_MARGIN * (1 + max(np.abs(least).max(), np.abs(most).max()))
-    box = HiddenAabb.of(least - margin, most + margin)
-    is_missed = box.is_missed(_rays_from_sensors(built, capture, time_axis))
-    return box if float(dr.mean(dr.select(is_missed, mi.Float(1), 0))[0]) > OFTEN else None
+    low, high = (np.asarray(corner, dtype=np.float64) / built.unit for corner in built.hidden_bounds)
+    margin = tuning.box_margin * (1 + max(np.abs(low).max(), np.abs(high).max()))
+    box = HiddenAabb.of(low - margin, high + margin)
+    return box if _share(box.is_missed(_rays_from_sensors(device))) > tuning.min_miss_share else None
 
 
-def _rays_from_sensors(built: BuiltScene, capture: Capture, time_axis: TimeAxis) -> mi.Ray3f:
+def omitted_techniques(device: DeviceCapture, p_hidden_sampling: float) -> Iterator[OmittedWork]:
+    """Yield the sampling technique that is left out where one covers everything."""
+    if p_hidden_sampling == 1:
+        yield OmittedWork("BSDF sampling at the wall (MIS)", "hidden geometry sampling alone finds all light there")
+    elif p_hidden_sampling == 0:
+        if not device.options.hidden_geometry_sampling:
+            why = "render.hidden_geometry_sampling is false"
+        elif device.built.hidden_bounds is None or device.sampler.is_empty:
+            why = "there is no hidden surface to sample"
+        else:
+            why = "hidden geometry surrounds the wall: BSDF sampling alone does better"
+        yield OmittedWork("hidden geometry sampling (MIS)", why)
+
+
+def _share(of_rays: mi.Bool) -> float:
+    return float(dr.mean(dr.select(of_rays, mi.Float(1), 0))[0])
+
+
+def _rays_from_sensors(device: DeviceCapture) -> mi.Ray3f:
     """Return 64 rays, stratified by the cosine, from each of at most 64 sensor points."""
-    grid = capture.sensor_grid
+    built, grid = device.built, device.capture.sensor_grid
     n_points = grid.positions.shape[0] * grid.positions.shape[1]
     index = np.linspace(0, n_points - 1, min(n_points, 64)).astype(np.uint32)
-    points = sensor_points(built, capture, time_axis, index).interaction
+    points = sensor_points(built, device.capture, device.time_axis, index).interaction
     lanes = dr.arange(mi.UInt32, len(index) * 64)
     si = dr.gather(mi.SurfaceInteraction3f, points, lanes // 64)
     k = lanes % 64

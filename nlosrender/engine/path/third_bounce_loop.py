@@ -1,12 +1,15 @@
-"""Hidden geometry sampling alone: the third bounce asks for visibility only, and few paths go on beyond it.
+"""The third-bounce loop: hidden geometry sampling alone, where the third bounce asks for visibility only.
 
 What ``trace_paths`` finds as the nearest hit of a ray is known beforehand: the sampled point lies on a known triangle.
 Both legs are any-hit queries, and only points that face sensor and laser point take them. Every lane traces one path
-per iteration, so that the lanes of a packet stay at neighbouring points of the hidden geometry (``systematic``).
+per iteration, so the lanes of a packet stay at neighbouring points of the hidden geometry (``SystematicSequence``).
 
-Where further bounces are asked for, every n-th path goes on (``follow_paths``) and carries the light of n: the third
-bounce has most of the variance and the further ones most of the cost. Which of n paths it is, is random: no bias.
-The lanes of a packet take turns together.
+The estimator, with a point x of density 1 / A on the hidden geometry, sensor point s, laser point l:
+
+    H_3 = E  f_s cos_s  [V(s, x) cos(x) A / |x - s|^2]  f(x) cos(x)  f_l cos_l  V(x, l) / |x - l|^2
+
+Where further bounces are asked for, one path in n goes on (``follow_paths``) and carries the light of n: see
+``roulette``. The lanes of a packet go on together.
 """
 
 from __future__ import annotations
@@ -16,26 +19,28 @@ import mitsuba as mi
 
 from nlosrender.capture.bounces import THIRD_BOUNCE
 from nlosrender.engine.launch.histogram import DeviceHistogram
-from nlosrender.engine.launch.launch_params import LaneRandomness, LaunchParams, PathSettings
+from nlosrender.engine.launch.lane_random_state import LaneRandomness
+from nlosrender.engine.launch.ray_offsets import connection_segment
 from nlosrender.engine.launch.recurrence import recurrence_steps
 from nlosrender.engine.launch.surface_sampler import SurfaceSample, SurfaceSampler
 from nlosrender.engine.launch.systematic_sequence import SystematicSequence, first_coordinate
 from nlosrender.engine.launch.time_gate import time_gate_roulette
-from nlosrender.engine.path.laser_connections import connect_to_lasers, connection_segment
+from nlosrender.engine.path.laser_connections import PathVertex, connect_to_lasers
+from nlosrender.engine.path.settings import PathParams, PathSettings
 from nlosrender.engine.path.vertex_steps import DirectionNumbers, arrive, leave, turns_away, unit_interval
 
 
-def are_direct(settings: PathSettings, sampler: SurfaceSampler) -> bool:
-    """Return whether all paths of these settings begin as those traced here do."""
+def is_third_bounce_loop(settings: PathSettings, sampler: SurfaceSampler) -> bool:
+    """Return whether all paths of these settings begin with hidden geometry sampling, as this loop has it."""
     only_hidden = settings.p_hidden_sampling == 1 and settings.laser_sampling and not settings.finds_spot
     is_first = settings.first_bounce == THIRD_BOUNCE
     return only_hidden and is_first and not sampler.has_analytic and not mi.is_polarized
 
 
 @dr.syntax
-def trace_direct_paths(
+def trace_third_bounce(
     settings: PathSettings,
-    params: LaunchParams,
+    params: PathParams,
     histogram: DeviceHistogram,
     randomness: LaneRandomness,
     systematic: SystematicSequence,
@@ -44,11 +49,10 @@ def trace_direct_paths(
     """Trace ``n_samples`` more paths per lane and deposit what they carry; as ``trace_paths``."""
     sampler, sensors, stride = params.sampler, params.sensors, systematic.stride
     sensor, every = sensors.interaction, params.continuation_period
-    lane = params.row_of_lane
     own_laser = params.lasers.gather(params.first_laser).interaction.p
     (step,) = recurrence_steps(1)
 
-    # ---- State -------------------------------------------------------------------------------------------------
+    # ---- State ------------------------------------------------------------------------------------------------------
     generator = mi.PCG32(randomness.generator)
     at = mi.UInt64(systematic.at)
     seq_v = mi.UInt32(randomness.sequence[1])
@@ -56,7 +60,7 @@ def trace_direct_paths(
     done = mi.UInt32(0)  # paths of this lane
 
     while dr.hint(done < n_samples, exclude=[settings, params, histogram, sampler, sensors, sensor, own_laser, every]):
-        # ---- Sample a point of the hidden geometry -------------------------------------------------------------
+        # ---- Sample a point of the hidden geometry ------------------------------------------------------------------
         sample = sampler.sample(first_coordinate(at), unit_interval(seq_v), mi.Bool(True))
         goes_on = mi.Bool(False)
         if dr.hint(settings.goes_on, mode="scalar"):
@@ -65,9 +69,9 @@ def trace_direct_paths(
         active = ~turns_away(params, sample, sensor.p)
         if dr.hint(sampler.dark_behind and params.lasers_per_lane == 1, mode="scalar"):
             active &= goes_on | ~turns_away(params, sample, own_laser)
-        generator = _connect_sample(settings, params, histogram, generator, lane, sample, active, goes_on)
+        generator = _connect_sample(settings, params, histogram, generator, sample, active, goes_on)
 
-        # ---- Next path -----------------------------------------------------------------------------------------
+        # ---- Next path ----------------------------------------------------------------------------------------------
         at += stride
         seq_v += step
         done += 1
@@ -79,16 +83,15 @@ def trace_direct_paths(
 @dr.syntax
 def _connect_sample(
     settings: PathSettings,
-    params: LaunchParams,
+    params: PathParams,
     histogram: DeviceHistogram,
     generator: mi.PCG32,
-    lane: mi.UInt32,
     sample: SurfaceSample,
     active: mi.Bool,
     goes_on: mi.Bool,
 ) -> mi.PCG32:
     """Connect a sampled point to its sensor point and to the lasers, and go on; packets in the dark pass by."""
-    if dr.hint(active, exclude=[settings, params, histogram, lane, sample, goes_on]):
+    if dr.hint(active, exclude=[settings, params, histogram, sample, goes_on]):
         built, sampler, sensor = params.built, params.sampler, params.sensors.interaction
         leg = sample.p - sensor.p
         distance = dr.norm(leg)
@@ -100,68 +103,46 @@ def _connect_sample(
         if dr.hint(settings.needs_visibility, mode="scalar"):
             segment = connection_segment(built, si, -direction, sensor)
             seen &= ~built.scene.ray_test(segment, coherent=True, active=seen)
-        bounce, no_spot = mi.UInt32(THIRD_BOUNCE), mi.PCG32()
-        connect_to_lasers(
-            settings,
-            params,
-            histogram,
-            no_spot,
-            lane,
-            si,
-            seen,
-            bounce,
-            distance,
-            throughput,
-            sensor.p,
-            leg,
-            coherent=True,
-        )
+        lit_vertex = PathVertex(si, sensor.p, leg, distance, throughput, mi.UInt32(THIRD_BOUNCE))
+        connect_to_lasers(settings, params, histogram, mi.PCG32(), lit_vertex, seen, coherent=True)
         if dr.hint(settings.goes_on, mode="scalar"):
-            carried = throughput * mi.Float(params.continuation_period)
-            generator = follow_paths(
-                settings, params, histogram, generator, lane, si, seen & goes_on, carried, distance
-            )
+            generator = follow_paths(settings, params, histogram, generator, lit_vertex, seen & goes_on)
     return generator
 
 
 @dr.syntax
 def follow_paths(
     settings: PathSettings,
-    params: LaunchParams,
+    params: PathParams,
     histogram: DeviceHistogram,
     generator: mi.PCG32,
-    lane: mi.UInt32,
-    vertex: mi.SurfaceInteraction3f,
+    first: PathVertex,
     alive: mi.Bool,
-    throughput: mi.Spectrum,
-    opl: mi.Float,
 ) -> mi.PCG32:
-    """Follow paths beyond their first hidden vertex until they end; return the advanced random state.
+    """Follow one path in n beyond its ``first`` hidden vertex, which has been deposited; ``alive``: lanes that go on.
 
-    Parameters
-    ----------
-    vertex, throughput, opl
-        Of the third bounce, which has been deposited: the vertex, the throughput up to it, its way [engine units].
-    alive
-        Lanes whose paths go on.
+    Returns
+    -------
+    mi.PCG32
+        The advanced random state.
     """
     built, sampler = params.built, params.sampler
     last_vertex = settings.last_vertex
     time_gate = params.time_gate if settings.has_time_gate else None
 
-    # ---- State -------------------------------------------------------------------------------------------------
-    bounce = mi.UInt32(THIRD_BOUNCE)  # bounce index of the vertex
+    # ---- State ------------------------------------------------------------------------------------------------------
+    vertex, opl = first.si, mi.Float(first.opl)  # the vertex, and the path's length up to it [engine units]
+    throughput = first.throughput * mi.Float(params.continuation_period)
+    bounce = mi.UInt32(first.bounce)  # bounce index of the vertex's connections
     on_wall = mi.Bool(False)  # the vertex lies on the relay wall
     medium = mi.Float(1)  # refractive index along the ray
     is_past_gate = mi.Bool(False)  # as in ``trace_paths``
 
-    while dr.hint(alive, exclude=[settings, params, histogram, lane, built, sampler, time_gate]):
-        # ---- Thin out what comes after the window, once a path ---------------------------------------------------
+    while dr.hint(alive, exclude=[settings, params, histogram, built, sampler, time_gate]):
+        # ---- Sample the next direction ------------------------------------------------------------------------------
         alive, is_past_gate, throughput = time_gate_roulette(
             time_gate, generator, alive, is_past_gate, opl, vertex.p, on_wall, throughput
         )
-
-        # ---- Sample the next direction -----------------------------------------------------------------------------
         numbers = DirectionNumbers.drawn(generator, alive)
         has_target = alive & on_wall
         sample = sampler.sample(numbers.bits_u, numbers.v, has_target)
@@ -176,31 +157,19 @@ def follow_paths(
         alive &= dr.any(way.value != 0)
         medium *= eta
 
-        # ---- Intersect -----------------------------------------------------------------------------------------
+        # ---- Intersect ----------------------------------------------------------------------------------------------
         there = arrive(settings, params, way, alive)
         opl += medium * there.distance
         throughput = dr.select(there.is_reached, throughput * way.value / there.density, 0)
         bounce += 1
         alive = there.is_reached & dr.any(throughput != 0)
 
-        # ---- Connect to the lasers and deposit ---------------------------------------------------------------------
+        # ---- Connect to the lasers and deposit ----------------------------------------------------------------------
         vertex, on_wall = there.si, there.on_wall
-        connect_to_lasers(
-            settings,
-            params,
-            histogram,
-            generator,
-            lane,
-            vertex,
-            alive,
-            bounce,
-            opl,
-            throughput,
-            way.origin,
-            there.leg,
-        )
+        lit_vertex = PathVertex(vertex, way.origin, there.leg, opl, throughput, bounce)
+        connect_to_lasers(settings, params, histogram, generator, lit_vertex, alive)
 
-        # ---- Stop ----------------------------------------------------------------------------------------------------
+        # ---- Stop ---------------------------------------------------------------------------------------------------
         if dr.hint(last_vertex is not None, mode="scalar"):
             alive &= bounce < last_vertex
     return generator

@@ -12,9 +12,10 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from nlosrender.engine.launch.launch_params import HIGHEST_SURVIVAL, LaunchParams, PathSettings
+from nlosrender.engine.launch.launch_params import MAX_SURVIVAL
+from nlosrender.engine.launch.ray_offsets import leg_to_tangent_plane, offset_origin
 from nlosrender.engine.launch.surface_sampler import SurfaceSample
-from nlosrender.engine.path.laser_connections import leg_to_tangent_plane, offset_origin
+from nlosrender.engine.path.settings import PathParams, PathSettings
 from nlosrender.scene.build import BuiltScene
 
 
@@ -82,7 +83,7 @@ def intersect(settings: PathSettings, built: BuiltScene, ray: mi.Ray3f, active: 
     return si
 
 
-def arrive(settings: PathSettings, params: LaunchParams, way: Departure, active: mi.Bool) -> Arrival:
+def arrive(settings: PathSettings, params: PathParams, way: Departure, active: mi.Bool) -> Arrival:
     """Trace a ray to the next vertex and say how dense its direction was sampled."""
     built, sampler, q = params.built, params.sampler, settings.p_hidden_sampling
     wall = mi.ShapePtr(built.wall_shape)
@@ -109,7 +110,7 @@ def arrive(settings: PathSettings, params: LaunchParams, way: Departure, active:
 
 def leave(
     settings: PathSettings,
-    params: LaunchParams,
+    params: PathParams,
     generator: mi.PCG32,
     vertex: mi.SurfaceInteraction3f,
     on_wall: mi.Bool,
@@ -151,7 +152,7 @@ def leave(
         share = dr.select(on_wall, 1 - q, 1.0)
         way.bsdf_density = dr.select(way.is_delta, share, share * bs.pdf)
         way.value = dr.select(way.is_delta, weight, weight * bs.pdf)
-        survival = dr.select(by_bsdf, dr.minimum(dr.max(mi.unpolarized_spectrum(weight)), HIGHEST_SURVIVAL), 1)
+        survival = dr.select(by_bsdf, dr.minimum(dr.max(mi.unpolarized_spectrum(weight)), MAX_SURVIVAL), 1)
         if settings.has_transmission:
             eta = dr.select(by_bsdf & (bs.eta > 0), bs.eta, 1)
     if sample is not None:
@@ -175,14 +176,14 @@ def leave(
     return way, survival, eta
 
 
-def turns_away(params: LaunchParams, sample: SurfaceSample, origin: mi.Point3f) -> mi.Bool:
+def turns_away(params: PathParams, sample: SurfaceSample, origin: mi.Point3f) -> mi.Bool:
     """Return whether a sampled point shows its dark side to ``origin``: such a path ends without a ray."""
     if not params.sampler.dark_behind:
         return mi.Bool(False)
     return dr.dot(sample.n, sample.p - origin) >= 0
 
 
-def misses_hidden(params: LaunchParams, ray: mi.Ray3f) -> mi.Bool:
+def misses_hidden(params: PathParams, ray: mi.Ray3f) -> mi.Bool:
     """Return whether a ray from a planar wall passes the hidden geometry by: such a path ends without a ray."""
     if params.hidden_aabb is None:
         return mi.Bool(False)

@@ -13,12 +13,10 @@ from nlosrender.capture.arrivals import window_warnings
 from nlosrender.capture.bounces import THIRD_BOUNCE
 from nlosrender.capture.grids import Capture, PointGrid
 from nlosrender.capture.time_axis import TimeAxis
-from nlosrender.engine.engines import Engine
+from nlosrender.engine.interface import Engine
+from nlosrender.engine.launch.near_surfaces import points_above_wall
 from nlosrender.engine.launch.surface_sampler import SAMPLEABLE_PLUGINS, facing_triangles
-from nlosrender.engine.preflight.near_wall_warnings import near_wall_warnings, points_above_wall
-from nlosrender.engine.virtual_lights.elements.tessellator import MAX_PATCHES
-from nlosrender.engine.virtual_lights.engine import VirtualLightEngine
-from nlosrender.engine.virtual_lights.third_bounce import COARSEST_SCALE, REFINEMENT
+from nlosrender.engine.preflight.near_wall_warnings import near_wall_warnings
 from nlosrender.scene.build import BuiltScene, wall_box
 from nlosrender.scene.pose import Float64
 from nlosrender.scene.surfaces import Surface
@@ -52,13 +50,15 @@ def scene_warnings(engine: Engine) -> tuple[str, ...]:
     max_bounces = engine.options.bounces.max_bounces
     window = window_warnings(capture, built.wall, built.hidden_bounds, time_axis, max_bounces)
     if isinstance(built, BuiltView):
-        return (*built.warnings, *_view_warnings(built), *window, *_bin_warnings(engine, time_axis))
+        own = _view_warnings(built)
+        return (*built.warnings, *own, *window, *_bin_warnings(built, time_axis), *engine.warnings())
     return (
         *built.warnings,
         *dark_surface_warnings(built, capture, max_bounces),
         *window,
-        *near_wall_warnings(engine, built, capture),
-        *_bin_warnings(engine, time_axis),
+        *near_wall_warnings(built, capture),
+        *_bin_warnings(built, time_axis),
+        *engine.warnings(),
     )
 
 
@@ -188,18 +188,10 @@ def _any_visible(built: BuiltScene, surfaces: list[_SurfacePoints], grid: PointG
     return seen
 
 
-def _bin_warnings(engine: Engine, time_axis: TimeAxis) -> Iterator[str]:
-    finest = FINEST_BIN * engine.built.unit
+def _bin_warnings(built: BuiltScene | BuiltView, time_axis: TimeAxis) -> Iterator[str]:
+    finest = FINEST_BIN * built.unit
     if time_axis.bin_width_opl < finest:
         yield (
             f"time_axis.bin_width_opl: bins of {time_axis.bin_width_opl:.3g} m are finer than path lengths in a scene "
             f"of this size are known (float32, about {finest / 4:.1g} m): light is spread over several bins."
         )
-    if isinstance(engine, VirtualLightEngine):
-        needed = engine.tessellator.count(COARSEST_SCALE) * REFINEMENT
-        if needed > MAX_PATCHES:
-            yield (
-                f"time_axis.bin_width_opl: bins of {time_axis.bin_width_opl:.3g} m are so fine that {needed:.1e} "
-                f"patches of the hidden geometry are needed, more than {MAX_PATCHES:.0e}. "
-                "Use wider bins, or render.engine: path."
-            )

@@ -19,8 +19,8 @@ from nlosrender.capture.arrivals import sampled_indices
 from nlosrender.capture.grids import Capture
 from nlosrender.capture.time_axis import TimeAxis
 from nlosrender.engine.launch.device_arrays import columns, laser_points
+from nlosrender.engine.launch.ray_offsets import offset_origin
 from nlosrender.engine.launch.surface_sampler import SAMPLEABLE_PLUGINS
-from nlosrender.engine.path.laser_connections import offset_origin
 from nlosrender.scene.build import BuiltScene
 from nlosrender.scene.pose import Float64
 from nlosrender.scene.view import BuiltView

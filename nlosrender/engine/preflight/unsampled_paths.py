@@ -24,7 +24,7 @@ from dataclasses import dataclass
 
 import mitsuba as mi
 
-from nlosrender.engine.engines import Engine
+from nlosrender.engine.interface import Engine
 from nlosrender.engine.preflight.specular_light import (
     SpecularLight,
     light_after_lamps,

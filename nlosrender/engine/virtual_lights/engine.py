@@ -1,9 +1,10 @@
-"""The virtual-light engine: third bounce gathered from patches, further bounces from walks, to the asked-for error."""
+"""The virtual-light engine: third bounce gathered from patches, further bounces from VPLs, to the error asked for."""
 
 from __future__ import annotations
 
 import math
 import time
+from collections.abc import Iterator
 from dataclasses import replace
 from functools import cached_property
 
@@ -11,66 +12,50 @@ import mitsuba as mi
 import numpy as np
 
 from nlosrender.capture.bounces import THIRD_BOUNCE
-from nlosrender.capture.grids import Capture
-from nlosrender.capture.plan import Batch
-from nlosrender.capture.time_axis import TimeAxis
-from nlosrender.engine.launch.device_arrays import on_device
-from nlosrender.engine.launch.energy_contrasts import RoundContrasts, contrasts_of_deviation
+from nlosrender.capture.plan import Batch, Plan
+from nlosrender.engine.interface import Budget, OmittedWork, PilotSeconds, SupplementaryEngine, TimeEstimate
+from nlosrender.engine.launch.device_capture import DeviceCapture
+from nlosrender.engine.launch.energy_contrasts import contrasts_of_deviation
 from nlosrender.engine.launch.histogram import Histogram
+from nlosrender.engine.launch.near_surfaces import RARE_SHARE
 from nlosrender.engine.launch.occlusion import nothing_occludes
-from nlosrender.engine.launch.passes import Passes, Snapshot
-from nlosrender.engine.launch.pilot_points import Pilot, pilot_of
-from nlosrender.engine.launch.sample_schedule import DEFAULT_TARGET, Budget
-from nlosrender.engine.path.engine import PathEngine, RenderOptions
-from nlosrender.engine.virtual_lights.elements.tessellator import Tessellator, wall_sees_itself
+from nlosrender.engine.launch.omissions import omitted_by_time_gate, omitted_triangles, omitted_visibility
+from nlosrender.engine.launch.passes import Passes
+from nlosrender.engine.launch.pilot_points import pilot_of
+from nlosrender.engine.launch.schedule import DEFAULT_TARGET
+from nlosrender.engine.virtual_lights.calibration import calibrated_lights
+from nlosrender.engine.virtual_lights.cost import gather_batch_bytes, virtual_light_estimate
+from nlosrender.engine.virtual_lights.elements.tessellator import MAX_PATCHES, Tessellator, wall_sees_itself
 from nlosrender.engine.virtual_lights.gather.lighting import GatherSettings
 from nlosrender.engine.virtual_lights.reciprocity import is_reciprocal
-from nlosrender.engine.virtual_lights.third_bounce import (
-    COARSEST_SCALE,
-    REFINEMENT,
-    Gathered,
-    ThirdBounce,
-    difference_divisor,
-    estimated_error,
-)
-from nlosrender.engine.virtual_lights.vpls.gather import (
-    SHARES_OF_THIRD,
-    SQUARES,
-    VplBounces,
-    rounds_needed,
-)
-from nlosrender.errors import RenderError
-from nlosrender.scene.build import BuiltScene
+from nlosrender.engine.virtual_lights.third_bounce import COARSEST_SCALE, REFINEMENT, ThirdBounce, difference_divisor
+from nlosrender.engine.virtual_lights.vpls.rounds import REST_OF_MANY, VplBounces
 
-# Shares of the target error: squares add up to less than 1, for what a pilot cannot know.
-THIRD_ALONE = 0.85
-THIRD_OF_MANY, REST_OF_MANY = 0.35, 0.88  # patches are cheaper than walks
-PILOT_ERROR = 4.0  # times the target: when a pilot has seen enough to say how many rounds are needed
-MOST_PILOT_ROUNDS = 16
-PILOT_LANES = 2048
-FEW_SENSORS = 8  # along each side of a pilot's grid: the error of patches has no noise
-MISSED = 3.0  # times the light that is found of bounce 5: one of the four legs that may lead past the laser point is
-RARE = 1e-4  # share of walks or paths: rarer light is not found by renders of common lengths, or by too few
+MISSED = 3.0  # times the light found of bounce 5: of its four legs, one that may lead past the laser point is found
 
 
 class VirtualLightEngine:
-    """Third bounce by the gather of patches, further bounces by the gather of walks.
+    """Third bounce by the gather of patches, further bounces by the gather of VPLs or by paths.
 
     Parameters
     ----------
-    built, capture, time_axis, options
-        As for the path engine. The hidden geometry has to be meshes, spheres and cylinders, none of them a mirror, and
-        no more than the wall may be.
+    device
+        The capture on the device. The hidden geometry has to be meshes, spheres and cylinders, none of them a mirror,
+        and no more than the wall may be.
+    paths
+        Engine of the bounces above the third where surfaces are not Lambertian.
     lanes
         Lanes that keep the backend busy.
     """
 
     name = "virtual_lights"
 
-    def __init__(self, built: BuiltScene, capture: Capture, time_axis: TimeAxis, options: RenderOptions, lanes: int):
-        self.built, self.capture, self.time_axis, self.options, self.lanes = built, capture, time_axis, options, lanes
-        self.paths = PathEngine(built, capture, time_axis, options, first_bounce=THIRD_BOUNCE + 1)
-        self.tessellator = Tessellator(built, capture, time_axis.bin_width_opl / built.unit)
+    def __init__(self, device: DeviceCapture, paths: SupplementaryEngine, lanes: int):
+        self.device, self.paths = device, paths
+        self.built, self.capture, self.time_axis = device.built, device.capture, device.time_axis
+        self.options = device.options
+        built, capture = self.built, self.capture
+        self.tessellator = Tessellator(built, capture, self.time_axis.bin_width_opl / built.unit)
         shapes = (*built.hidden_shapes, *([built.wall_shape] if wall_sees_itself(built) else []))
         self.settings = GatherSettings(
             is_confocal=capture.scan_type == "confocal",
@@ -79,22 +64,22 @@ class VirtualLightEngine:
             has_one_laser=capture.n_lasers == 1,
         )
         all_lambertian = self.settings.is_diffuse and is_lambertian(built.wall_shape.bsdf())
-        reciprocal = is_reciprocal(built, capture, time_axis.n_bins, is_lambertian=all_lambertian)
-        self.third = ThirdBounce(self.paths, self.tessellator, self.settings, lanes, reciprocal)
-        self.further: VplBounces | None = None  # else the path engine
+        reciprocal = is_reciprocal(built, capture, self.time_axis.n_bins, is_lambertian=all_lambertian)
+        self.third = ThirdBounce(device, self.tessellator, self.settings, lanes, reciprocal)
+        self.further: VplBounces | None = None  # else ``paths``, where further bounces are asked for
         if self.has_further_bounces and self.settings.is_diffuse:
             masks = self.third.masks if self.settings.needs_visibility else None
-            self.further = VplBounces(self.paths, self.tessellator, masks)
+            self.further = VplBounces(device, self.tessellator, masks)
         self.reason = f"Lambertian surfaces before a {'planar' if built.wall.is_planar else 'curved'} wall"
         self._calibrated: dict[Budget, Budget] = {}
 
     def set_up(self) -> None:
         """Make what all resolutions and batches share, else made when it is first needed: it grows with the triangles.
 
-        Sums over small cells, and the tree of what may hide something.
+        Area moments of small elements, and the tree of what may hide something.
         """
         self.tessellator.set_up()
-        if self.settings.needs_visibility and self.third.masks.pay_off(self.capture.n_sensors):
+        if self.has_masks:
             self.third.masks.set_up()
 
     @property
@@ -103,17 +88,27 @@ class VirtualLightEngine:
         highest = self.options.bounces.max_bounces
         return highest is None or highest > THIRD_BOUNCE
 
+    @property
+    def traces_paths(self) -> bool:
+        """Whether paths give the further bounces."""
+        return self.has_further_bounces and self.further is None
+
+    @property
+    def has_masks(self) -> bool:
+        """Whether visibility masks save rays."""
+        return self.settings.needs_visibility and self.third.masks.pay_off(self.capture.n_sensors)
+
     @cached_property
     def misses_light(self) -> bool:
         """Whether light of the further bounces is not found, nor known to the estimated error.
 
         Between a laser point and a surface almost on it, light goes to and fro in an area of about the distance
-        squared. Walks begin anywhere and end there by chance.
+        squared. Subpaths begin anywhere and end there by chance.
         """
-        sampler = self.paths.sampler
+        sampler = self.device.sampler
         if not self.has_further_bounces or self.capture.scan_type == "confocal" or sampler.is_empty:
             return False
-        return math.pi * self.tessellator.nearest_to_laser**2 < RARE * sampler.area
+        return math.pi * self.tessellator.nearest_to_laser**2 < RARE_SHARE * sampler.area
 
     @property
     def compile_seconds(self) -> float:
@@ -121,160 +116,105 @@ class VirtualLightEngine:
         return self.paths.compile_seconds
 
     def calibrate(self, budget: Budget, seconds: float = math.inf) -> Budget:
-        """Turn a target error into settings for the whole capture, tried on a few of its points.
+        """Turn a target error into a patch scale, and into rounds or samples; see ``Engine.calibrate``.
 
-        The settings do not depend on how the capture is cut. With a time limit only the patches are settled.
-        A pilot of paths ends after ``seconds``, as for ``calibrated_by_pilot``.
+        With a time limit only the patch scale is decided.
         """
         if budget.patch_scale is not None:
             return budget
         if budget not in self._calibrated:
-            calibrated = self.calibrate_lights(budget)
-            if self.has_further_bounces and self.further is None:
+            calibrated = calibrated_lights(self.third, self.further, budget, is_alone=not self.has_further_bounces)
+            if self.traces_paths:
                 squares = self.third.gather(pilot_of(self.capture), calibrated.patch_scale or COARSEST_SCALE).squares
                 goal = REST_OF_MANY * (budget.target_error or DEFAULT_TARGET)
-                paths = self.paths.calibrate(replace(budget, target_error=goal), squares, seconds)
+                paths = self.paths.calibrate(replace(budget, target_error=goal), seconds, squares)
                 calibrated = replace(calibrated, spp=paths.spp)
             if math.isfinite(seconds):
                 return calibrated
             self._calibrated[budget] = calibrated
         return self._calibrated[budget]
 
-    def calibrate_lights(self, budget: Budget) -> Budget:
-        """Return ``budget`` with the settings of patches and walks; what the path engine has to do is left open."""
-        pilot = pilot_of(self.capture)
-        target = budget.target_error or DEFAULT_TARGET
-        share = THIRD_OF_MANY if self.has_further_bounces else THIRD_ALONE
-        if budget.time_limit_s is not None:
-            return replace(budget, patch_scale=self._patch_scale_in_time(budget, share * target))
-        if self.further is not None:
-            share = SHARES_OF_THIRD[0]
-        few = self._pilot_of_patches(pilot)
-        patch_scale, third = self.third.calibrate(few, share * target)
-        if self.further is None:
-            return replace(budget, patch_scale=patch_scale)
-        goal, squares = REST_OF_MANY * target, third.squares * (pilot.sensors.size / few.sensors.size)
-        squares += self.paths.second_squares(pilot)
-        replicas = max(2, PILOT_LANES // pilot.sensors.size // 2 * 2)
-        histogram = self.further.histogram(pilot, replicas)
-        done, error = 0, math.inf
-        while done < MOST_PILOT_ROUNDS and error > PILOT_ERROR * goal:
-            self.further.accumulate(pilot, histogram, done)
-            done += 1
-            error = histogram.relative_error(done, squares)
-        share = self.further.share_of_third(third.n_patches, error * math.sqrt(done) / target)
-        if share < SHARES_OF_THIRD[0]:
-            patch_scale, _ = self.third.calibrate(few, share * target)
-        rounds = rounds_needed(error, done, math.sqrt(SQUARES - share**2) * target)
-        return replace(budget, patch_scale=patch_scale, rounds=rounds)
-
-    def _pilot_of_patches(self, pilot: Pilot) -> Pilot:
-        """Return the pilot that patches are settled on: few points, unless some surface is nearer than they are apart.
-
-        Only some of the points see such a surface close up, or what lies behind it.
-        """
-        nearest = self.tessellator.nearest
-        if self.built.wall.is_planar and self.built.hidden_bounds is not None:  # what faces away from it, too
-            nearest = self.built.hidden_bounds[0][2] / self.built.unit
-        is_far = nearest > 2 * self.tessellator.reach / FEW_SENSORS
-        return pilot_of(self.capture, FEW_SENSORS) if is_far else pilot
-
     def render(self, batch: Batch, budget: Budget, passes: Passes | None = None) -> Histogram:
-        """Render one batch; as ``PathEngine.render``, whose errors it raises.
+        """Render one batch; see ``Engine.render``.
 
         The variance of the third bounce is the square of its estimated discretisation error.
         """
         begun, passes = time.perf_counter(), passes or Passes()
         budget = self.calibrate(budget)
-        patch_scale = budget.patch_scale or COARSEST_SCALE
+        scale = budget.patch_scale or COARSEST_SCALE
         shared = 0.5 if self.has_further_bounces else 1.0
-        coarse, fine = self.third.pair(batch, patch_scale, passes.stage("third bounce", 0, shared))
+        coarse, fine = self.third.pair(batch, scale, passes.stage("third bounce", 0, shared))
         left = budget.time_limit_s
         if left is not None:
             left = max(0.0, left - (time.perf_counter() - begun))
-        rest = passes.stage("further bounces", shared, 1)
-        result = self._further_bounces(batch, replace(budget, time_limit_s=left), fine, rest)
+        rest, budget = passes.stage("further bounces", shared, 1), replace(budget, time_limit_s=left)
+        if self.has_further_bounces:
+            result = (self.further or self.paths).render(batch, budget, rest, fine.squares)
+        else:
+            result = self.device.histogram_without_samples(batch)
         if self.misses_light:
             np.add(result.variance, np.square(MISSED * result.mean), out=result.variance)
             result.contrasts[:] += MISSED * result.mean.sum(axis=(2, 3, 4))
-        slot, scale = self.options.bounces.slot(THIRD_BOUNCE), self.paths.scale
+        slot, factor = self.options.bounces.slot(THIRD_BOUNCE), self.device.scale
         third, deviation = fine.values, coarse.values  # large: worked on in place
         np.subtract(third, deviation, out=deviation)
-        deviation *= scale / difference_divisor(coarse, fine)
-        third *= scale
+        deviation *= factor / difference_divisor(coarse, fine)
+        third *= factor
         result.mean[:, slot] += third[:, 0, ..., :-1]
-        grid, sensors = self.capture.sensor_grid, self.paths.sensor_indices(batch)
+        grid, sensors = self.capture.sensor_grid, self.device.sensor_indices(batch)
         in_window = deviation[:, 0, ..., :-1]
         result.contrasts[:, :, slot] += contrasts_of_deviation(in_window, sensors, (grid.nx, grid.ny))
         result.variance[:, slot] += np.square(deviation, out=deviation)[:, 0, ..., :-1]
         result.outside[:, slot] += third[:, 0, ..., -1]
-        if not np.isfinite(result.mean).all():
-            raise RenderError("the gather produced a value that is not finite; please report the configuration")
+        result.refuse_not_finite()
         return result
 
-    def _further_bounces(self, batch: Batch, budget: Budget, third: Gathered, passes: Passes) -> Histogram:
-        if self.further is None:
-            known_squares = third.squares if self.has_further_bounces else 0.0
-            return self.paths.render(batch, budget, passes, known_squares=known_squares)
-        known_squares = third.squares + self.paths.second_squares(batch)
-        histogram = self.further.histogram(batch, self.options.replicas)
-        grid = self.capture.sensor_grid
-        contrasts = RoundContrasts(histogram, self.paths.sensor_indices(batch), (grid.nx, grid.ny))
-        done, skipped, before = 0, 0, 0.0
-        if (earlier := passes.resumed("sums")) is not None:
-            histogram.sums = on_device(mi.Float64, earlier.arrays["sums"])
-            contrasts.restore(earlier.arrays["contrasts"], earlier.arrays["grouped"], earlier.numbers["groups"])
-            done, skipped, before = (earlier.numbers[name] for name in ("done", "skipped", "seconds"))
-        begun, share = time.perf_counter() - before, 0.0
+    # What ``preflight`` and reports ask
 
-        def report_progress(skipped: int) -> None:
-            numbers = {"done": done, "skipped": skipped, "seconds": time.perf_counter() - begun}
-            numbers["groups"] = contrasts.groups
-            saved = {"contrasts": contrasts.sums, "grouped": contrasts.grouped}
-            passes.between(share, lambda: Snapshot({"sums": histogram.sums.numpy()} | saved, numbers))
+    def omitted_work(self) -> Iterator[OmittedWork]:
+        """Yield the work that is left out; see ``Engine.omitted_work``."""
+        if not self.settings.needs_visibility:
+            yield omitted_visibility()
+        elif self.has_masks:
+            why = "where nothing can lie between a patch and a part of the wall"
+            yield OmittedWork("visibility rays that nothing can stop", why)
+        yield from omitted_triangles(self.device)
+        if self.third.is_reciprocal:
+            why = "laser and sensor points are the same and everything is Lambertian: H(l, s) = H(s, l)"
+            yield OmittedWork("half of the pairs of laser and sensor points", why)
+        if self.further is not None:
+            yield from omitted_by_time_gate(self.device)
+        elif self.traces_paths:
+            yield from self.paths.omitted_path_work()
 
-        while True:
-            self.further.accumulate(batch, histogram, done, report_progress, skipped)
-            done, skipped = done + 1, 0
-            if budget.rounds is not None:
-                share = done / budget.rounds
-            else:
-                share = (time.perf_counter() - begun) / max(budget.time_limit_s or 0.0, 1e-9)
-                if budget.target_error is not None:
-                    error = histogram.relative_error(done, known_squares) / (REST_OF_MANY * budget.target_error)
-                    share = max(share, 1 / max(error, 1e-9) ** 2)
-            contrasts.add(done, share >= 1)
-            if share >= 1:
-                break
-            report_progress(0)
-        bounces = self.options.bounces
-        first = bounces.slot(THIRD_BOUNCE + 1)
-        slots = range(-first, bounces.n_slots - first)
-        statistics = histogram.statistics(done, self.paths.scale, slots)
-        errors = contrasts.result(self.paths.scale / (done * self.options.replicas), slots)
-        mean, variance = (histogram.on_host(values) for values in statistics)
-        contributions = done * self.further.contributions_per_round
-        if not self.built.wall.is_planar:
-            mean[:, :1] += self.paths.second_bounce(batch)
-        return Histogram(mean[..., :-1], variance[..., :-1], mean[..., -1], contributions, errors)
+    def shared_samples(self) -> str:
+        """Return what makes errors correlated; see ``Engine.shared_samples``."""
+        return "all sensor points share the same patches" + (" and walks" if self.further is not None else "")
 
-    def _patch_scale_in_time(self, budget: Budget, target: float) -> float:
-        """Return the fineness for ``target``, or the one that half of the time is predicted to suffice for."""
-        pilot = pilot_of(self.capture)
-        pairs = self.capture.n_sensors * (self.capture.n_lasers if self.capture.scan_type == "exhaustive" else 1)
-        lasers = pilot.lasers.size if self.capture.scan_type == "exhaustive" else 1
-        more = pairs / (pilot.sensors.size * lasers)
-        patch_scale = COARSEST_SCALE
-        coarse, second = self.third.gather(pilot, patch_scale), self.paths.second_squares(pilot)
-        while True:
-            finer = self.third.finer(patch_scale, REFINEMENT)
-            begun = time.perf_counter()
-            fine = self.third.gather(pilot, finer)
-            predicted = (time.perf_counter() - begun) * more * 4
-            error = estimated_error(coarse, fine, second)
-            if error <= target or predicted > (budget.time_limit_s or 0.0) / 2:
-                return finer if error <= target else patch_scale
-            patch_scale, coarse = finer, fine
+    def batch_bytes(self, plan: Plan, available: float = math.inf) -> int:
+        """Return the memory of the largest batch; see ``Engine.batch_bytes``."""
+        return gather_batch_bytes(self, plan, available)
+
+    def warnings(self) -> Iterator[str]:
+        """Yield light that is not found, and bins that take too many patches; see ``Engine.warnings``."""
+        if self.misses_light:
+            distance = self.tessellator.nearest_to_laser * self.built.unit
+            yield (
+                f"a hidden surface lies {distance:.1g} m from a laser point: the third bounce is right, "
+                "but most of the light that goes to and fro between the two is not found, and the stated "
+                "error takes all further bounces for unknown. Use render.max_bounces: 3 where they do not matter."
+            )
+        needed = self.tessellator.count(COARSEST_SCALE) * REFINEMENT
+        if needed > MAX_PATCHES:
+            yield (
+                f"time_axis.bin_width_opl: bins of {self.time_axis.bin_width_opl:.3g} m are so fine that {needed:.1e} "
+                f"patches of the hidden geometry are needed, more than {MAX_PATCHES:.0e}. "
+                "Use wider bins, or render.engine: path."
+            )
+
+    def cost_estimate(self, plan: Plan, budget: Budget, lanes: int, pilot: PilotSeconds) -> TimeEstimate:
+        """Estimate the seconds of a render; see ``Engine.cost_estimate``."""
+        return virtual_light_estimate(self, plan, budget, lanes, pilot)
 
 
 def is_lambertian(bsdf: mi.BSDF) -> bool:

@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 
 from nlosrender.capture.plan import Batch
 from nlosrender.engine.launch.device_arrays import on_device
+from nlosrender.engine.launch.device_capture import DeviceCapture
 from nlosrender.engine.launch.histogram import HistogramShape, relative_l2_error
 from nlosrender.engine.launch.launch_params import LaunchParams
 from nlosrender.engine.launch.passes import Passes, Snapshot
 from nlosrender.engine.launch.pilot_points import Pilot
-from nlosrender.engine.path.engine import PathEngine
 from nlosrender.engine.virtual_lights.elements.patches import Patches
 from nlosrender.engine.virtual_lights.elements.tessellator import MAX_PATCHES, MOST_KEPT, Tessellator
 from nlosrender.engine.virtual_lights.gather.block_histogram import BlockHistogram
@@ -84,8 +84,8 @@ class ThirdBounce:
 
     Parameters
     ----------
-    paths
-        Engine whose scene, points and histogram shapes are used.
+    device
+        The capture on the device.
     tessellator
         Cuts the hidden geometry.
     settings
@@ -99,15 +99,15 @@ class ThirdBounce:
 
     def __init__(
         self,
-        paths: PathEngine,
+        device: DeviceCapture,
         tessellator: Tessellator,
         settings: GatherSettings,
         lanes: int,
         is_reciprocal: bool = False,
     ):
-        self.paths, self.tessellator, self.settings, self.lanes = paths, tessellator, settings, lanes
+        self.device, self.tessellator, self.settings, self.lanes = device, tessellator, settings, lanes
         self.is_reciprocal = is_reciprocal
-        self.masks = VisibilityMasks(paths.built)
+        self.masks = VisibilityMasks(device.built)
         self._saved: dict[float, LitPatches] = {}  # per coarseness
 
     def gather(self, batch: Batch | Pilot, patch_scale: float, passes: Passes | None = None) -> Gathered:
@@ -138,7 +138,7 @@ class ThirdBounce:
         Whatever the batch, so that how a capture is cut does not show. A batch of other lasers than sensor points is
         gathered in two parts, the second with their roles exchanged.
         """
-        sensors, lasers = self.paths.sensor_indices(batch), self.paths.laser_indices(batch)
+        sensors, lasers = self.device.sensor_indices(batch), self.device.laser_indices(batch)
         is_symmetric = np.array_equal(sensors, lasers)
         one = passes.stage("one way", 0, 1 if is_symmetric else 0.5)
         if (earlier := one.resumed("values")) is not None:
@@ -170,7 +170,7 @@ class ThirdBounce:
         shape = self.shape(batch)
         lanes = self._lanes(batch, shape, lasers)
         histogram = BlockHistogram(shape, lanes.order)
-        work = GatherPasses(self.settings, histogram, passes)
+        work = GatherPasses(self.settings, histogram, passes, self.device.options.schedule.first_gather_pairs)
         if len(patches):
             wall_tiles = self._wall_tiles(batch)
             packed = self._shared_lights(lanes.params, shape, patch_scale, patches, wall_tiles)
@@ -225,12 +225,12 @@ class ThirdBounce:
         self, params: LaunchParams, shape: HistogramShape, patches: Patches, places: PatchRegions, wall_tiles: WallTiles
     ) -> LitPatches:
         is_near = self.tessellator.nearest < NEAR
-        on_device = upload_patches(self.paths.built, patches, places, self.paths.options.seed, is_near)
+        on_device = upload_patches(self.device.built, patches, places, self.device.options.seed, is_near)
         return light_patches(self.settings, params, on_device, MaskQuery(self.masks, wall_tiles), shape.lasers)
 
     def _wall_tiles(self, batch: Batch | Pilot, regions: list[int] | None = None) -> WallTiles:
         """Return what patches are seen from: all points, or the sensor points of some regions."""
-        built, capture = self.paths.built, self.paths.capture
+        built, capture = self.device.built, self.device.capture
         if regions is None or self.tessellator.regions is None:
             return WallTiles.of(built, capture, batch, with_lasers=not self.settings.has_one_laser)
         labels = self.tessellator.regions.labels
@@ -249,7 +249,7 @@ class ThirdBounce:
 
         The error is that of the second and third bounce together.
         """
-        second = self.paths.second_squares(pilot)
+        second = self.device.second_squares(pilot)
         levels = [(self.gather(pilot, COARSEST_SCALE), math.inf)]  # and its error, coarse to fine
         patch_scale = self.finer(COARSEST_SCALE, REFINEMENT)
         while True:
@@ -299,13 +299,13 @@ class ThirdBounce:
         As many as the capture needs, not the batch: how a capture is cut must not show in the result. No more than
         the replicas that the plan has counted memory for.
         """
-        most = self.paths.options.replicas if isinstance(batch, Batch) else self.lanes
-        points = self.paths.capture.n_sensors if isinstance(batch, Batch) else batch.sensors.size
-        return replace(self.paths.shape(batch, 1), replicas=max(1, min(math.ceil(self.lanes / points), most)))
+        most = self.device.options.replicas if isinstance(batch, Batch) else self.lanes
+        points = self.device.capture.n_sensors if isinstance(batch, Batch) else batch.sensors.size
+        return replace(self.device.shape(batch, 1), replicas=max(1, min(math.ceil(self.lanes / points), most)))
 
     def _lanes(self, batch: Batch | Pilot, shape: HistogramShape, lasers: NDArray[np.int64] | None = None) -> _Lanes:
-        params = self.paths.launch_params(batch, replace(shape, replicas=1))
-        indices, order = self.paths.sensor_indices(batch), self.paths.lane_order(batch)
+        params = self.device.launch_params(batch, replace(shape, replicas=1))
+        indices, order = self.device.sensor_indices(batch), self.device.lane_order(batch)
         lane = dr.arange(mi.UInt32, shape.lanes)
         params = params.gather_lanes(dr.gather(mi.UInt32, on_device(mi.UInt32, order), lane % shape.sensors))
         replica = lane // shape.sensors

@@ -18,8 +18,6 @@ from nlosrender.engine.virtual_lights.gather.block_histogram import BlockHistogr
 from nlosrender.engine.virtual_lights.gather.kernel import gather_third_bounce
 from nlosrender.engine.virtual_lights.gather.lighting import GatherSettings, PackedPatches
 
-FIRST_PAIRS = 2**25  # of patches with sensor and laser points in the first kernel, whose speed is not known
-
 
 class GatherPasses:
     """Gathers groups of patches, the same ones in the same order every time, into a histogram.
@@ -30,9 +28,11 @@ class GatherPasses:
         What is gathered, and where to.
     passes
         Who is told between two kernels, and may have kept a state to go on from.
+    first_pairs
+        Of patches with sensor and laser points in the first kernel.
     """
 
-    def __init__(self, settings: GatherSettings, histogram: BlockHistogram, passes: Passes):
+    def __init__(self, settings: GatherSettings, histogram: BlockHistogram, passes: Passes, first_pairs: int):
         self._settings, self._histogram, self._passes = settings, histogram, passes
         self._group = self._first_group = self._skipped = 0
         if (earlier := passes.resumed("sums")) is not None:
@@ -40,7 +40,7 @@ class GatherPasses:
                 on_device(mi.Float64, earlier.arrays[name]) for name in ("sums", "outside")
             )
             self._first_group, self._skipped = earlier.numbers["group"], earlier.numbers["skipped"]
-        self._size = PassSize(max(1, FIRST_PAIRS // (histogram.shape.lanes * histogram.shape.lasers)))
+        self._size = PassSize(max(1, first_pairs // (histogram.shape.lanes * histogram.shape.lasers)))
 
     def gather(
         self, params: LaunchParams, packed: PackedPatches, lane: mi.UInt32, part: mi.UInt32, tile: mi.UInt64

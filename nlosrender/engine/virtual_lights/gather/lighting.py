@@ -10,7 +10,7 @@ import numpy as np
 
 from nlosrender.engine.launch.device_arrays import on_device
 from nlosrender.engine.launch.launch_params import LaunchParams
-from nlosrender.engine.path.laser_connections import off_the_wall
+from nlosrender.engine.launch.ray_offsets import off_the_wall
 from nlosrender.engine.virtual_lights.gather.device_patches import DevicePatches
 from nlosrender.engine.virtual_lights.tuning import DEFAULT_TUNING
 from nlosrender.engine.virtual_lights.visibility.masks import VisibilityMasks, WallTiles

@@ -13,7 +13,7 @@ import numpy as np
 
 from nlosrender.engine.launch.morton import morton_order
 from nlosrender.engine.launch.recurrence import recurrence_steps
-from nlosrender.engine.launch.time_gate import GATE_SURVIVAL, CaptureTimeGate
+from nlosrender.engine.launch.time_gate import CaptureTimeGate
 from nlosrender.engine.virtual_lights.elements.patches import SurfacePoints
 from nlosrender.engine.virtual_lights.elements.round_shapes import onto_round_shapes
 from nlosrender.engine.virtual_lights.elements.subdivision import longest_edges, normals_and_areas
@@ -53,7 +53,7 @@ class VplSampler:
         order = np.lexsort((morton_order(centres), self._shapes))  # shape by shape, neighbours together
         importance = (self._areas / self._reach)[order]
         if capture_gate is not None:
-            importance *= 1 - (1 - GATE_SURVIVAL) * self._late_shares(capture_gate)[order]
+            importance *= 1 - (1 - capture_gate.survival) * self._late_shares(capture_gate)[order]
         self._order = order
         self.is_empty = not importance.sum() > 0
         if not self.is_empty:

@@ -19,9 +19,10 @@ from numpy.typing import NDArray
 
 from nlosrender.capture.bounces import FIRST_BOUNCE
 from nlosrender.engine.launch.device_arrays import WallPoints, on_device
-from nlosrender.engine.launch.launch_params import HIGHEST_SURVIVAL, LaneRandomness, LaunchParams
-from nlosrender.engine.launch.time_gate import GATE_SURVIVAL, CaptureTimeGate, TimeGate, time_gate_roulette
-from nlosrender.engine.path.laser_connections import connection_segment, offset_origin
+from nlosrender.engine.launch.lane_random_state import LaneRandomness
+from nlosrender.engine.launch.launch_params import MAX_SURVIVAL, LaunchParams
+from nlosrender.engine.launch.ray_offsets import connection_segment, offset_origin
+from nlosrender.engine.launch.time_gate import CaptureTimeGate, TimeGate, time_gate_roulette
 from nlosrender.engine.virtual_lights.gather.device_patches import normal_reflectance, surface_at
 from nlosrender.engine.virtual_lights.tuning import DEFAULT_TUNING
 from nlosrender.engine.virtual_lights.vpls.sampler import Vpls
@@ -88,6 +89,7 @@ def trace_subpaths(
     scene, wall, context = built.scene, mi.ShapePtr(built.wall_shape), mi.BSDFContext()
     generator = mi.PCG32(randomness.generator)
     square = mi.Point2f(mi.Float(randomness.sequence[0] >> 8), mi.Float(randomness.sequence[1] >> 8)) * 2.0**-24
+    gate_survival = 1.0 if time_gate is None else time_gate.survival
 
     # ---- State -------------------------------------------------------------------------------------------------
     throughput = mi.Spectrum(reflectance)
@@ -131,7 +133,7 @@ def trace_subpaths(
             away = dr.squared_norm(si.p - proposal_lasers.points.gather(mi.UInt32(0)).interaction.p)
             lit += proposal_lasers.untried_share * dr.mean(leaving) / away
         if dr.hint(time_gate is not None, mode="scalar"):
-            lit = dr.select(is_past_gate, lit * GATE_SURVIVAL, lit)
+            lit = dr.select(is_past_gate, lit * gate_survival, lit)
         lit = dr.select(hidden, lit, 0)
         # reservoir sampling: of the vertices so far, each is chosen in proportion to its light
         total += lit
@@ -145,7 +147,7 @@ def trace_subpaths(
         lobe = generator.next_float32(alive)
         sample = mi.Point2f(generator.next_float32(alive), generator.next_float32(alive))
         bs, weight = bsdf.sample(context, si, lobe, sample, alive)
-        survival = dr.minimum(dr.max(weight), HIGHEST_SURVIVAL)
+        survival = dr.minimum(dr.max(weight), MAX_SURVIVAL)
         alive &= generator.next_float32(alive) < survival
         throughput *= weight / dr.maximum(survival, 1e-9)
         direction = si.to_world(bs.wo)

@@ -1,0 +1,166 @@
+"""A capture of the relay wall on the device: what every engine of such captures launches its kernels with."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+
+from nlosrender.capture.bounces import BounceAxis
+from nlosrender.capture.grids import Capture
+from nlosrender.capture.plan import Batch
+from nlosrender.capture.time_axis import TimeAxis
+from nlosrender.engine.launch.device_arrays import laser_points, on_device, sensor_points
+from nlosrender.engine.launch.energy_contrasts import no_contrasts
+from nlosrender.engine.launch.histogram import DeviceHistogram, Histogram, HistogramShape
+from nlosrender.engine.launch.launch_params import LaunchParams
+from nlosrender.engine.launch.morton import morton_order
+from nlosrender.engine.launch.pilot_points import Pilot
+from nlosrender.engine.launch.schedule import DEFAULT_SCHEDULE, ScheduleTuning
+from nlosrender.engine.launch.second_bounce import deposit_second_bounce
+from nlosrender.engine.launch.surface_sampler import SurfaceSampler
+from nlosrender.engine.launch.time_gate import CaptureTimeGate, light_leaves_window
+from nlosrender.scene.build import BuiltScene
+
+
+@dataclass(frozen=True)
+class RenderOptions:
+    """What is computed, by which techniques of Royo et al. 2022; the last five are set by tests alone."""
+
+    bounces: BounceAxis
+    laser_sampling: bool = True
+    hidden_geometry_sampling: bool = True
+    russian_roulette: bool = True
+    channels: int = 1
+    seed: int = 0
+    temporal_kernel_bins: float = 0.0  # full width of the kernel in time [bins]; 0: a plain histogram
+    replicas: int = 2  # independent estimates, whose spread is the stated error
+    has_time_gate: bool = True  # Russian roulette on paths that can only bring light after the time window
+    gate_survival: float = 1 / 8  # its probability to go on: light after the window is one number, seven eighths saved
+    p_hidden_sampling: float | None = None  # of hidden geometry sampling at wall vertices; None: chosen from the scene
+    schedule: ScheduleTuning = DEFAULT_SCHEDULE
+    continuation_period: int | None = None  # one path in so many goes on after bounce 3; None: by a pilot
+
+
+class DeviceCapture:
+    """Points, histogram shapes and launch parameters of a capture.
+
+    Parameters
+    ----------
+    built, capture, time_axis
+        The scene and what is measured of it.
+    options
+        What is computed.
+    """
+
+    def __init__(self, built: BuiltScene, capture: Capture, time_axis: TimeAxis, options: RenderOptions):
+        self.built, self.capture, self.time_axis, self.options = built, capture, time_axis, options
+        self.sampler = SurfaceSampler(built)
+        # Throughput is per (engine unit)^2: H falls with the square of a scene's size.
+        self.scale = capture.laser_energy / built.unit**2
+
+    @cached_property
+    def capture_gate(self) -> CaptureTimeGate | None:
+        """The end of the time window; None where no light arrives after it, or no path is to be ended for it."""
+        if not self.options.has_time_gate:
+            return None
+        if not light_leaves_window(self.built, self.capture, self.time_axis, self.options.bounces):
+            return None
+        return CaptureTimeGate.of(self.built, self.capture, self.time_axis, self.options.gate_survival)
+
+    @property
+    def is_exhaustive(self) -> bool:
+        """Whether every sensor point sees every laser point of a batch."""
+        return self.capture.scan_type == "exhaustive"
+
+    def shape(self, batch: Batch | Pilot, slots: int) -> HistogramShape:
+        """Return the shape of a batch's histogram with ``slots`` bounce slots."""
+        lasers, options = batch.lasers.size if self.is_exhaustive else 1, self.options
+        return HistogramShape(
+            options.replicas, batch.sensors.size, lasers, slots, options.channels, self.time_axis.n_bins
+        )
+
+    def sensor_indices(self, batch: Batch | Pilot) -> NDArray[np.uint32]:
+        """Return the flat indices of a batch's sensor points."""
+        return np.array(batch.sensors.flat_indices(self.capture.sensor_grid.nx), dtype=np.uint32)
+
+    def laser_indices(self, batch: Batch | Pilot) -> NDArray[np.uint32]:
+        """Return the flat indices of a batch's laser points."""
+        return np.array(batch.lasers.flat_indices(self.capture.laser_grid.nx), dtype=np.uint32)
+
+    def lane_order(self, batch: Batch | Pilot) -> NDArray[np.int64]:
+        """Return the order in which lanes take a batch's sensor points: rays of a packet start near each other."""
+        positions = self.capture.sensor_grid.positions.reshape(-1, 3)[self.sensor_indices(batch)]
+        return np.argsort(morton_order(positions), kind="stable")
+
+    def launch_params(
+        self, batch: Batch | Pilot, shape: HistogramShape, order: NDArray[np.int64] | None = None
+    ) -> LaunchParams:
+        """Return what the lanes of a batch read.
+
+        Parameters
+        ----------
+        batch, shape
+            What is rendered, and the shape of its histogram.
+        order
+            (n,) the batch's sensor points in the order in which lanes take them; None: as they are.
+        """
+        built, capture, time_axis = self.built, self.capture, self.time_axis
+        index = self.sensor_indices(batch)
+        sensors = sensor_points(built, capture, time_axis, index)
+        lasers = laser_points(built, capture, time_axis, self.laser_indices(batch))
+        lane = dr.arange(mi.UInt32, shape.lanes)
+        sensor = lane % shape.sensors
+        if order is not None:
+            sensor = dr.gather(mi.UInt32, on_device(mi.UInt32, order), sensor)
+        row_of_lane = lane // shape.sensors * shape.sensors + sensor
+        is_confocal = capture.scan_type == "confocal"
+        first_laser = mi.UInt32(sensor) if is_confocal else dr.zeros(mi.UInt32, shape.lanes)
+        per_lane = sensors.gather(sensor)
+        dr.eval(per_lane.interaction, per_lane.delay_bins, per_lane.delay_fraction, first_laser, row_of_lane)
+        gate = self.capture_gate
+        return LaunchParams(
+            built=built,
+            sampler=self.sampler,
+            sensors=per_lane,
+            lasers=lasers,
+            first_laser=first_laser,
+            lasers_per_lane=shape.lasers,
+            n_lasers=dr.opaque(mi.UInt32, shape.lasers),
+            bins_per_unit=dr.opaque(mi.Float, built.unit / time_axis.bin_width_opl),
+            time_gate=None if gate is None else gate.of_sensors(built, capture, time_axis, index, sensor),
+            row_of_lane=row_of_lane,
+        )
+
+    def second_bounce(self, batch: Batch | Pilot) -> NDArray[np.float64]:
+        """Return the second bounce (channel, 1, laser, sensor, row): exact, so one replica computes it."""
+        shape = replace(self.shape(batch, 1), replicas=1)
+        histogram = DeviceHistogram(shape)
+        deposit_second_bounce(self.launch_params(batch, shape), histogram)
+        return histogram.on_host(histogram.total(self.scale))
+
+    def second_squares(self, batch: Batch | Pilot) -> float:
+        """Return the sum of the squares of the second bounce, which a target error counts in [(engine unit)^-4]."""
+        if self.built.wall.is_planar:
+            return 0.0
+        return float(np.square(self.second_bounce(batch)[..., :-1] / self.scale).sum())
+
+    def histogram_without_samples(self, batch: Batch) -> Histogram:
+        """Return the histogram of a batch of which nothing is sampled: the second bounce, all others zero."""
+        shape, slots = self.shape(batch, 1), self.options.bounces.n_slots
+        axes = (shape.channels, slots, shape.lasers, shape.sensors, shape.row)
+        result = Histogram.of_rows(np.zeros(axes), np.zeros(axes), 0, no_contrasts(shape.channels, slots))
+        self.add_second_bounce(batch, result)
+        return result
+
+    def add_second_bounce(self, batch: Batch, histogram: Histogram) -> None:
+        """Add the second bounce to a batch's histogram in place; a planar wall has none."""
+        if not self.built.wall.is_planar:
+            second = self.second_bounce(batch)
+            histogram.mean[:, :1] += second[..., :-1]
+            histogram.outside[:, :1] += second[..., -1]
+            histogram.refuse_not_finite()

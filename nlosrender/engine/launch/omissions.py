@@ -1,0 +1,29 @@
+"""Work that several engines leave out, in words."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from nlosrender.engine.interface import OmittedWork
+from nlosrender.engine.launch.device_capture import DeviceCapture
+
+
+def omitted_visibility() -> OmittedWork:
+    """Return that no visibility ray is traced."""
+    return OmittedWork("visibility rays", "one convex object stands alone before a planar wall: nothing lies between")
+
+
+def omitted_triangles(device: DeviceCapture) -> Iterator[OmittedWork]:
+    """Yield how many triangles are not sampled."""
+    total = device.built.n_triangles
+    if dark := total - device.sampler.n_triangles:
+        why = "they face away from the whole wall or lie behind it: no ray is sent to them"
+        yield OmittedWork(f"{dark} of {total} triangles", why)
+
+
+def omitted_by_time_gate(device: DeviceCapture) -> Iterator[OmittedWork]:
+    """Yield that few paths go on beyond the time window, where light can arrive after it."""
+    if device.capture_gate is not None:
+        many = round(1 / device.options.gate_survival)
+        why = f"one in {many} goes on, with {many} times the weight: the light outside the window is not biased"
+        yield OmittedWork("most paths on which light can only arrive after the time window", why)

@@ -1,0 +1,85 @@
+"""Settings of the path tracer's kernels, and what a launch of them reads besides the capture."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+from nlosrender.capture.bounces import FIRST_BOUNCE, THIRD_BOUNCE, BounceAxis
+from nlosrender.engine.launch.hidden_aabb import HiddenAabb
+from nlosrender.engine.launch.launch_params import LaunchParams
+from nlosrender.engine.path.tuning import PathTuning
+
+
+@dataclass(frozen=True)
+class PathSettings:
+    """What the integrator computes and how; part of the compiled kernel."""
+
+    bounces: BounceAxis
+    first_bounce: int  # lowest bounce that is deposited, >= 3
+    p_hidden_sampling: float  # share of wall vertices that sample the hidden geometry; 0 = BSDF only, 1 = hidden only
+    laser_sampling: bool
+    russian_roulette: bool
+    spot_radius: float  # of the laser on the wall [engine units]; 0 = a point
+    needs_visibility: bool  # something may lie between a vertex and a laser or sensor point
+    has_transmission: bool  # some BSDF refracts: the optical path length needs the medium's index
+    is_plain_diffuse: bool  # flat surfaces of one reflectance each: only normals matter to their BSDFs
+    max_tries: int = PathTuning.max_tries  # of paths that miss the hidden geometry's box, one after the other
+
+    @property
+    def goes_on(self) -> bool:
+        """Whether paths have more than one vertex after the sensor point."""
+        return self.last_vertex is None or self.last_vertex > FIRST_BOUNCE + 1
+
+    @property
+    def last_vertex(self) -> int | None:
+        """Bounce index of the last vertex a path may have: one more than the bounces when rays look for the spot."""
+        highest = self.bounces.max_bounces
+        return highest + 1 if highest is not None and self.finds_spot else highest
+
+    @property
+    def has_time_gate(self) -> bool:
+        """Whether few paths go on that can only bring light after the time window."""
+        return self.goes_on and self.russian_roulette
+
+    @property
+    def has_continuation_roulette(self) -> bool:
+        """Whether only some of the paths may go on beyond the third bounce, which all of them deposit."""
+        is_first = self.first_bounce == THIRD_BOUNCE and self.laser_sampling
+        return self.has_time_gate and is_first and not self.finds_spot
+
+    def is_deposited(self, bounce: mi.UInt32) -> mi.Bool | bool:
+        """Return whether a connection of this bounce index is one of those asked for."""
+        in_reach: mi.Bool | bool = True
+        if self.first_bounce > FIRST_BOUNCE + 1:
+            in_reach &= bounce >= self.first_bounce
+        if self.goes_on and self.bounces.max_bounces is not None:
+            in_reach &= bounce <= self.bounces.max_bounces
+        return in_reach
+
+    def may_go_on(self, bounce: mi.UInt32) -> mi.Bool | bool:
+        """Return whether a path may have another vertex after one of this bounce index."""
+        if not self.goes_on:
+            return False
+        return True if self.last_vertex is None else bounce < self.last_vertex
+
+    def slot(self, bounce: mi.UInt32) -> mi.UInt32:
+        """Return the histogram's slot of a bounce; the second bounce is computed elsewhere and has none."""
+        if not self.bounces.split:
+            return mi.UInt32(0)
+        return dr.minimum(bounce - (FIRST_BOUNCE + 1), mi.UInt32(self.bounces.n_slots - 2))
+
+    @property
+    def finds_spot(self) -> bool:
+        """Whether rays may find the laser's spot by chance."""
+        return self.spot_radius > 0
+
+
+@dataclass(frozen=True, eq=False)
+class PathParams(LaunchParams):
+    """What a launch of the path tracer reads."""
+
+    hidden_aabb: HiddenAabb | None  # None: few rays from the wall miss it
+    continuation_period: mi.UInt32  # n of ``roulette``: one path in n goes on after bounce 3; opaque

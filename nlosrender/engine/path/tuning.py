@@ -1,0 +1,46 @@
+"""Numbers of the path engine, each with its derivation or the measurement it comes from."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class LoopCost:
+    """What the bounces after the third cost in a loop, and how rare they may become (``roulette``)."""
+
+    relative: float  # b / a: seconds that a path's further bounces take over those of its third bounce
+    max_period: int  # a pilot does not see what is rare: it must not become much rarer
+    max_period_split: int  # where bounces are kept apart: none may take longer to the same error than without roulette
+
+
+@dataclass(frozen=True)
+class PathTuning:
+    """Numbers of the path engine; none changes what an estimate converges to."""
+
+    # Hidden area over pi (its distance from the wall)^2 above which hidden geometry sampling alone gives way to the
+    # mixture. The density of a direction is r^2 / (A cos) at distance r: on a disk of that area, of radius 2 d at
+    # distance d, it grows by (1 + 2^2)^(3/2) = 11 from the centre to the rim.
+    max_area_ratio: float = 4.0
+    # Cosine-weighted share of the hemisphere that meets hidden geometry above which BSDF sampling does alone: it then
+    # loses 1 / 0.75 of its paths, less than the mixture loses by its second density.
+    surrounded_share: float = 0.75
+    # Share of rays from the wall that miss the box of the hidden geometry above which it is asked before a ray is
+    # traced. 25 to 120 % more paths per second where half of the rays or more miss it (639c651, bench --part skips).
+    min_miss_share: float = 0.2
+    # Tries of a lane whose paths miss the box, before the other lanes of its packet go on: 1 - 0.8^4 = 59 % of lanes
+    # have found a path by then even where only one ray in five meets the box.
+    max_tries: int = 4
+    # Widening of the box over 1 + its largest coordinate: 80 times the rounding of float32 (1.2e-7).
+    box_margin: float = 1e-5
+    # Samples per lane of the pilot that chooses the continuation period, and paths of a capture below which none is
+    # run: 2^20 paths take about as long as compiling the pilot's kernel (0.3 s on 2 cores).
+    pilot_samples: int = 64
+    min_paths_for_pilot: int = 2**20
+    direct: LoopCost = LoopCost(2.0, 8, 3)  # ``third_bounce_loop``; measured on open scenes (5c22817)
+    traced: LoopCost = LoopCost(0.5, 8, 1)  # ``full_loop``, whose third bounce itself takes a closest-hit ray
+
+
+PILOT_SEED = 0x5EED  # of the pilot alone: the continuation period does not depend on the render's seed
+PHASE_TILE = 4  # 4 x 4 sensor points, a vector of 16 lanes in Morton order, go on after bounce 3 at the same time
+DEFAULT_TUNING = PathTuning()

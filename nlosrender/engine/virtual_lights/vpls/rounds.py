@@ -1,0 +1,221 @@
+"""Rounds of VPLs for bounces 4 and up: VPLs at random points, subpaths from them, the gather by all sensor points."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cached_property
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from nlosrender.capture.bounces import THIRD_BOUNCE
+from nlosrender.capture.plan import Batch
+from nlosrender.engine.interface import Budget
+from nlosrender.engine.launch.device_arrays import laser_points, on_device
+from nlosrender.engine.launch.device_capture import DeviceCapture
+from nlosrender.engine.launch.energy_contrasts import RoundContrasts
+from nlosrender.engine.launch.histogram import DeviceHistogram, Histogram
+from nlosrender.engine.launch.passes import Passes, PassSize, Snapshot
+from nlosrender.engine.launch.pilot_points import Pilot, spread
+from nlosrender.engine.virtual_lights.elements.tessellator import Tessellator
+from nlosrender.engine.virtual_lights.visibility.masks import VisibilityMasks, WallTiles
+from nlosrender.engine.virtual_lights.vpls.gather import VplTable, gather_contributions
+from nlosrender.engine.virtual_lights.vpls.sampler import Vpls, VplSampler
+from nlosrender.engine.virtual_lights.vpls.subpaths import ProposalLasers, SubpathPlan, vpl_contributions
+
+VPLS_PER_ROUND = 4096  # of all replicas together
+CONTRIBUTIONS_PER_VPL = 8
+CONFOCAL_CONTRIBUTIONS_PER_VPL = 2
+TRIED_PER_AXIS = 2  # laser points by which the vertices of walks are judged
+MOST_VALUES = 2**24  # impulses of a round times lasers, for memory
+SUBPATHS_PER_VPL = (16, 64)  # walks are cheap beside the gather when many sensor points share them
+MOST_ROUNDS = 2**20  # of a target that is out of reach
+# Of the target error: what the third bounce may take, and the squares of the third bounce and of the rest together.
+SHARES_OF_THIRD, SQUARES = (0.65, 0.5, 0.35), 0.9
+REST_OF_MANY = 0.88  # of the target error, beside the third bounce
+
+
+class VplBounces:
+    """Bounces above the third of a scene of Lambertian surfaces before a planar wall.
+
+    Parameters
+    ----------
+    device
+        The capture on the device.
+    tessellator
+        Holds the cells the sites lie on.
+    masks
+        Tell what may lie between wall and hidden surfaces; None: nothing may.
+    """
+
+    def __init__(self, device: DeviceCapture, tessellator: Tessellator, masks: VisibilityMasks | None):
+        self.device, self.masks = device, masks
+        self.built, self.options = device.built, device.options
+        built, capture, time_axis = device.built, device.capture, device.time_axis
+        self.tessellator = tessellator
+        proposal_lasers = spread(capture.laser_grid, TRIED_PER_AXIS)
+        points = laser_points(built, capture, time_axis, np.array(proposal_lasers.indices, dtype=np.uint32))
+        self.proposal_lasers = ProposalLasers(points, proposal_lasers.size, proposal_lasers.size == capture.n_lasers)
+        pairs = capture.n_sensors * (capture.n_lasers if capture.scan_type == "exhaustive" else 1)
+        fewest, most = SUBPATHS_PER_VPL
+        self.is_confocal = capture.scan_type == "confocal"
+        # every impulse of a confocal capture takes a ray of its own to the laser
+        self.contributions_per_vpl = CONFOCAL_CONTRIBUTIONS_PER_VPL if self.is_confocal else CONTRIBUTIONS_PER_VPL
+        lasers = capture.n_lasers if capture.scan_type == "exhaustive" else 1
+        self.vpls_per_round = min(VPLS_PER_ROUND, max(64, MOST_VALUES // (self.contributions_per_vpl * lasers)))
+        self.subpaths = int(min(max(pairs / 32, fewest), most))
+
+    @cached_property
+    def sampler(self) -> VplSampler:
+        """What draws the sites; made when it is needed, for it holds all cells."""
+        return VplSampler(self.tessellator, self.device.capture_gate)
+
+    def plan(self, replicas: int) -> SubpathPlan:
+        """Return the numbers of a round of ``replicas`` independent sets of sites."""
+        vpls = max(self.vpls_per_round // replicas, 16)
+        max_bounces = self.options.bounces.max_bounces
+        confocal, capture_gate = self.is_confocal, self.device.capture_gate
+        return SubpathPlan(
+            replicas, vpls, self.subpaths, self.contributions_per_vpl, max_bounces, confocal, capture_gate
+        )
+
+    @property
+    def contributions_per_round(self) -> int:
+        """Impulses that every sensor point receives per round, at most."""
+        return self.vpls_per_round * self.contributions_per_vpl
+
+    def share_of_third(self, patches: int, noise: float) -> float:
+        """Return the one of ``SHARES_OF_THIRD`` with which patches and walks together take the fewest rays.
+
+        Parameters
+        ----------
+        patches
+            That the largest share takes: their number goes with the error to the power of -4/3 where shadows decide.
+        noise
+            Error of one round over the target error.
+        """
+        rays_per_round = self.vpls_per_round * (1 + self.contributions_per_vpl * self.is_confocal)
+
+        def rays(share: float) -> float:
+            finer = patches * (SHARES_OF_THIRD[0] / share) ** (4 / 3)
+            return finer * 4 / 3 + rays_per_round * max(1, math.ceil(noise**2 / (SQUARES - share**2)))
+
+        return min(SHARES_OF_THIRD, key=rays)
+
+    def histogram(self, batch: Batch | Pilot, replicas: int) -> DeviceHistogram:
+        """Return an empty histogram of a batch: bounce slots from the fourth bounce on."""
+        bounces = self.options.bounces
+        slots = bounces.n_slots - bounces.slot(THIRD_BOUNCE + 1) if bounces.split else 1
+        return DeviceHistogram(replace(self.device.shape(batch, slots), replicas=replicas))
+
+    def render(self, batch: Batch, budget: Budget, passes: Passes, known_squares: float = 0.0) -> Histogram:
+        """Render bounces 2 and 4 and up of a batch; see ``SupplementaryEngine.render``."""
+        known_squares += self.device.second_squares(batch)
+        histogram = self.histogram(batch, self.options.replicas)
+        grid = self.device.capture.sensor_grid
+        contrasts = RoundContrasts(histogram, self.device.sensor_indices(batch), (grid.nx, grid.ny))
+        done, skipped, before = 0, 0, 0.0
+        if (earlier := passes.resumed("sums")) is not None:
+            histogram.sums = on_device(mi.Float64, earlier.arrays["sums"])
+            contrasts.restore(earlier.arrays["contrasts"], earlier.arrays["grouped"], earlier.numbers["groups"])
+            done, skipped, before = (earlier.numbers[name] for name in ("done", "skipped", "seconds"))
+        begun, share = time.perf_counter() - before, 0.0
+
+        def report_progress(skipped: int) -> None:
+            numbers = {"done": done, "skipped": skipped, "seconds": time.perf_counter() - begun}
+            numbers["groups"] = contrasts.groups
+            saved = {"contrasts": contrasts.sums, "grouped": contrasts.grouped}
+            passes.between(share, lambda: Snapshot({"sums": histogram.sums.numpy()} | saved, numbers))
+
+        while True:
+            self.accumulate(batch, histogram, done, report_progress, skipped)
+            done, skipped = done + 1, 0
+            if budget.rounds is not None:
+                share = done / budget.rounds
+            else:
+                share = (time.perf_counter() - begun) / max(budget.time_limit_s or 0.0, 1e-9)
+                if budget.target_error is not None:
+                    goal = REST_OF_MANY * budget.target_error
+                    error = histogram.relative_error(done, known_squares) / goal
+                    share = max(share, 1 / max(error, 1e-9) ** 2)
+            contrasts.add(done, share >= 1)
+            if share >= 1:
+                break
+            report_progress(0)
+        return self._result(batch, histogram, contrasts, done)
+
+    def _result(self, batch: Batch, histogram: DeviceHistogram, contrasts: RoundContrasts, done: int) -> Histogram:
+        bounces, scale = self.options.bounces, self.device.scale
+        first = bounces.slot(THIRD_BOUNCE + 1)
+        slots = range(-first, bounces.n_slots - first)
+        statistics = histogram.statistics(done, scale, slots)
+        errors = contrasts.result(scale / (done * self.options.replicas), slots)
+        mean, variance = (histogram.on_host(values) for values in statistics)
+        result = Histogram.of_rows(mean, variance, done * self.contributions_per_round, errors)
+        self.device.add_second_bounce(batch, result)
+        return result
+
+    def accumulate(
+        self,
+        batch: Batch | Pilot,
+        histogram: DeviceHistogram,
+        number: int,
+        report_progress: Callable[[int], None] = lambda done: None,
+        skipped: int = 0,
+    ) -> None:
+        """Add round ``number`` to ``histogram``; a round is the same for every batch of a capture.
+
+        Parameters
+        ----------
+        batch, histogram, number
+            What is rendered, where to; which round.
+        report_progress
+            Called between kernels with the sites that every replica is done with.
+        skipped
+            Sites that every replica is done with already.
+        """
+        shape = histogram.shape
+        plan = self.plan(shape.replicas)
+        if self.sampler.is_empty:
+            return
+        state = np.random.SeedSequence([self.options.seed, number]).generate_state(2)
+        generator = np.random.default_rng(state[0])
+        vpls = Vpls.joined([self.sampler.sample(plan.vpls, generator) for _ in range(plan.replicas)])
+        params = self.device.launch_params(batch, shape)
+        contributions = vpl_contributions(plan, params, vpls, self.proposal_lasers, int(state[1]))
+        if not contributions.count:
+            return
+        wall_tiles = WallTiles.of(self.built, self.device.capture, batch)
+        first_vpls = np.arange(plan.replicas + 1) * plan.vpls
+        table = VplTable.of(self.built, vpls, first_vpls, contributions, self.masks, wall_tiles)
+        lowest = mi.UInt32(THIRD_BOUNCE + 1)
+        slots = (
+            dr.minimum(contributions.bounces - lowest, shape.slots - 1) if self.options.bounces.split else lowest * 0
+        )
+        slots = dr.full(mi.UInt32, 0, contributions.count) + slots
+        dr.eval(slots)
+        needs_visibility = self.masks is not None
+        longest = int(np.diff(np.array(table.first)).max())
+        pairs_per_step = shape.lanes * self.contributions_per_vpl * (shape.lasers + self.is_confocal)
+        size, done = PassSize(max(1, self.options.schedule.first_vpl_pairs // pairs_per_step)), skipped
+        while done < longest:
+            steps = min(size.steps, longest - done)
+            cut = tuple(dr.opaque(mi.UInt32, count) for count in (done, steps))
+            size.begin()
+            scene = params, needs_visibility, self.is_confocal, wall_tiles
+            gather_contributions(*scene, table, cut, contributions, slots, shape, histogram)
+            dr.eval(histogram.sums)
+            dr.sync_thread()
+            size.end()
+            done += steps
+            if done < longest:
+                report_progress(done)
+
+
+def rounds_needed(error: float, done: int, target: float) -> int:
+    """Return how many rounds bring the ``error`` after ``done`` rounds to ``target``: it falls as 1 / sqrt(rounds)."""
+    return min(max(1, math.ceil(done * (error / target) ** 2)), MOST_ROUNDS) if math.isfinite(error) else MOST_ROUNDS
