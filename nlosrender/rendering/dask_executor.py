@@ -12,7 +12,7 @@ from concurrent.futures import CancelledError
 from contextlib import suppress
 from dataclasses import asdict, replace
 from itertools import islice
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from nlosrender.capture.plan import WorkItem
 from nlosrender.errors import BackendError, IncompleteRender, InterruptedRender, RenderError
@@ -111,7 +111,7 @@ class _Flight:
         self._left, self._client = iter(items), cluster.client
         self._arguments = (asdict(budget), cluster.threads)
         self._job = job
-        self._out: dict[Future, None] = {}  # the oldest first: the order in which they are begun
+        self._out: dict[Future[Any], None] = {}  # the oldest first: the order in which they are begun
         self._recalled = False
         self._given_up_at = math.inf  # s of the monotonic clock, after a stop
 
@@ -174,7 +174,7 @@ class _Flight:
         for future in waiting:
             del self._out[future]
 
-    def _arrived(self, future: Future) -> FinishedItem:
+    def _arrived(self, future: Future[Any]) -> FinishedItem:
         from distributed import KilledWorker
 
         try:

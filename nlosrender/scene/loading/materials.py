@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterable, Iterator, Mapping
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -165,7 +166,7 @@ def _extremes(bsdf: mi.BSDF, texture: str) -> tuple[float, float]:
     return float(min(part.min() for part in values)), float(max(part.max() for part in values))
 
 
-def _parameters(bsdf: mi.BSDF, prefix: str, suffixes: tuple[str, ...]) -> Iterator[tuple[str, NDArray]]:
+def _parameters(bsdf: mi.BSDF, prefix: str, suffixes: tuple[str, ...]) -> Iterator[tuple[str, NDArray[Any]]]:
     """Yield names and values of the parameters of a BSDF's textures."""
     parameters = mi.traverse(bsdf)
     for name in parameters.keys():  # noqa: SIM118  # not its items: some of other parameters cannot be read
@@ -183,7 +184,7 @@ def _index_of(bsdf: mi.BSDF) -> float:
     return float(2 / (1 - math.sqrt(0.08 * np.ravel(parameters["specular"])[0])) - 1)
 
 
-def _check_texels(values: NDArray, name: str, key: str) -> None:
+def _check_texels(values: NDArray[Any], name: str, key: str) -> None:
     """Refuse images with values no reflectance has; numbers in the configuration have been checked before."""
     if values.dtype.kind == "u":
         return  # 8-bit images stand for 0 to 1

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +24,7 @@ class AttributeUse:
     name: str
     scale: float = 1.0
 
-    def check(self, attributes: Mapping[str, NDArray]) -> None:
+    def check(self, attributes: Mapping[str, NDArray[Any]]) -> None:
         """Raise ValueError for an attribute that is not there, or has values that the parameter cannot have."""
         if self.name not in attributes:
             there = ", ".join(attributes) or "none"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,7 +34,7 @@ def some_of(names: Sequence[str]) -> str:
     return ", ".join(names[:MAX_NAMES]) + (f" and {rest} more" if rest > 0 else "")
 
 
-def numbers_in(text: bytes, dtype: type) -> NDArray:
+def numbers_in(text: bytes, dtype: type) -> NDArray[Any]:
     """Return the numbers in a text, separated by white space, up to the first word that is none."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)  # how numpy reports such a word

@@ -6,6 +6,7 @@ No other file is opened; materials, lines and curves are counted (``FileMesh``),
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -81,13 +82,15 @@ def _numbers(text: ObjLines, kind: bytes) -> Float64:
     return np.where(column < counts[:, None], values[at], 0.0)
 
 
-def _parsed(lines: Sequence[bytes], dtype: type) -> NDArray:
+def _parsed(lines: Sequence[bytes], dtype: type) -> NDArray[Any]:
     """Return the numbers after the first word of each line, up to the first word that is none."""
     words = (line.split(None, 1) for line in lines)
     return numbers_in(b" ".join(parts[1] for parts in words if len(parts) > 1).replace(b"/", b" "), dtype)
 
 
-def _triangles(text: ObjLines, groups: Sequence[tuple[Int64, Int64]], positions: Float64) -> tuple[Int64, tuple]:
+def _triangles(
+    text: ObjLines, groups: Sequence[tuple[Int64, Int64]], positions: Float64
+) -> tuple[Int64, tuple[str, ...]]:
     """Return the corners (3 m, 3) of the triangles that polygons are cut into, and sentences about bent polygons."""
     polygons = [(rows, indices) for rows, indices in groups if indices.shape[1] > 2]
     cuts, bent = cut_polygons(

@@ -7,6 +7,7 @@ in a file is a message, never a crash.
 from __future__ import annotations
 
 from collections.abc import Container, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -83,11 +84,11 @@ def _present(choices: Sequence[tuple[str, ...]], names: Container[str]) -> tuple
     return next((group for group in choices if all(name in names for name in group)), ())
 
 
-def _columns(columns: Mapping[str, NDArray], names: Sequence[str]) -> Float64:
+def _columns(columns: Mapping[str, NDArray[Any]], names: Sequence[str]) -> Float64:
     return np.column_stack([columns[name].astype(np.float64) for name in names])
 
 
-def _optional(columns: Mapping[str, NDArray], choices: Sequence[tuple[str, ...]]) -> Float64 | None:
+def _optional(columns: Mapping[str, NDArray[Any]], choices: Sequence[tuple[str, ...]]) -> Float64 | None:
     names = _present(choices, columns)
     return _columns(columns, names) if names else None
 

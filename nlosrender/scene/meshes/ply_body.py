@@ -6,6 +6,7 @@ An ASCII body is read row by row: a record ends where its line does, or somethin
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +16,7 @@ from nlosrender.scene.meshes.ply_header import PlyElement, PlyHeader
 from nlosrender.scene.meshes.triangle_mesh import Int64
 from nlosrender.scene.pose import Float64
 
-Lists = list[NDArray]  # of one list property: runs of records of equal length, (records, length)
+Lists = list[NDArray[Any]]  # of one list property: runs of records of equal length, (records, length)
 
 
 @dataclass(eq=False)
@@ -95,7 +96,7 @@ class PlyRows:
 class PlyRecords:
     """The values of an element by the names of its properties."""
 
-    columns: dict[str, NDArray]  # single values, (records,)
+    columns: dict[str, NDArray[Any]]  # single values, (records,)
     lists: dict[str, Lists]
 
 
@@ -128,7 +129,7 @@ def _records(element: PlyElement, body: memoryview) -> tuple[PlyRecords, int]:
     equal lengths.
     """
     lists = [index for index, prop in enumerate(element.properties) if prop.count_kind is not None]
-    columns: dict[str, list[NDArray]] = {prop.name: [] for prop in element.properties if prop.count_kind is None}
+    columns: dict[str, list[NDArray[Any]]] = {prop.name: [] for prop in element.properties if prop.count_kind is None}
     values: dict[str, Lists] = {element.properties[index].name: [] for index in lists}
     done, offset, window = 0, 0, element.count
     while done < element.count and element.properties:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -95,7 +96,7 @@ def with_corner_uvs(mesh: TriangleMesh, uvs: Float64) -> TriangleMesh:
     return replace(mesh.reindexed(vertices[first], which.reshape(-1, 3)), uvs=flat[first])
 
 
-def whole_numbers(values: NDArray) -> Int64:
+def whole_numbers(values: NDArray[Any]) -> Int64:
     """Return indices as integers; ValueError for one that is none."""
     if values.dtype.kind == "f" and not (np.abs(values) < 2**53).all():
         raise ValueError("a face has an index that is no number, or far too large")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -42,7 +43,7 @@ class PlyElement:
 
     def dtype(self, lengths: Sequence[int], n_properties: int | None = None) -> np.dtype:
         """Return the layout of the first properties of a record, all of them by default, whose lists have lengths."""
-        fields: list[tuple] = []
+        fields: list[tuple[Any, ...]] = []
         of_lists = iter(lengths)
         for index, prop in enumerate(self.properties[:n_properties]):
             if prop.count_kind is None:

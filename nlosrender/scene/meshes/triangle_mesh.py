@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -146,7 +147,7 @@ def unit_rows(vectors: Float64, min_length: float = 0.0) -> Float64:
     return np.divide(vectors, length, out=np.zeros_like(vectors), where=length > min_length)
 
 
-def equal_columns(keys: NDArray | Sequence[NDArray]) -> Int64:
+def equal_columns(keys: NDArray[Any] | Sequence[NDArray[Any]]) -> Int64:
     """Return for each column of ``keys`` (k, n) its number among the different columns, in order of the last key."""
     order = np.lexsort(keys)
     is_new = np.any([np.diff(key[order]) != 0 for key in keys], axis=0)
@@ -155,7 +156,7 @@ def equal_columns(keys: NDArray | Sequence[NDArray]) -> Int64:
     return numbers
 
 
-def distinct_columns(keys: NDArray | Sequence[NDArray]) -> tuple[Int64, Int64]:
+def distinct_columns(keys: NDArray[Any] | Sequence[NDArray[Any]]) -> tuple[Int64, Int64]:
     """Return the index of one column of ``keys`` (k, n) of each kind, and which of these each column equals, (n,)."""
     numbers = equal_columns(keys)
     first = np.empty(int(numbers.max(initial=-1)) + 1, np.int64)
@@ -173,6 +174,6 @@ def _per_vertex(name: str, rows: ArrayLike, width: int, count: int | None) -> Fl
     return rows
 
 
-def _frozen(array: NDArray) -> NDArray:
+def _frozen(array: NDArray[Any]) -> NDArray[Any]:
     array.flags.writeable = False
     return array

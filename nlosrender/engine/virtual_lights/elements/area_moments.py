@@ -6,6 +6,7 @@ docs/virtual-lights.md, 4.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -200,7 +201,7 @@ def _place_moments(corners: Float64, centres: Float64, areas: Float64) -> Float6
     return result
 
 
-def _numbered(keys: list[NDArray]) -> tuple[UInt64, Int64]:
+def _numbered(keys: list[NDArray[Any]]) -> tuple[UInt64, Int64]:
     """Return the sorted hash codes (m,) of all combinations of whole keys, and the index among them (n,).
 
     Codes of different combinations are as good as random: among a million one pair is the same with probability 3e-8.
