@@ -28,9 +28,9 @@ class VirtualLightTuning:
     # parts have to follow the scale in small steps. A plate on the wall: error 4.7 / 4.9 / 4.8 % with 1160 / 1404 /
     # 1834 patches at half / as is / twice.
     close_distance: float = 1e-2
-    # Elements smaller than this part of the size allowed are merged. Sheets of 300 to 450 triangles at scale 0.5: error
-    # 3.3 / 3.3 / 4.0 % (one), 3.9 / 3.9 / 5.6 % (two) at half / as is / twice; at scale 1 4.9 / 10.2 / 15.7 % with 312
-    # / 171 / 75 patches: the error per patch is the same, and half of it keeps four times as many of a fine mesh.
+    # Elements smaller than this part of the size allowed are merged: such an element has at most a quarter of the area
+    # that a patch may have. Sheets of 300 to 450 triangles at scale 0.5: error 3.3 / 3.3 / 4.0 % (one), 3.9 / 3.9 /
+    # 5.6 % (two) at half / as is / twice; one at scale 1: 4.9 / 10.2 / 15.7 % with 312 / 171 / 75 patches.
     merge_ratio: float = 0.5
     # Of one gather; 400 bytes each, 0.8 GB. Beyond it paths reach the error sooner (chosen, 6.5).
     max_patches: int = 2_000_000
