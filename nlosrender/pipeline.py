@@ -26,6 +26,7 @@ from nlosrender.files.parts.shards import part_attributes
 from nlosrender.files.provenance import provenance_attributes
 from nlosrender.rendering.dask_executor import render_on_cluster
 from nlosrender.rendering.dask_worker import Job
+from nlosrender.rendering.item_in_flight import SAVING, SavePolicy
 from nlosrender.rendering.local_executor import render_items, resumable
 from nlosrender.rendering.outcome import missed_target, missing_light, summed_capture
 from nlosrender.rendering.process_layout import ONE_PROCESS
@@ -47,6 +48,7 @@ def render_capture(
     cluster: Cluster | None = None,
     watch: Watch = lambda standing: None,
     strict: bool = False,
+    saving: SavePolicy = SAVING,
 ) -> RenderReport:
     """Render one capture, or a part of it, and write its file.
 
@@ -69,6 +71,8 @@ def render_capture(
         Called with how many work items are finished: before the first one, and after each.
     strict
         Refuse to render where light is missing that no technique samples.
+    saving
+        When the state of the work item in flight is saved.
 
     Raises
     ------
@@ -119,7 +123,7 @@ def render_capture(
             shown = (lambda standing: watch(replace(standing, error=None))) if unsampled else watch
             monitor = Monitor(stopwatch, progress, lambda text: warnings.emit([text]), shown)
             if cluster is None:
-                render_items(items, engine, budget, partial, stop, monitor)
+                render_items(items, engine, budget, partial, stop, monitor, saving)
             else:
                 job = Job(config, selection, identity, backend.name, processes)
                 render_on_cluster(items, job, budget, partial, stop, cluster, monitor)

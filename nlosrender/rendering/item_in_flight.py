@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING
 
 from nlosrender.capture.plan import WorkItem
@@ -18,10 +18,19 @@ from nlosrender.rendering.render_report import Progress, Warn
 if TYPE_CHECKING:
     from nlosrender.engine.interface import Budget
 
-KEEP_SECONDS = 30.0  # between two states: a kill costs about a minute at most, and quick work items write none
-KEEP_COST = 0.1  # largest share of the time spent on writing states, which may have gigabytes
-SOON_SECONDS = 5.0  # grace for the work item in flight after a signal
 OF_ITEM = "unit"  # stage under which the seconds are saved
+
+
+@dataclass(frozen=True)
+class SavePolicy:
+    """When the state of a work item in flight is saved."""
+
+    seconds: float = 30.0  # between two states: a kill costs about a minute at most, and quick work items write none
+    max_cost: float = 0.1  # largest share of the time spent on writing states, which may have gigabytes
+    grace_seconds: float = 5.0  # in which a work item may still end after a signal
+
+
+SAVING = SavePolicy()
 
 
 class ItemStopped(Exception):
@@ -35,8 +44,8 @@ class ItemInFlight:
     ----------
     partial, item, budget
         Where states go; of what; when it is done (a limit of time does not count: it is another one every time).
-    stop
-        When it comes the work item has ``SOON_SECONDS`` to end; then it is kept as it is.
+    stop, policy
+        When a stop comes the work item has ``policy.grace_seconds`` to end; then it is saved as it is.
     progress, warn
         Told the share that is done, and what cannot be kept.
     """
@@ -49,8 +58,9 @@ class ItemInFlight:
         stop: StopRequest,
         progress: Progress,
         warn: Warn,
+        policy: SavePolicy,
     ):
-        self._partial, self._stop, self._warn = partial, stop, warn
+        self._partial, self._stop, self._warn, self._policy = partial, stop, warn, policy
         comparable_budget = asdict(budget) | {"time_limit_s": budget.time_limit_s is not None}
         self._state = partial.item_state((item.sensors, item.lasers), comparable_budget)
         kept = self._state.read() or {}
@@ -61,7 +71,7 @@ class ItemInFlight:
         self.earlier_seconds = float(kept[OF_ITEM].numbers["seconds"]) if OF_ITEM in kept else 0.0
         self.passes = Passes(progress, self._look, kept)
         self._begun = self._kept_at = time.perf_counter()
-        self._pause = KEEP_SECONDS
+        self._pause = policy.seconds
         self._signal_at: float | None = None  # when the stop was noticed
 
     @property
@@ -73,13 +83,13 @@ class ItemInFlight:
         now = time.perf_counter()
         if self._stop.came:
             self._signal_at = self._signal_at or now
-            if now - self._signal_at >= SOON_SECONDS:
+            if now - self._signal_at >= self._policy.grace_seconds:
                 self._keep(take())
                 raise ItemStopped
         elif now - self._kept_at >= self._pause:
             self._keep(take())
             self._kept_at = time.perf_counter()
-            self._pause = max(self._pause, KEEP_SECONDS, (self._kept_at - now) / KEEP_COST)
+            self._pause = max(self._pause, (self._kept_at - now) / self._policy.max_cost)
 
     def _keep(self, kept: SavedStages) -> None:
         noted = Snapshot(numbers={"seconds": self.seconds})

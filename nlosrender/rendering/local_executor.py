@@ -13,7 +13,7 @@ from nlosrender.errors import FileError, IncompleteRender, InterruptedRender, Re
 from nlosrender.files.partial.partial_capture import PartialCapture
 from nlosrender.files.sums import Sums
 from nlosrender.interruption import StopRequest, stop_request
-from nlosrender.rendering.item_in_flight import ItemInFlight, ItemStopped
+from nlosrender.rendering.item_in_flight import SAVING, ItemInFlight, ItemStopped, SavePolicy
 from nlosrender.rendering.render_report import Monitor, Standing
 from nlosrender.rendering.work_items import ItemWriter, render_timed
 
@@ -54,6 +54,7 @@ def render_items(
     partial: PartialCapture,
     stop: StopRequest,
     monitor: Monitor,
+    saving: SavePolicy = SAVING,
 ) -> None:
     """Render work items and store each as it is done.
 
@@ -65,8 +66,9 @@ def render_items(
         What renders them; when to stop, ``time_limit_s`` being the limit for all work items, earlier runs' included.
     partial, stop
         Where they go, open; looked at between passes: a work item that takes long is saved as it is.
-    monitor
-        Told the seconds, the share that is done, that the user has to wait, and what is finished.
+    monitor, saving
+        Told the seconds, the share that is done, that the user has to wait, and what is finished; when the state of an
+        item in flight is saved.
 
     Raises
     ------
@@ -97,7 +99,7 @@ def render_items(
                     )
 
             own_budget = replace(budget, time_limit_s=limit)
-            flight = ItemInFlight(partial, item, own_budget, stop, report_progress, monitor.warn)
+            flight = ItemInFlight(partial, item, own_budget, stop, report_progress, monitor.warn, saving)
             finished = render_timed(
                 engine, item, own_budget, partial.chunker, monitor.stopwatch, flight.passes, flight.earlier_seconds
             )

@@ -20,7 +20,7 @@ from nlosrender.engine.backend.start import start_backend
 from nlosrender.errors import FileError, IncompleteRender, InterruptedRender
 from nlosrender.files.partial.work_item_state import ItemState
 from nlosrender.pipeline import render_capture
-from nlosrender.rendering import item_in_flight
+from nlosrender.rendering.item_in_flight import SavePolicy
 
 PLATE = {"type": "rectangle", "width": 0.8, "height": 0.6, "center": [0.1, 0, 1.0], "normal": [0, 0, -1]}
 
@@ -33,9 +33,11 @@ def config(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Config:
 
     long_launches = {"schedule": ScheduleTuning(pass_seconds=math.inf)}  # of 1, 4, 20, ... paths a lane
     monkeypatch.setattr(pipeline, "set_up_engine", partial(pipeline.set_up_engine, changes=long_launches))
-    monkeypatch.setattr(item_in_flight, "SOON_SECONDS", 0.0)
     scene = flat_wall(PLATE, max_bounces=4, spp=60_000)
     return configured(scene | {"output": {"path": str(tmp_path / "a.hdf5")}})
+
+
+AT_ONCE = SavePolicy(grace_seconds=0.0)  # a signal ends the item
 
 
 class Killed(BaseException):
@@ -78,7 +80,7 @@ def test_a_signal_ends_a_long_unit_and_the_same_command_goes_on(config: Config) 
     """No more of the unit is lost than the pass in flight, though not one unit is finished."""
     undisturbed = whole(config)
     with pytest.raises(InterruptedRender, match="0 of 1 units are finished and saved, and so is what was done of the"):
-        render_capture(config, at(0.1))
+        render_capture(config, at(0.1), saving=AT_ONCE)
     assert len(states(config)) == 1
     shares: list[float] = []
     report = render_capture(config, shares.append, resume=True)
@@ -88,12 +90,11 @@ def test_a_signal_ends_a_long_unit_and_the_same_command_goes_on(config: Config) 
     assert not Path(config.output.path).with_name(".a.hdf5.partial").exists()
 
 
-def test_a_kill_costs_what_was_done_since_the_last_state(config: Config, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_kill_costs_what_was_done_since_the_last_state(config: Config) -> None:
     """States are kept now and then; the last one is what a later render goes on from."""
     undisturbed = whole(config)
-    monkeypatch.setattr(item_in_flight, "KEEP_SECONDS", 0.0)
     with pytest.raises(Killed):
-        render_capture(config, at(0.1, Killed()))
+        render_capture(config, at(0.1, Killed()), saving=SavePolicy(seconds=0.0))
     assert len(states(config)) == 1
     shares: list[float] = []
     render_capture(config, shares.append)
@@ -102,7 +103,7 @@ def test_a_kill_costs_what_was_done_since_the_last_state(config: Config, monkeyp
 
 
 def test_a_short_unit_keeps_nothing(config: Config) -> None:
-    """States are for units that take longer than ``KEEP_SECONDS``."""
+    """States are for units that take longer than ``SavePolicy.seconds``."""
     with pytest.raises(Killed):
         render_capture(config, at(0.1, Killed()))
     assert not Path(config.output.path).with_name(".a.hdf5.partial").exists()
@@ -112,7 +113,7 @@ def test_a_damaged_state_begins_the_unit_anew(config: Config) -> None:
     """A flipped bit in the sums, or a state of another target: the checksum tells, and nothing of it is used."""
     undisturbed = whole(config)
     with pytest.raises(InterruptedRender):
-        render_capture(config, at(0.1))
+        render_capture(config, at(0.1), saving=AT_ONCE)
     (state,) = states(config)
     content = bytearray(state.read_bytes())
     content[-100] ^= 1
@@ -126,7 +127,7 @@ def test_a_damaged_state_begins_the_unit_anew(config: Config) -> None:
 def test_another_render_is_refused_for_a_state_alone(config: Config) -> None:
     """What is unfinished is not thrown away for a capture of another seed, though no unit is finished."""
     with pytest.raises(InterruptedRender):
-        render_capture(config, at(0.1))
+        render_capture(config, at(0.1), saving=AT_ONCE)
     other = config.model_copy(update={"render": config.render.model_copy(update={"seed": 7})})
     with pytest.raises(FileError, match="unfinished render of something else"):
         render_capture(other)
@@ -144,5 +145,5 @@ def test_a_disk_that_takes_no_state_stops_all_the_same(config: Config, monkeypat
     monkeypatch.setattr(ItemState, "write", refused)
     warnings: list[str] = []
     with pytest.raises((InterruptedRender, IncompleteRender), match="nothing is kept"):
-        render_capture(config, at(0.1), warnings.append)
+        render_capture(config, at(0.1), warnings.append, saving=AT_ONCE)
     assert any("cannot be kept" in warning for warning in warnings)
