@@ -13,6 +13,7 @@ import numpy as np
 from nlosrender.bench.curve import Curve, Point
 from nlosrender.bench.references import Reference
 from nlosrender.bench.runs import LoadedScene, Run, Timer, chosen_engine, render
+from nlosrender.engine.interface import Budget
 
 REPEATS = 3
 SHORT_SECONDS = 1.5  # runs up to this long are repeated, and their median reported
@@ -58,8 +59,6 @@ class OwnContender:
         RenderError
             The result is not finite, or does not fit the memory.
         """
-        from nlosrender.engine.interface import Budget
-
         if self.options["engine"] == "path":
             budget = Budget(spp=FIRST_SAMPLES * 4**level)
         else:

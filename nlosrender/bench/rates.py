@@ -15,6 +15,7 @@ import yaml
 from nlosrender.bench.any_hit import trace_any_hit
 from nlosrender.bench.runs import LoadedScene, Timer, virtual_lights_of
 from nlosrender.bench.scenes import BenchScene
+from nlosrender.engine.interface import Budget
 from nlosrender.errors import RenderError
 
 REPEATS = 3
@@ -32,8 +33,6 @@ def gather_rate(loaded: LoadedScene) -> dict[str, Any]:
     RenderError
         The virtual-light engine does not take the scene.
     """
-    from nlosrender.engine.interface import Budget
-
     plan, engine = virtual_lights_of(loaded)
     patch_scale = engine.calibrate(Budget(target_error=GATHER_TARGET)).patch_scale or 1.0
     spent = []

@@ -8,6 +8,7 @@ import numpy as np
 
 from nlosrender.bench.runs import Float64, LoadedScene, Timer, render
 from nlosrender.bench.scenes import PLATE_DISTANCE, PLATE_REFLECTANCE, PLATE_SIZE
+from nlosrender.engine.interface import Budget
 
 CELLS = 200  # per edge of the plate: cells of 4 mm
 QUADRATURE_ERROR = 2e-4  # of that: falls as 1 / CELLS^2, 6e-3 with 40
@@ -44,8 +45,6 @@ def find_reference(loaded: LoadedScene, seconds: float) -> Reference:
 
 def _refined(loaded: LoadedScene, seconds: float) -> Reference:
     """Gather at finer and finer targets while the next one can be expected to fit."""
-    from nlosrender.engine.interface import Budget
-
     timer, target = Timer(), FIRST_TARGET
     options = {"engine": "virtual_lights"}
     run = render(loaded, Budget(target_error=target), LONG_RUN_SEED, options)
@@ -60,8 +59,6 @@ def _refined(loaded: LoadedScene, seconds: float) -> Reference:
 
 def _long_run(loaded: LoadedScene, seconds: float) -> Reference:
     """Gather the third bounce as finely as a third of the time allows, and trace the rest of the light in the rest."""
-    from nlosrender.engine.interface import Budget
-
     timer = Timer()
     options = {"engine": "virtual_lights"}
     third = replace(loaded, scene=replace(loaded.scene, max_bounces=3))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
@@ -12,6 +13,7 @@ from numpy.typing import NDArray
 
 from nlosrender.bench.scenes import BenchScene
 from nlosrender.capture.grids import Capture
+from nlosrender.capture.relative_error import relative_l2_error
 from nlosrender.capture.time_axis import TimeAxis
 from nlosrender.engine.backend.start import Backend, start_backend
 from nlosrender.errors import RenderError
@@ -19,7 +21,7 @@ from nlosrender.rendering import stages
 
 if TYPE_CHECKING:
     from nlosrender.capture.plan import Plan
-    from nlosrender.engine.interface import Budget
+    from nlosrender.engine.interface import Budget, Engine
     from nlosrender.engine.virtual_lights.engine import VirtualLightEngine
     from nlosrender.scene.build import BuiltScene
 
@@ -90,6 +92,25 @@ def load(scene: BenchScene) -> LoadedScene:
     return LoadedScene(scene, backend, built, capture, time_axis)
 
 
+def prepared(
+    loaded: LoadedScene, render: Mapping[str, Any], changes: Mapping[str, Any] = MappingProxyType({})
+) -> tuple[Plan, Engine]:
+    """Return the plan and the engine of a scene; bounces are summed.
+
+    Parameters
+    ----------
+    loaded
+        The scene.
+    render
+        Keys of the configuration's ``render`` section, such as ``engine``.
+    changes
+        To the engine's ``RenderOptions``.
+    """
+    config = loaded.scene.config(split_bounces=False, **render)
+    scene = loaded.built, loaded.capture, loaded.time_axis
+    return stages.prepare(config, loaded.backend, *scene, changes=changes)
+
+
 def virtual_lights_of(loaded: LoadedScene) -> tuple[Plan, VirtualLightEngine]:
     """Return the plan of a scene and the virtual-light engine for it.
 
@@ -98,8 +119,7 @@ def virtual_lights_of(loaded: LoadedScene) -> tuple[Plan, VirtualLightEngine]:
     RenderError
         The engine does not take the scene.
     """
-    config = loaded.scene.config(engine="virtual_lights", split_bounces=False)
-    plan, engine = stages.prepare(config, loaded.backend, loaded.built, loaded.capture, loaded.time_axis)
+    plan, engine = prepared(loaded, {"engine": "virtual_lights"})
     if engine.name != "virtual_lights":
         raise RenderError(f"{loaded.scene.name}: the virtual-light engine does not take this scene")
     return plan, cast("VirtualLightEngine", engine)
@@ -120,14 +140,11 @@ def render(loaded: LoadedScene, budget: Budget, seed: int = 0, options: Mapping[
     RenderError
         The result is not finite, or does not fit the memory.
     """
-    from nlosrender.engine.launch.histogram import relative_l2_error
-
-    config = loaded.scene.config(split_bounces=False, seed=seed, **(options or {}))
     values = np.zeros(loaded.shape)
     noise = squares = 0.0
     samples: list[int] = []
     timer = Timer()
-    plan, engine = stages.prepare(config, loaded.backend, loaded.built, loaded.capture, loaded.time_axis)
+    plan, engine = prepared(loaded, {"seed": seed, **(options or {})})
     engine.set_up()
     _, setup_seconds = timer.read()
     for batch in plan.batches:
@@ -141,12 +158,11 @@ def render(loaded: LoadedScene, budget: Budget, seed: int = 0, options: Mapping[
         squares += float((histogram.mean**2).sum())
         samples.append(histogram.samples)
     seconds, cpu_seconds = timer.read()
-    estimate = relative_l2_error(noise, squares)
-    return Run(values, seconds, cpu_seconds, estimate, min(samples), engine.name, setup_seconds)
+    return Run(
+        values, seconds, cpu_seconds, relative_l2_error(noise, squares), min(samples), engine.name, setup_seconds
+    )
 
 
 def chosen_engine(loaded: LoadedScene) -> str:
     """Return the name of the engine that ``engine: auto`` takes for a scene."""
-    config = loaded.scene.config(split_bounces=False)
-    _, engine = stages.prepare(config, loaded.backend, loaded.built, loaded.capture, loaded.time_axis)
-    return engine.name
+    return prepared(loaded, {})[1].name

@@ -14,6 +14,7 @@ from nlosrender.bench.curve import power_law
 from nlosrender.bench.generated_meshes import grid_faces, write_ply
 from nlosrender.bench.runs import Timer, load, render
 from nlosrender.bench.scenes import BenchScene, closed_room, many_lasers, plate, wavy_sheet
+from nlosrender.engine.interface import Budget
 
 REPEATS = 3
 TARGET = 0.02  # error asked for at every size
@@ -66,8 +67,6 @@ def _axes(folder: Path) -> list[tuple[str, str, Sequence[float], Callable[[int],
 def _measure(
     quantity: str, setting: str, sizes: Sequence[float], scene_of: Callable[[int], BenchScene], seconds: float
 ) -> dict[str, Any]:
-    from nlosrender.engine.path.engine import Budget
-
     begun, budget, options = Timer(), Budget(target_error=TARGET), {"engine": "auto"}
     found: dict[str, list[Any]] = {name: [] for name in ("seconds", "cpu_seconds", "setup_seconds", "engines")}
     times = found["seconds"]
