@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -12,9 +12,9 @@ from nlosrender.analysis.reconstruction.voxel_grid import VoxelGrid
 from nlosrender.config.load import parse_config
 from nlosrender.errors import ConfigError, FileError
 from nlosrender.files.layout import Float64
-from nlosrender.scene.meshes.mesh_file import read_mesh
 from nlosrender.scene.meshes.triangle_mesh import TriangleMesh
-from nlosrender.scene.surfaces import MeshFile, Surface, hidden_surfaces
+from nlosrender.scene.read_surfaces import read_surfaces
+from nlosrender.scene.surfaces import ShapeDescription, Surface, hidden_surfaces
 from nlosrender.scene.walls.wall_from_config import relay_wall_from_config
 
 if TYPE_CHECKING:
@@ -37,7 +37,7 @@ def true_silhouette(source: Path, attributes: Mapping[str, object], grid: VoxelG
     """
     import shapely
 
-    shapes = [outline(surface, grid) for surface in _surfaces(source, attributes)]
+    shapes = [_outline(surface, shape, grid) for surface, shape in _surfaces(source, attributes.get("config"))]
     covered = shapely.union_all([shape for shape in shapes if not shape.is_empty])
     shapely.prepare(covered)
     offsets = ((np.arange(SUBPIXELS) + 0.5) / SUBPIXELS - 0.5) * grid.voxel_size
@@ -46,25 +46,17 @@ def true_silhouette(source: Path, attributes: Mapping[str, object], grid: VoxelG
     return inside.reshape(len(grid.y), SUBPIXELS, len(grid.x), SUBPIXELS).mean(axis=(1, 3))
 
 
-def outline(surface: Surface, grid: VoxelGrid) -> BaseGeometry:
-    """Return the projection along z of what lies in the volume's depth, as a shapely polygon.
-
-    Raises
-    ------
-    FileError
-        The surface is a mesh file that cannot be read, or a plugin whose shape is not known here.
-    """
+def _outline(surface: Surface, shape: TriangleMesh | ShapeDescription, grid: VoxelGrid) -> BaseGeometry:
+    """Return the projection along z of what lies in the volume's depth, as a shapely polygon."""
     import shapely
 
     low, high = grid.z[0] - grid.voxel_size / 2, grid.z[-1] + grid.voxel_size / 2
-    shape = _read(surface, surface.shape) if isinstance(surface.shape, MeshFile) else surface.shape
     if isinstance(shape, TriangleMesh):
         corners = shape.vertices[shape.faces]  # (face, corner, 3)
         depth = corners[..., 2].mean(axis=1)
         flat = corners[(depth >= low) & (depth <= high), :, :2]
         triangles = shapely.polygons(flat)
-        # seen edge on they have no area, and unions do not like them
-        return shapely.union_all(triangles[shapely.area(triangles) > 1e-12])
+        return shapely.union_all(triangles[shapely.area(triangles) > 1e-12])  # m^2: not those seen edge on
     points = _round_points(shape.description)
     if points is None:
         raise FileError(
@@ -76,22 +68,14 @@ def outline(surface: Surface, grid: VoxelGrid) -> BaseGeometry:
     return hull if low <= depth <= high else shapely.Polygon()
 
 
-def _read(surface: Surface, file: MeshFile) -> TriangleMesh:
-    try:
-        mesh = read_mesh(file.filename, Path(file.filename).suffix.lower().lstrip("."), "flat")
-        return mesh.transformed(file.to_local)
-    except ValueError as error:
-        raise FileError(f"{surface.key}.filename: {file.filename}: {error}. Leave --score away.") from error
-
-
-def _surfaces(source: Path, attributes: Mapping[str, object]) -> tuple[Surface, ...]:
-    text = attributes.get("config")
+def _surfaces(source: Path, text: object) -> Iterator[tuple[Surface, TriangleMesh | ShapeDescription]]:
+    """Yield the surfaces of a configuration and their shapes, mesh files read."""
     if not isinstance(text, str):
         raise FileError(f"{source}: does not carry the scene's configuration, so there is nothing to score against")
     try:
         config = parse_config(text, str(source), source.absolute().parent)
-        wall = relay_wall_from_config(config.scene.wall)
-        return hidden_surfaces(config.scene.hidden_geometry, wall.pose)
+        surfaces = hidden_surfaces(config.scene.hidden_geometry, relay_wall_from_config(config.scene.wall).pose)
+        yield from zip(surfaces, read_surfaces(surfaces).shapes, strict=True)
     except (ConfigError, ValueError) as error:
         raise FileError(f"{source}: the configuration it carries cannot be used: {error}") from error
 
