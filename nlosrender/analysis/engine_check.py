@@ -1,4 +1,4 @@
-"""Do the techniques that can render a scene agree? A few sensor points by each of them, pair by pair, bounce by bounce.
+"""``nlosrender check-engines``: renders a few sensor points by every technique and compares these pair by pair.
 
 The techniques are the path engine, the path engine without hidden geometry sampling (it shares no surface sampler with
 the others, and finds what is in front by rays alone), and the virtual lights. A pair is judged by the Z-test of
@@ -19,43 +19,40 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nlosrender.analysis.comparison.blocks import Block
-from nlosrender.analysis.comparison.z_test import ErrorModel, ZTest
+from nlosrender.analysis.comparison.z_test import ErrorModel, ZTest, sidak
 from nlosrender.analysis.json_values import finite_or_none
 from nlosrender.capture.bounces import FILE_BOUNCES, BounceAxis
 from nlosrender.capture.plan import replicas_for
 from nlosrender.capture.relative_error import relative_l2_error
 from nlosrender.config.document import Config
+from nlosrender.engine.interface import Budget
 from nlosrender.errors import NlosError, OptionError
 from nlosrender.rendering.outcome import missing_light
 from nlosrender.rendering.stages import bounce_axis, describe_capture, load_scene, prepare, started_backend
 
 if TYPE_CHECKING:
-    from nlosrender.engine.interface import Budget, Engine
+    from nlosrender.engine.interface import Engine
     from nlosrender.engine.launch.pilot_points import Pilot
     from nlosrender.engine.preflight.unsampled_paths import UnsampledPaths
 
 Float64 = NDArray[np.float64]
 GATHER_SHARE = 0.1  # of the target error: an error that may have one sign everywhere adds up over bins and points
-MAX_REPLICAS = 32  # per sensor point: enough to know a variance by
+MAX_REPLICAS = 32  # per sensor point: a variance is then known to sqrt(2 / 31) = 25 %
 
 
 @dataclass(frozen=True)
 class Technique:
-    """A way to render a scene: what it is called, and the keys of ``render`` that ask for it."""
+    """A way to render a scene: its name, and the keys of ``render`` that ask for it."""
 
     name: str
-    changes: Mapping[str, object]
-
-    @property
-    def engine(self) -> object:
-        """Return the engine that has to be taken."""
-        return self.changes["engine"]
+    engine: str
+    hidden_geometry_sampling: bool = True
 
 
 TECHNIQUES = (
-    Technique("path", {"engine": "path", "hidden_geometry_sampling": True}),
-    Technique("path without hidden geometry sampling", {"engine": "path", "hidden_geometry_sampling": False}),
-    Technique("virtual lights", {"engine": "virtual_lights", "hidden_geometry_sampling": True}),
+    Technique("path", "path"),
+    Technique("path without hidden geometry sampling", "path", hidden_geometry_sampling=False),
+    Technique("virtual lights", "virtual_lights"),
 )
 
 
@@ -151,20 +148,18 @@ def check_engines(
     significance: float,
     progress: Callable[[str], None] = lambda technique: None,
 ) -> EngineCheck:
-    """Render a few sensor points by every technique that can, and say how far these are apart; no file is written.
+    """Render a few sensor points by every technique that can, and compare them pair by pair; no file is written.
 
     Parameters
     ----------
-    config
-        A validated configuration; its own goal of samples, error or time is not used.
     points_per_axis
         Sensor points along each side of the grid, spread over it; of exhaustive captures 3 x 3 laser points.
     target_error, time_limit_s
-        When a technique stops: relative L2 error of H, or seconds.
+        When a technique stops: relative L2 error of H, or seconds; in place of the configuration's own goal.
     significance
-        Chance of a false alarm.
+        Chance of a false alarm over all pairs.
     progress
-        Told the name of each technique before it starts.
+        Called with the name of each technique before it starts.
 
     Raises
     ------
@@ -176,7 +171,6 @@ def check_engines(
     if config.capture.is_line_of_sight:
         raise OptionError("check-engines: one technique renders line_of_sight captures; there is nothing to compare.")
     backend = started_backend(config)
-    from nlosrender.engine.interface import Budget
     from nlosrender.engine.launch.pilot_points import pilot_of
 
     built = load_scene(config)
@@ -187,8 +181,9 @@ def check_engines(
     missing: tuple[UnsampledPaths, ...] = ()
     for technique in TECHNIQUES:
         progress(technique.name)
-        changes = {"spp": None, "temporal_kernel_opl": 0.0, **technique.changes}
-        changed = config.model_copy(update={"render": config.render.model_copy(update=changes)})
+        keys = {"engine": technique.engine, "hidden_geometry_sampling": technique.hidden_geometry_sampling}
+        keys |= {"spp": None, "temporal_kernel_opl": 0.0}
+        changed = config.model_copy(update={"render": config.render.model_copy(update=keys)})
         _, engine = prepare(changed, backend, built, capture, time_axis, changes={"replicas": replicas})
         missing = missing or missing_light(engine)
         trials.append(try_technique(technique, engine, pilot, budget))
@@ -209,18 +204,16 @@ def try_technique(technique: Technique, engine: Engine, pilot: Pilot, budget: Bu
         histogram = engine.render(pilot, budget)  # type: ignore[arg-type]  # points that are no rectangle
     except NlosError as error:
         return Trial(technique.name, str(error))
-    options = engine.options
-    attributes: dict[str, object] = {"replicas": options.replicas, "max_bounces": options.bounces.max_bounces}
-    attributes |= {"render_engine": engine.name}
-    seconds, split = time.perf_counter() - begun, options.bounces.split
+    seconds, options = time.perf_counter() - begun, engine.options
+    limit, split = options.bounces.max_bounces, options.bounces.split
+    attributes = {"render_engine": engine.name, "replicas": options.replicas, "max_bounces": limit}
     return Trial(technique.name, None, seconds, histogram.mean, histogram.variance, attributes, split)
 
 
 def compare_trials(trials: Sequence[Trial], bounces: BounceAxis, pilot: Pilot, significance: float) -> list[PairCheck]:
     """Compare every two techniques that rendered; ``significance`` is the chance of a false alarm over all pairs."""
     pairs = list(itertools.combinations([trial for trial in trials if trial.obstacle is None], 2))
-    single = -math.expm1(math.log1p(-significance) / max(len(pairs), 1))
-    return [_compare(*pair, bounces, pilot, single) for pair in pairs]
+    return [_compare(*pair, bounces, pilot, sidak(significance, len(pairs))) for pair in pairs]
 
 
 def _compare(a: Trial, b: Trial, bounces: BounceAxis, pilot: Pilot, significance: float) -> PairCheck:

@@ -6,11 +6,11 @@ import time
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from nlosrender.config.document import Config
 from nlosrender.config.warnings import config_warnings
 from nlosrender.engine.backend.start import scene_memory
+from nlosrender.engine.interface import Budget, OmittedWork
 from nlosrender.files.size_estimate import FileSize
 from nlosrender.readable import readable_duration
 from nlosrender.rendering.outcome import missing_light
@@ -19,10 +19,7 @@ from nlosrender.rendering.render_warnings import expected_file_size, render_warn
 from nlosrender.rendering.stages import set_up_engine, started_backend
 from nlosrender.scene.meshes.mesh_report import MeshReport
 
-if TYPE_CHECKING:
-    from nlosrender.engine.preflight.omitted_work import OmittedWork
-
-MAX_WAIT = 30 * 86_400.0  # s
+MAX_WAIT = 30 * 86_400.0  # s; a longer render is a warning
 
 
 @dataclass(frozen=True)
@@ -71,7 +68,6 @@ def plan_render(config: Config) -> RenderPlan:
     warnings = Warnings(lambda text: None)
     warnings.emit(config_warnings(config))
     backend = started_backend(config)  # chooses LLVM, which has to come before Dr.Jit is imported:
-    from nlosrender.engine.interface import Budget
     from nlosrender.engine.preflight.omitted_work import omitted_work
     from nlosrender.engine.preflight.time_estimate import estimate_render_time
 

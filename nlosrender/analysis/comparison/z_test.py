@@ -178,6 +178,11 @@ def deviations(a: Side, b: Side, per_light_a: Float64, per_light_b: Float64) -> 
     return normal_deviate(t, np.maximum(freedom, MIN_FREEDOM)), stated
 
 
+def sidak(significance: float, n: int) -> float:
+    """Return the significance of each of ``n`` statements that together have ``significance`` (Šidák 1967)."""
+    return -math.expm1(math.log1p(-significance) / max(n, 1))
+
+
 def normal_deviate(t: ArrayLike, freedom: ArrayLike) -> Float64:
     """Return the normal deviate z that is as rare as Student's t (Wallace 1959), from ``MIN_FREEDOM`` on."""
     f = np.asarray(freedom, dtype=np.float64)
@@ -238,8 +243,7 @@ class ZTest:
     @property
     def limit(self) -> float:
         """The z that no statement may exceed."""
-        single = -math.expm1(math.log1p(-self.significance) / max(self.n_statements, 1))
-        return -NormalDist().inv_cdf(single / 2)
+        return -NormalDist().inv_cdf(sidak(self.significance, self.n_statements) / 2)
 
     @property
     def z(self) -> float:
