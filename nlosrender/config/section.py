@@ -20,7 +20,7 @@ from pydantic import (
 )
 from pydantic_core import CoreSchema, core_schema
 
-from nlosrender.config.issues import Wrong, WrongValueRead, did_you_mean, mismatch, one_of, shown, wrong_value
+from nlosrender.config.issues import Wrong, WrongValueRead, did_you_mean, one_of, shown, wrong_value
 from nlosrender.config.vectors import parallel
 from nlosrender.errors import KeyPath, ValidationIssue
 
@@ -35,8 +35,7 @@ class Section(BaseModel):
     # Attribute docstrings feed the JSON Schema and the messages about missing keys: one text, one place.
     model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
 
-    _wrong: dict[str, Wrong] = PrivateAttr(default_factory=dict)
-    _unknown: tuple[str, ...] = PrivateAttr(default=())
+    _wrong: dict[str, Wrong] | None = PrivateAttr(default=None)  # values that are wrong, and those of unknown keys
 
     @classmethod
     def with_defaults(cls, raw: dict[str, Any], validation: ValidationInfo) -> dict[str, Any]:
@@ -56,17 +55,19 @@ class Section(BaseModel):
             if key not in raw and field.is_required():
                 raw[key] = Wrong(ValidationIssue((), f"missing, it is required: {field.description or 'no default'}."))
         section = handler({key: value for key, value in raw.items() if key in fields})
-        section._unknown = tuple(key for key in raw if key not in fields)
-        section._wrong = {key: value for key, value in vars(section).items() if isinstance(value, Wrong)}
-        for key in section._wrong:
+        wrong = {key: value for key, value in vars(section).items() if isinstance(value, Wrong)}
+        for key in wrong:
             del vars(section)[key]
+        wrong |= {key: Wrong() for key in raw if key not in fields}
+        if wrong:
+            section._wrong = wrong
         return section
 
     if not TYPE_CHECKING:  # else every attribute would be known to exist
 
         def __getattr__(self, name: str) -> Any:
             """Tell a rule that it reads a wrong value."""
-            if name in type(self).model_fields:
+            if not name.startswith("_") and name in type(self).model_fields:
                 raise WrongValueRead(name)
             return super().__getattr__(name)
 
@@ -80,10 +81,11 @@ class Section(BaseModel):
         root
             The section in which homes of unknown keys are looked for.
         """
-        for key in type(self).model_fields:
-            value = self._wrong[key] if key in self._wrong else vars(self)[key]
-            yield from issues_in(value, (*path, key), root)
-        for key in self._unknown:
+        wrong = self._wrong or {}
+        for key, value in (vars(self) | wrong).items():
+            if isinstance(value, (Section, Wrong, tuple, dict)):
+                yield from issues_in(value, (*path, key), root)
+        for key in [key for key in wrong if key not in type(self).model_fields]:
             yield ValidationIssue((*path, key), _unknown_key(key, type(self), root), "key")
         for name in _rule_names(type(self)):
             with suppress(WrongValueRead):
@@ -132,45 +134,44 @@ class Guard:
     Parameters
     ----------
     look
-        Takes the value and the annotated type; returns what stands for a wrong value, else None.
+        Takes the value and the names that the annotated type knows: those of a Literal, or the types of a union;
+        returns what stands for a wrong value, else None.
     """
 
-    look: Callable[[Any, Any], Wrong | None]
+    look: Callable[[Any, Sequence[str]], Wrong | None]
 
     def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
         """Return pydantic's schema behind the look."""
+        is_literal = typing.get_origin(source) is typing.Literal
+        known = typing.get_args(source) if is_literal else [*map(type_of, sections_in(source))]
 
         def check(value: Any, inner: core_schema.ValidatorFunctionWrapHandler) -> Any:
-            wrong = value if isinstance(value, Wrong) else self.look(value, source)
+            wrong = value if isinstance(value, Wrong) else self.look(value, known)
             return inner(value) if wrong is None else wrong
 
         return core_schema.no_info_wrap_validator_function(check, handler(source))
 
 
-def _look_for_list(value: Any, _: Any) -> Wrong | None:
+def _look_for_list(value: Any, _: Sequence[str]) -> Wrong | None:
     advice = "Write [] for an empty one." if value is None else ""
     return None if isinstance(value, (list, tuple)) else wrong_value(value, "a list", advice)
 
 
-def _look_for_mapping(value: Any, _: Any) -> Wrong | None:
+def _look_for_mapping(value: Any, _: Sequence[str]) -> Wrong | None:
     return None if isinstance(value, Mapping) else wrong_value(value, "a mapping of keys and values")
 
 
-def _look_for_name(value: Any, literal: Any) -> Wrong | None:
-    known = typing.get_args(literal)
+def _look_for_name(value: Any, known: Sequence[str]) -> Wrong | None:
     return None if value in known else wrong_value(value, one_of(known), did_you_mean(value, known))
 
 
-def _look_for_type(value: Any, union: Any) -> Wrong | None:
-    known = [type_of(section) for section in sections_in(union)]
+def _look_for_type(value: Any, known: Sequence[str]) -> Wrong | None:
     if not isinstance(value, Mapping):
-        return _look_for_mapping(value, union)
+        return _look_for_mapping(value, known)
     if "type" not in value:
         return Wrong(ValidationIssue(("type",), f"missing, need {one_of(known)}."))
-    given = value["type"]
-    if given in known:
-        return None
-    return Wrong(ValidationIssue(("type",), mismatch(given, one_of(known), did_you_mean(given, known))))
+    wrong = _look_for_name(value["type"], known)
+    return None if wrong is None else Wrong(*(issue.below(("type",)) for issue in wrong.issues))
 
 
 LIST, MAPPING = Guard(_look_for_list), Guard(_look_for_mapping)
@@ -179,8 +180,9 @@ BY_TYPE = Guard(_look_for_type)  # of a union of sections
 
 
 def type_of(section: type[BaseModel]) -> str:
-    """Return the ``type`` that a member of a union is told by."""
-    return str(typing.get_args(section.model_fields["type"].annotation)[0])
+    """Return the ``type`` that a member of a union is told by; empty for other sections."""
+    field = section.model_fields.get("type")
+    return str(typing.get_args(field.annotation)[0]) if field else ""
 
 
 def sections_in(annotation: Any) -> list[type[Section]]:

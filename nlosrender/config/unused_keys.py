@@ -37,6 +37,18 @@ _SECTIONS: dict[str, type[Section]] = {"scene": SceneConfig, "capture": CaptureC
 _PLACING = ("center", "translate", "rotate_deg", "scale")
 
 
+def fields_by_type(choice: Any) -> dict[str, set[str]]:
+    """Return the keys of every member of a union of sections, by its ``type``."""
+    return {type_of(member): {*member.model_fields} for member in sections_in(typing.get_args(choice)[0])}
+
+
+_FIELDS = {
+    "relay_wall": fields_by_type(RelayWallConfig),
+    "hidden_geometry": fields_by_type(HiddenItemConfig),
+    "emitters": fields_by_type(EmitterConfig),
+}
+
+
 def without_unused_keys(raw: Mapping[str, Any]) -> tuple[dict[str, Any], list[str]]:
     """Return the values of a config that have an effect, and a sentence for each choice that leaves some without.
 
@@ -49,11 +61,11 @@ def without_unused_keys(raw: Mapping[str, Any]) -> tuple[dict[str, Any], list[st
     notes = [*_by_scan_type(kept)]
     scene = kept.get("scene")
     if isinstance(scene, dict):
-        notes += _by_type(scene.get("relay_wall"), RelayWallConfig, "scene.relay_wall")
-        for key, choice in (("hidden_geometry", HiddenItemConfig), ("emitters", EmitterConfig)):
+        notes += _by_type(scene.get("relay_wall"), _FIELDS["relay_wall"], "scene.relay_wall")
+        for key in ("hidden_geometry", "emitters"):
             items = scene.get(key)
             for index, item in enumerate(items if isinstance(items, list) else ()):
-                notes += _by_type(item, choice, f"scene.{key}.{index}")
+                notes += _by_type(item, _FIELDS[key], f"scene.{key}.{index}")
     return kept, notes
 
 
@@ -88,9 +100,8 @@ def _is_no_film(grid: Any, camera: Any) -> bool:
     return given != {"nx": camera.get("width"), "ny": camera.get("height")}
 
 
-def _by_type(item: Any, choice: Any, path: str) -> Iterator[str]:
+def _by_type(item: Any, fields: Mapping[str, set[str]], path: str) -> Iterator[str]:
     """Take the keys of other types of walls, items and emitters out."""
-    fields = fields_by_type(choice)
     chosen = item.get("type") if isinstance(item, dict) else None
     if not isinstance(chosen, str) or chosen not in fields:
         return
@@ -98,11 +109,6 @@ def _by_type(item: Any, choice: Any, path: str) -> Iterator[str]:
     gone = [key for key in item if key in others and (item[key] is None or key not in _PLACING)]
     unused = [f"{path}.{key}" for key in gone if item.pop(key) is not None]
     yield from _note(unused, f"{path}.type: {chosen}", [name for name in fields if not fields[name].isdisjoint(gone)])
-
-
-def fields_by_type(choice: Any) -> dict[str, set[str]]:
-    """Return the keys of every member of a union of sections, by its ``type``."""
-    return {type_of(member): {*member.model_fields} for member in sections_in(typing.get_args(choice)[0])}
 
 
 def _note(unused: list[str], choice: str, owners: list[str]) -> Iterator[str]:
