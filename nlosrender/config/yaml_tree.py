@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import copy
 import dataclasses
+import itertools
 import math
 import re
 from collections.abc import Iterator
@@ -156,6 +157,7 @@ def read_document(text: str, source: str, folder: Path = Path()) -> Document:
     try:
         node = _Composer(text).get_single_node()
         if node is not None:
+            _measured(node, {})
             document.places[()] = Place(_at(node, source), _at(node, source))
             document.tree = _Builder(document).build(node, ())
     except yaml.MarkedYAMLError as error:
@@ -178,38 +180,43 @@ def _at(node: Node, source: str) -> str:
     return f"{source}:{node.start_mark.line + 1}:{node.start_mark.column + 1}"
 
 
+def _measured(node: Node, known: dict[int, tuple[int, float]]) -> tuple[int, float]:
+    """Return nodes and levels of a node with every alias written out; each node is looked at once, in milliseconds.
+
+    Raises
+    ------
+    yaml.MarkedYAMLError
+        They are too many.
+    """
+    if id(node) not in known:
+        known[id(node)] = (1, math.inf)  # until it is measured: an alias of it lies inside it
+        children = node.value if isinstance(node, SequenceNode) else []
+        if isinstance(node, MappingNode):
+            children = itertools.chain.from_iterable(node.value)
+        sizes = [(0, 0.0), *(_measured(child, known) for child in children)]
+        n_nodes, levels = 1 + sum(n for n, _ in sizes), 1 + max(below for _, below in sizes)
+        if n_nodes > MAX_NODES or levels > MAX_DEPTH:
+            message = f"aliases grow it beyond {MAX_NODES} values or {MAX_DEPTH} levels"
+            message = "an alias inside its own anchor never ends" if levels == math.inf else message
+            raise yaml.MarkedYAMLError(problem=message, problem_mark=node.start_mark)
+        known[id(node)] = (n_nodes, levels)
+    return known[id(node)]
+
+
 class _Builder:
     """Turns nodes into values, writing aliases out, and notes places and issues in the document."""
 
     def __init__(self, document: Document):
         self.document = document
-        self._open: list[Node] = []  # nodes that are being built, each inside the one before
-        self._n_nodes = 0  # keys and values so far
 
     def build(self, node: Node, path: KeyPath) -> Any:
-        """Return the value of ``node`` at ``path``.
-
-        Raises
-        ------
-        yaml.MarkedYAMLError
-            Aliases have made it too large.
-        """
-        self._n_nodes += 1
-        if any(node is outer for outer in self._open):
-            message = "an alias inside its own anchor never ends"
-            raise yaml.MarkedYAMLError(problem=message, problem_mark=node.start_mark)
-        if self._n_nodes > MAX_NODES or len(self._open) == MAX_DEPTH:
-            message = f"aliases grow it beyond {MAX_NODES} values or {MAX_DEPTH} levels"
-            raise yaml.MarkedYAMLError(problem=message, problem_mark=node.start_mark)
+        """Return the value of ``node`` at ``path``."""
         if node.tag not in _KNOWN_TAGS:
             known = "only plain values, lists and mappings"
             return self._unread(node, path, f"tag {node.tag.replace(_TAG, '!!')} is not allowed, {known}.")
         if isinstance(node, ScalarNode):
             return self._scalar(node, path)
-        self._open.append(node)
-        value = self._list(node, path) if isinstance(node, SequenceNode) else self._mapping(node, path)
-        self._open.pop()
-        return value
+        return self._list(node, path) if isinstance(node, SequenceNode) else self._mapping(node, path)
 
     def _list(self, node: Node, path: KeyPath) -> list[Any]:
         items = []
@@ -223,7 +230,6 @@ class _Builder:
         values: dict[str, Any] = {}
         source = self.document.source
         for key_node, value_node in node.value:
-            self._n_nodes += 1
             if _is_merge(key_node):
                 continue
             if not isinstance(key_node, ScalarNode) or key_node.tag != _TAG + "str":
