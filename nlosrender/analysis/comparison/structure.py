@@ -13,7 +13,7 @@ from nlosrender.files.reading.reader import StoredCapture
 from nlosrender.files.reading.stored_header import StoredHeader
 
 WIDTH_TOLERANCE = 1e-6  # relative; a float32 deltaT is off by 6e-8
-# attributes that change what a sample means; files by other writers may lack them, and then say nothing
+# attributes that change what a sample means; files by other writers may lack them
 MEANINGS = ("frame", "account_first_and_last_bounces", "channels", "split_bounces")
 
 
@@ -46,21 +46,18 @@ def structure_differences(
 
 
 def _header_differences(a: StoredHeader, b: StoredHeader, alignment: Alignment) -> Iterator[StructureDifference]:
-    if a.scan_type != b.scan_type:
-        yield StructureDifference("scan type", a.scan_type, b.scan_type)
-    names = {"channel": "channels", "bin": "bins", "sensor": "sensor points", "laser": "laser points"}
-    sizes = [
-        _lengths(a, alignment.sensors.turned_shape, alignment.lasers.turned_shape),
-        _lengths(b, b.sensor_grid, b.laser_grid),
-    ]
     moved_in_time = bool(alignment.lead or alignment.reference_lead)
-    for axis, name in names.items():
-        if sizes[0][axis] != sizes[1][axis] and not (axis == "bin" and moved_in_time):
-            yield StructureDifference(name, sizes[0][axis], sizes[1][axis])
-    if a.sizes["bounce"] != b.sizes["bounce"]:
-        yield StructureDifference("bounce axis", str(a.sizes["bounce"]), str(b.sizes["bounce"]))
-    elif a.first_bounce != b.first_bounce:
-        yield StructureDifference("bounce of index 0", str(a.first_bounce), str(b.first_bounce))
+    same_axis = a.sizes["bounce"] == b.sizes["bounce"]
+    pairs: dict[str, tuple[object, object]] = {
+        "scan type": (a.scan_type, b.scan_type),
+        "channels": (a.sizes["channel"], b.sizes["channel"]),
+        "bins": (b.n_bins if moved_in_time else a.n_bins, b.n_bins),
+        "sensor points": (_size(alignment.sensors.turned_shape), _size(b.sensor_grid)),
+        "laser points": (_size(alignment.lasers.turned_shape), _size(b.laser_grid)),
+        "bounce axis": (a.sizes["bounce"], b.sizes["bounce"]),
+        "bounce of index 0": (a.first_bounce if same_axis else b.first_bounce, b.first_bounce),
+    }
+    yield from (StructureDifference(name, str(x), str(y)) for name, (x, y) in pairs.items() if x != y)
     if abs(a.bin_width_opl - b.bin_width_opl) > WIDTH_TOLERANCE * b.bin_width_opl:
         yield StructureDifference("bin width", f"{a.bin_width_opl:.9g} m", f"{b.bin_width_opl:.9g} m")
     if not moved_in_time and abs(a.start_opl - b.start_opl) > START_TOLERANCE * b.bin_width_opl:
@@ -71,17 +68,12 @@ def _header_differences(a: StoredHeader, b: StoredHeader, alignment: Alignment) 
             yield StructureDifference(name, str(values[0]), str(values[1]))
 
 
-def _lengths(header: StoredHeader, sensors: tuple[int, int], lasers: tuple[int, int]) -> dict[str, str]:
-    return {
-        "channel": str(header.sizes["channel"]),
-        "bin": str(header.n_bins),
-        "sensor": f"{sensors[1]} x {sensors[0]}",
-        "laser": f"{lasers[1]} x {lasers[0]}",
-    }
+def _size(grid: tuple[int, int]) -> str:
+    return f"{grid[1]} x {grid[0]}"
 
 
 def _grid_differences(a: StoredCapture, b: StoredCapture, alignment: Alignment) -> Iterator[StructureDifference]:
-    """Compare where laser, sensor and their points are; what one of the files does not say is passed over."""
+    """Compare where laser, sensor and their points are, as far as both files have them."""
     for name in ("sensor_position", "laser_position"):
         points = [getattr(capture.header, name) for capture in (a, b)]
         if None not in points and apart(np.array(points[0]), np.array(points[1])):
