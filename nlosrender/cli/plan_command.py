@@ -18,8 +18,7 @@ if TYPE_CHECKING:
     from nlosrender.config.sweep_load import Sweep
 
 PILOTS = 3  # captures of a sweep whose cost is measured: the first, the last and those between
-NOTABLE_BYTES = 50e6  # of a scene's triangles
-KEEP_SECONDS = 30.0  # units that take longer are kept on the way, see ``rendering.item_in_flight``
+NOTABLE_BYTES = 50e6  # of a scene's triangles: less is lost in the program's own 400 MB
 
 
 def plan(config: ConfigFile, overrides: Overrides = None, as_json: AsJson = False) -> None:
@@ -60,11 +59,10 @@ def _rows(plan: RenderPlan) -> Iterator[tuple[str, str]]:
     yield from (("mesh", line) for line in mesh_lines(plan.meshes))
     start, end = plan.window_opl
     yield "time", f"{plan.n_bins} bins of {plan.bin_width_opl:g} m, from {start:.6g} to {end:.6g} m"
-    plural = "" if plan.batches == 1 else "es"
-    beside = ""
-    if plan.scene_bytes >= NOTABLE_BYTES:
-        beside = f", and about {readable_size(plan.scene_bytes)} for the triangles"
-    yield "memory", f"{plan.batches} batch{plural} of up to {readable_size(plan.bytes_per_batch)}{beside}"
+    batches = "1 batch" if plan.batches == 1 else f"{plan.batches} batches"
+    is_large = plan.scene_bytes >= NOTABLE_BYTES
+    triangles = f", and about {readable_size(plan.scene_bytes)} for the triangles" if is_large else ""
+    yield "memory", f"{batches} of up to {readable_size(plan.bytes_per_batch)}{triangles}"
     size = plan.file
     yield (
         "file",
@@ -83,9 +81,11 @@ def _rows(plan: RenderPlan) -> Iterator[tuple[str, str]]:
 
 
 def _units(plan: RenderPlan) -> str:
+    from nlosrender.rendering.item_in_flight import SAVING
+
     seconds = plan.seconds_per_unit or 0.0
     count = "1 unit" if plan.units == 1 else f"{plan.units} units"
-    if seconds < KEEP_SECONDS:
+    if seconds < SAVING.seconds:
         on_stop = "SIGTERM ends the render with the one in flight, or seconds later; SIGKILL costs that one"
     else:
         on_stop = "SIGTERM ends the render within seconds and keeps the one in flight; SIGKILL costs about a minute"
@@ -94,10 +94,8 @@ def _units(plan: RenderPlan) -> str:
 
 def _scan(plan: RenderPlan) -> str:
     points = "pixels" if plan.scan_type == LINE_OF_SIGHT else "sensor points"
-    sensors = "{} x {} ".format(*plan.sensor_grid) + points
-    if plan.scan_type != "exhaustive":
-        return f"{plan.scan_type}, {sensors}"
-    return "exhaustive, {}, {} x {} laser points".format(sensors, *plan.laser_grid)
+    lasers = ", {} x {} laser points".format(*plan.laser_grid) if plan.scan_type == "exhaustive" else ""
+    return f"{plan.scan_type}, {plan.sensor_grid[0]} x {plan.sensor_grid[1]} {points}{lasers}"
 
 
 def _plan_all(sweep: Sweep, as_json: bool) -> None:
