@@ -38,7 +38,7 @@ output: {path: z.hdf5}
 ITEM = "    - {type: rectangle, width: 1.0, height: 0.5, center: [0, 0, 0.8]}\n"
 WALL_BSDF = "{type: diffuse, reflectance: 0.9}"
 WALL = BASE[BASE.index("    type: rectangle") : BASE.index("  hidden_geometry")]
-MARK = "§"  # stands before the character whose line and column the problem has to name
+MARK = "§"  # stands before the character whose line and column the issue has to name
 
 
 def item(text: str) -> tuple[str, str]:
@@ -278,7 +278,7 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def problems_of(text: str, folder: Path, overrides: tuple[str, ...] = ()) -> tuple[ValidationIssue, ...]:
+def issues_of(text: str, folder: Path, overrides: tuple[str, ...] = ()) -> tuple[ValidationIssue, ...]:
     with pytest.raises(ConfigError) as caught:
         parse_config(text, "z.yaml", folder, overrides)
     assert caught.value.exit_code == 3
@@ -294,18 +294,18 @@ def test_the_base_is_sound(folder: Path) -> None:
 def test_one_mistake_is_told_once_with_place_key_and_reason(
     old: str, new: str, key: str, message: str, folder: Path
 ) -> None:
-    """One mistake gives one problem: its line and column, its key, the value found and what is allowed."""
+    """One mistake gives one issue: its line and column, its key, the value found and what is allowed."""
     assert BASE.count(old) >= 1
     marked = BASE.replace(old, new, 1)
     if key == "capture.laser_spot_radius":
         marked = marked.replace("capture:\n", "capture:\n  laser_spot_radius: §0.1\n")
-    (problem,) = problems_of(marked.replace(MARK, ""), folder)
-    assert problem.key == key
-    assert re.search(message, problem.message, re.IGNORECASE), problem.message
+    (issue,) = issues_of(marked.replace(MARK, ""), folder)
+    assert issue.key == key
+    assert re.search(message, issue.message, re.IGNORECASE), issue.message
     if MARK in marked:
         before = marked[: marked.index(MARK)]
         line, column = before.count("\n") + 1, len(before) - before.rfind("\n")
-        assert problem.place == f"z.yaml:{line}:{column}"
+        assert issue.place == f"z.yaml:{line}:{column}"
 
 
 def test_the_table_is_long_enough() -> None:
@@ -324,8 +324,8 @@ def test_the_table_is_long_enough() -> None:
 )
 def test_a_missing_key_is_placed_at_its_mapping(removed: str, place: str, key: str, folder: Path) -> None:
     """A key that is not there is told at the key (or list item) that holds the mapping it belongs in."""
-    (problem,) = problems_of(BASE.replace(removed, ""), folder)
-    assert (problem.place, problem.key) == (place, key)
+    (issue,) = issues_of(BASE.replace(removed, ""), folder)
+    assert (issue.place, issue.key) == (place, key)
 
 
 def test_all_mistakes_come_at_once_in_reading_order(folder: Path) -> None:
@@ -345,8 +345,8 @@ def test_all_mistakes_come_at_once_in_reading_order(folder: Path) -> None:
     for old, new in edits.items():
         assert old in text
         text = text.replace(old, new, 1)
-    problems = problems_of(text, folder)
-    assert [problem.key for problem in problems] == [
+    issues = issues_of(text, folder)
+    assert [issue.key for issue in issues] == [
         "scene.relay_wall.widht",
         "scene.relay_wall.bsdf.reflectance",
         "scene.hidden_geometry.1.text",
@@ -358,15 +358,29 @@ def test_all_mistakes_come_at_once_in_reading_order(folder: Path) -> None:
         "render.target_error",
         "output.path",
     ]
-    lines = [int(problem.place.split(":")[1]) for problem in problems]
+    lines = [int(issue.place.split(":")[1]) for issue in issues]
     assert lines == sorted(lines)
 
 
 def test_a_wrong_value_gives_no_second_complaint_by_a_rule_that_reads_it(folder: Path) -> None:
     """A broken wall size says nothing about the grids on it."""
     text = BASE.replace("width: 2.0", "width: wide").replace("nx: 3, ny: 5", "nx: 3, ny: 5, width: 500")
-    (problem,) = problems_of(text, folder)
-    assert problem.key == "scene.relay_wall.width"
+    (issue,) = issues_of(text, folder)
+    assert issue.key == "scene.relay_wall.width"
+
+
+def test_one_wrong_item_hides_no_mistake_of_the_others(folder: Path) -> None:
+    """Items without a known type, and keys that are unknown, leave the rules between the others in force."""
+    text = BASE.replace(ITEM, ITEM + "    - {type: shpere}\n    - {type: room, size: [1, 1, 1], name: letters-3}\n")
+    text = text.replace(WALL, "    {type: cylinder, radius: 1, height: 1, widht: 2}\n")
+    text = text.replace("nx: 3", "nx: 3, height: 2")
+    assert [issue.key for issue in issues_of(text, folder)] == [
+        "scene.relay_wall.widht",
+        "scene.hidden_geometry.1.type",
+        "scene.hidden_geometry.2.type",
+        "scene.hidden_geometry.3.name",
+        "capture.sensor_grid.height",
+    ]
 
 
 @pytest.mark.parametrize(
@@ -375,9 +389,9 @@ def test_a_wrong_value_gives_no_second_complaint_by_a_rule_that_reads_it(folder:
 )
 def test_a_file_that_is_no_mapping_is_refused(text: str, message: str, folder: Path) -> None:
     """The root of a config is a mapping, and an empty file says which keys it needs."""
-    (problem,) = problems_of(text, folder)
-    assert re.search(message, problem.message)
-    assert "scene, capture" in problem.message
+    (issue,) = issues_of(text, folder)
+    assert re.search(message, issue.message)
+    assert "scene, capture" in issue.message
 
 
 @pytest.mark.parametrize(
@@ -397,7 +411,7 @@ def test_a_file_that_is_no_mapping_is_refused(text: str, message: str, folder: P
 def test_a_file_that_cannot_be_read_is_explained(
     name: str, content: bytes | None, message: str, tmp_path: Path
 ) -> None:
-    """A missing, unreadable, foreign or huge file is one problem, never a traceback."""
+    """A missing, unreadable, foreign or huge file is one issue, never a traceback."""
     path = tmp_path / name
     if content is not None:
         path.write_bytes(content)

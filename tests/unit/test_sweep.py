@@ -194,6 +194,7 @@ def test_values_that_are_none(value: Any, message: str) -> None:
         {"uniform": [2, 1]},
         {"uniform": ["a", 2]},
         {"uniform": 3},
+        {"integers": 3},
         {"integers": [1.5, 2]},
         {"log_uniform": [0, 1]},
         {"choice": []},
