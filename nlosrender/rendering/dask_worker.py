@@ -26,7 +26,7 @@ from nlosrender.rendering.stages import set_up_engine
 from nlosrender.rendering.work_items import FinishedItem, render_timed
 
 if TYPE_CHECKING:
-    from nlosrender.rendering.work_items import Engine
+    from nlosrender.engine.interface import Engine
 
 
 @dataclass(frozen=True)

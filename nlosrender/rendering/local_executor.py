@@ -18,8 +18,7 @@ from nlosrender.rendering.render_report import Monitor, Standing
 from nlosrender.rendering.work_items import ItemWriter, render_timed
 
 if TYPE_CHECKING:
-    from nlosrender.engine.interface import Budget
-    from nlosrender.rendering.work_items import Engine
+    from nlosrender.engine.interface import Budget, Engine
 
 
 @contextmanager

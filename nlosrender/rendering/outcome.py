@@ -9,9 +9,9 @@ from nlosrender.errors import ConfigError, ValidationIssue
 from nlosrender.files.capture_results import SummedCapture
 
 if TYPE_CHECKING:
+    from nlosrender.engine.interface import Engine
     from nlosrender.engine.preflight.unsampled_paths import UnsampledPaths
     from nlosrender.files.sums import Sums
-    from nlosrender.rendering.work_items import Engine
 
 MISSED_BY = 1.25  # tolerance of the target: the error estimate has an error itself
 

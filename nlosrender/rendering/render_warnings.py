@@ -16,7 +16,7 @@ from nlosrender.files.size_estimate import FileSize, disk_warnings, forecast_siz
 from nlosrender.rendering.process_layout import ONE_PROCESS, ProcessLayout
 
 if TYPE_CHECKING:
-    from nlosrender.rendering.work_items import Engine
+    from nlosrender.engine.interface import Engine
 
 
 def render_warnings(

@@ -27,8 +27,7 @@ from nlosrender.scene.walls.wall import RelayWall
 from nlosrender.scene.walls.wall_from_config import relay_wall_from_config
 
 if TYPE_CHECKING:
-    from nlosrender.engine.interface import Budget
-    from nlosrender.rendering.work_items import Engine
+    from nlosrender.engine.interface import Budget, Engine
     from nlosrender.scene.build import BuiltScene
     from nlosrender.scene.view import BuiltView
 

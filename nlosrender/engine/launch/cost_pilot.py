@@ -12,7 +12,8 @@ from dataclasses import replace
 
 from nlosrender.capture.bounces import FIRST_BOUNCE, LINE_OF_SIGHT, THIRD_BOUNCE, BounceAxis
 from nlosrender.capture.grids import Capture
-from nlosrender.capture.plan import Batch, Plan, Tile
+from nlosrender.capture.plan import Batch, Plan
+from nlosrender.capture.tile import Tile
 from nlosrender.engine.interface import Budget, Engine, PilotSeconds, TimeEstimate
 from nlosrender.engine.launch.accumulation import refuse_many_sums
 from nlosrender.engine.launch.histogram import Histogram, HistogramShape

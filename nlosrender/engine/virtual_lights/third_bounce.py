@@ -11,9 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nlosrender.capture.plan import Batch
+from nlosrender.capture.relative_error import relative_l2_error
 from nlosrender.engine.launch.device_arrays import on_device
 from nlosrender.engine.launch.device_capture import DeviceCapture
-from nlosrender.engine.launch.histogram import HistogramShape, relative_l2_error
+from nlosrender.engine.launch.histogram import HistogramShape
 from nlosrender.engine.launch.launch_params import LaunchParams
 from nlosrender.engine.launch.passes import Passes, Snapshot
 from nlosrender.engine.launch.pilot_points import Pilot
