@@ -1,0 +1,89 @@
+"""What docs/ says of the code is in the code."""
+
+from __future__ import annotations
+
+import ast
+import re
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+PACKAGE = ROOT / "nlosrender"
+PAGES = sorted([*ROOT.glob("docs/*.md"), ROOT / "README.md", ROOT / "CONTRIBUTING.md"])
+OF_CODE = [ROOT / "docs" / name for name in ("virtual-lights.md", "architecture.md")]
+MODULES = {path: ast.parse(path.read_text()) for path in PACKAGE.rglob("*.py")}
+ENGINE = PACKAGE / "engine"
+FOLDERS = (ROOT, PACKAGE, PACKAGE / "rendering", ENGINE, ENGINE / "path", ENGINE / "virtual_lights")
+FOREIGN = {"bsdf.eval", "wall_bsdf.eval"}  # Mitsuba's
+WORDS = {"confocal", "auto", "target_missed", "seconds", "execution_time"}  # of configurations and files
+
+
+def defined_in(tree: ast.AST) -> set[str]:
+    """Return the names that a tree defines: classes, functions, arguments, variables, attributes."""
+    names = set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.ClassDef | ast.FunctionDef):
+            names.add(node.name)
+        elif isinstance(node, ast.arg):
+            names.add(node.arg)
+        elif isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store):
+            names.add(node.id)
+        elif isinstance(node, ast.Attribute) and isinstance(node.ctx, ast.Store):
+            names.add(node.attr)
+    return names
+
+
+NAMES = set().union(*(defined_in(tree) for tree in MODULES.values())) | {path.stem for path in MODULES}
+CLASSES: dict[str, set[str]] = {}
+for tree in MODULES.values():
+    for node in ast.walk(tree):
+        if isinstance(node, ast.ClassDef):
+            CLASSES.setdefault(node.name, set()).update(defined_in(node))
+
+
+def code_spans(page: Path) -> list[str]:
+    """Return what stands in backquotes, blocks of code left out."""
+    return re.findall(r"`([^`\n]+)`", re.sub(r"```.*?```", "", page.read_text(), flags=re.DOTALL))
+
+
+@pytest.mark.parametrize("page", OF_CODE, ids=lambda page: page.name)
+def test_every_name_in_backquotes_is_defined_in_the_code(page: Path) -> None:
+    """A class, function, argument, attribute or constant; of ``Class.attribute`` the class has the attribute."""
+    missing = []
+    for span in code_spans(page):
+        if (
+            span in FOREIGN | WORDS
+            or not re.fullmatch(r"\.?[A-Za-z_]\w*(\.[A-Za-z_]\w*)*", span)
+            or span.endswith(".py")
+        ):
+            continue
+        first, *rest = span.lstrip(".").split(".")
+        if rest and first in CLASSES:
+            found = rest[0] in CLASSES[first]
+        else:
+            found = all(name in NAMES for name in (first, *rest))
+        if not found:
+            missing.append(span)
+    assert not missing
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_every_path_on_a_page_exists(page: Path) -> None:
+    """Modules, pages, pictures, configurations and folders; links are relative to the page."""
+    text = re.sub(r"```.*?```", "", page.read_text(), flags=re.DOTALL)
+    links = {link.split("#")[0] for link in re.findall(r"\]\(([^)#]+)\)", text)}
+    assert not {link for link in links if not (page.parent / link).exists()}
+    if page in OF_CODE:
+        paths = set(re.findall(r"(?<![\w/])[a-z_][\w/-]*\.(?:py|yaml)\b", text))
+        paths |= {span for span in code_spans(page) if re.fullmatch(r"[\w/]+/", span)}
+        assert not {path for path in paths if not any((folder / path).exists() for folder in FOLDERS)}
+
+
+@pytest.mark.parametrize("page", OF_CODE, ids=lambda page: page.name)
+def test_no_section_that_the_code_cites_is_missing(page: Path) -> None:
+    """``docs/virtual-lights.md, 2.3`` in a docstring leads to a heading with that number."""
+    headings = set(re.findall(r"^#+ ([\d.]+) ", page.read_text(), flags=re.MULTILINE))
+    cited = re.compile(rf"docs/{re.escape(page.name)}, (\d+(?:\.\d+)?)")
+    found = {number for path in MODULES for number in cited.findall(path.read_text())}
+    assert found <= headings
