@@ -50,33 +50,25 @@ def lattice_of(points: Float64) -> Lattice:
         They are not equally spaced rows and columns along x and y.
     """
     rows, columns = points.shape[:2]
-    x, y = _axis(points[..., 0].mean(axis=0)), _axis(points[..., 1].mean(axis=1))
-    steps = [axis.step for axis in (x, y) if axis.count > 1]
-    fallback = abs(steps[0]) if steps else 1.0  # of a single row or column: any step does
-    flips = tuple(number for number, axis in enumerate((y, x)) if axis.step < 0)
-    x, y = (_ascending(axis, fallback) for axis in (x, y))
+    x, y = points[..., 0].mean(axis=0), points[..., 1].mean(axis=1)
+    flips = tuple(number for number, along in enumerate((y, x)) if along[-1] < along[0])
+    steps = [abs(float(along[-1] - along[0])) / (len(along) - 1) for along in (x, y) if len(along) > 1]
+    fallback = steps[0] if steps else 1.0  # of a single row or column: any step does
+    x_axis, y_axis = _ascending(x, fallback), _ascending(y, fallback)
     height = float(points[..., 2].mean())
-    ordered = np.flip(points, axis=flips) if flips else points
-    expected = np.stack(np.broadcast_arrays(x.coordinates(), y.coordinates()[:, None], height), axis=-1)
-    worst = float(np.abs(ordered - expected).max())
-    if worst > MAX_IRREGULARITY * min(x.step, y.step):
+    places = np.broadcast_arrays(x_axis.coordinates(), y_axis.coordinates()[:, None], height)
+    worst = float(np.abs(np.flip(points, axis=flips) - np.stack(places, axis=-1)).max())
+    if worst > MAX_IRREGULARITY * min(x_axis.step, y_axis.step):
         raise FileError(
             f"the {rows} x {columns} points on the wall are not equally spaced along its axes (one is {worst:.3g} m "
             "off), which phasor fields by convolution need. Use --method backprojection."
         )
-    return Lattice(x, y, height, flips)
+    return Lattice(x_axis, y_axis, height, flips)
 
 
-def _axis(coordinates: Float64) -> Axis:
-    count = len(coordinates)
-    step = float(coordinates[-1] - coordinates[0]) / (count - 1) if count > 1 else 0.0
-    return Axis(float(coordinates[0]), step, count)
-
-
-def _ascending(axis: Axis, fallback: float) -> Axis:
-    if axis.step < 0:
-        return Axis(axis.first + axis.step * (axis.count - 1), -axis.step, axis.count)
-    return axis if axis.step > 0 else Axis(axis.first, fallback, axis.count)
+def _ascending(coordinates: Float64, fallback: float) -> Axis:
+    first, last = sorted((float(coordinates[0]), float(coordinates[-1])))
+    return Axis(first, (last - first) / max(len(coordinates) - 1, 1) or fallback, len(coordinates))
 
 
 def interpolation_matrix(coordinates: Float64, first: float, step: float, count: int) -> NDArray[np.float32]:
