@@ -12,9 +12,8 @@ from nlosrender.engine.interface import Engine
 from nlosrender.engine.launch.device_capture import DeviceCapture, RenderOptions
 from nlosrender.engine.line_of_sight.engine import LineOfSightEngine
 from nlosrender.engine.path.engine import PathEngine
-from nlosrender.engine.virtual_lights.elements.tessellator import MAX_PATCHES, can_tessellate, wall_sees_itself
+from nlosrender.engine.virtual_lights.elements.tessellator import can_tessellate, wall_sees_itself
 from nlosrender.engine.virtual_lights.engine import VirtualLightEngine, is_lambertian
-from nlosrender.engine.virtual_lights.third_bounce import COARSEST_SCALE
 from nlosrender.scene.build import BuiltScene
 from nlosrender.scene.view import BuiltView
 
@@ -58,7 +57,7 @@ def choose_engine(
     if engine.tessellator.nearest_round < TOUCHING:
         reason = "a round surface, which is cut into patches of one size, touches a laser or sensor point"
         return PathEngine(device, reason=reason)
-    if engine.tessellator.n_round_elements > MAX_PATCHES:
+    if engine.tessellator.n_round_elements > engine.tessellator.tuning.max_patches:
         reason = "a round surface is so narrow that it would be cut into millions of patches"
         return PathEngine(device, reason=reason)
     if render.engine == "virtual_lights":
@@ -78,8 +77,8 @@ def _obstacle_close_by(engine: VirtualLightEngine, capture: Capture) -> str | No
         return None
     if capture.scan_type == "confocal":
         return "hidden geometry touches a laser or sensor point"
-    most = MAX_PATCHES if tessellator.nearest_to_laser < TOUCHING else MAX_NEAR_PATCHES
-    if tessellator.count(COARSEST_SCALE) > most:
+    most = tessellator.tuning.max_patches if tessellator.nearest_to_laser < TOUCHING else MAX_NEAR_PATCHES
+    if tessellator.count(tessellator.tuning.coarsest_scale) > most:
         return "hidden geometry touches so many points that paths cost less"
     return None
 

@@ -90,12 +90,9 @@ def test_other_lasers_light_patches_anew(lighting: list[int]) -> None:
     assert len(lighting) == len(BATCHES["exhaustive"])
 
 
-def test_many_patches_are_not_kept(monkeypatch: pytest.MonkeyPatch, lighting: list[int]) -> None:
+def test_many_patches_are_not_kept(lighting: list[int]) -> None:
     """They would take more memory than the plan counts."""
-    from nlosrender.engine.virtual_lights import third_bounce
-
-    monkeypatch.setattr(third_bounce, "MOST_KEPT", 10)
-    third = gather_of("single")
+    third = gather_of("single", max_kept_patches=10)
     for batch in BATCHES["single"]:
         third.gather(batch, 0.5)
     assert len(lighting) == 2

@@ -29,7 +29,7 @@ class ScheduleTuning:
     # Pairs of a path and a laser point in the first launch, whose speed is not known: 1 s at the 8e6 pairs per second
     # of the slowest scene of the benchmark (room.yaml on 2 cores).
     max_first_pairs: int = 2**23
-    # The same of the gathers: pairs of a patch, and of a contribution of a VPL, with a sensor and a laser point.
+    # The same of the gathers: a patch (1 s at 30 ns) or a contribution of a VPL (1 s at 15 ns), sensor and laser point.
     first_gather_pairs: int = 2**25
     first_vpl_pairs: int = 2**26
     # Share of the target error aimed at: the pilot's own estimate scatters by 5 to 10 % (256 points, 2 replicas).

@@ -12,22 +12,8 @@ from dataclasses import replace
 from nlosrender.engine.interface import Budget
 from nlosrender.engine.launch.pilot_points import Pilot, pilot_of
 from nlosrender.engine.launch.schedule import DEFAULT_TARGET
-from nlosrender.engine.virtual_lights.third_bounce import COARSEST_SCALE, REFINEMENT, ThirdBounce, estimated_error
-from nlosrender.engine.virtual_lights.vpls.rounds import (
-    REST_OF_MANY,
-    SHARES_OF_THIRD,
-    SQUARES,
-    VplBounces,
-    rounds_needed,
-)
-
-# Shares of the target error: squares add up to less than 1, for what a pilot cannot know.
-THIRD_ALONE = 0.85
-THIRD_OF_MANY = 0.35  # patches are cheaper than paths
-PILOT_ERROR = 4.0  # times the target: when a pilot has seen enough to say how many rounds are needed
-MAX_PILOT_ROUNDS = 16
-PILOT_LANES = 2048
-FEW_SENSORS = 8  # along each side of a pilot's grid: the error of patches has no noise
+from nlosrender.engine.virtual_lights.third_bounce import ThirdBounce, estimated_error
+from nlosrender.engine.virtual_lights.vpls.rounds import VplBounces
 
 
 def calibrated_lights(third: ThirdBounce, further: VplBounces | None, budget: Budget, *, is_alone: bool) -> Budget:
@@ -36,29 +22,29 @@ def calibrated_lights(third: ThirdBounce, further: VplBounces | None, budget: Bu
     ``is_alone``: whether the third bounce is the highest that is asked for. ``further`` is None there, and where paths
     give the further bounces.
     """
-    device = third.device
+    device, tuning = third.device, third.tuning
     pilot, target = pilot_of(device.capture), budget.target_error or DEFAULT_TARGET
-    share = THIRD_ALONE if is_alone else THIRD_OF_MANY
+    share = tuning.third_share_alone if is_alone else tuning.third_share_of_many
     if budget.time_limit_s is not None:
         return replace(budget, patch_scale=_patch_scale_in_time(third, budget.time_limit_s, share * target))
     if further is not None:
-        share = SHARES_OF_THIRD[0]
+        share = tuning.third_shares[0]
     few = _pilot_of_patches(third, pilot)
     patch_scale, gathered = third.calibrate(few, share * target)
     if further is None:
         return replace(budget, patch_scale=patch_scale)
-    goal, squares = REST_OF_MANY * target, gathered.squares * (pilot.sensors.size / few.sensors.size)
+    goal, squares = tuning.rest_share_of_many * target, gathered.squares * (pilot.sensors.size / few.sensors.size)
     squares += device.second_squares(pilot)
-    histogram = further.histogram(pilot, max(2, PILOT_LANES // pilot.sensors.size // 2 * 2))
+    histogram = further.histogram(pilot, max(2, tuning.pilot_lanes // pilot.sensors.size // 2 * 2))
     done, error = 0, math.inf
-    while done < MAX_PILOT_ROUNDS and error > PILOT_ERROR * goal:
+    while done < tuning.max_pilot_rounds and error > tuning.max_pilot_error * goal:
         further.accumulate(pilot, histogram, done)
         done += 1
         error = histogram.relative_error(done, squares)
     share = further.share_of_third(gathered.n_patches, error * math.sqrt(done) / target)
-    if share < SHARES_OF_THIRD[0]:
+    if share < tuning.third_shares[0]:
         patch_scale, _ = third.calibrate(few, share * target)
-    rounds = rounds_needed(error, done, math.sqrt(SQUARES - share**2) * target)
+    rounds = further.rounds_needed(error, done, math.sqrt(tuning.share_squares - share**2) * target)
     return replace(budget, patch_scale=patch_scale, rounds=rounds)
 
 
@@ -71,8 +57,8 @@ def _pilot_of_patches(third: ThirdBounce, pilot: Pilot) -> Pilot:
     nearest = tessellator.nearest
     if built.wall.is_planar and built.hidden_bounds is not None:  # what faces away from it, too
         nearest = built.hidden_bounds[0][2] / built.unit
-    is_far = nearest > 2 * tessellator.reach / FEW_SENSORS
-    return pilot_of(third.device.capture, FEW_SENSORS) if is_far else pilot
+    is_far = nearest > 2 * tessellator.reach / third.tuning.patch_pilot_sensors
+    return pilot_of(third.device.capture, third.tuning.patch_pilot_sensors) if is_far else pilot
 
 
 def _patch_scale_in_time(third: ThirdBounce, time_limit_s: float, target: float) -> float:
@@ -81,10 +67,10 @@ def _patch_scale_in_time(third: ThirdBounce, time_limit_s: float, target: float)
     pilot = pilot_of(capture)
     pairs = capture.n_sensors * (capture.n_lasers if third.device.is_exhaustive else 1)
     more = pairs / (pilot.sensors.size * (pilot.lasers.size if third.device.is_exhaustive else 1))
-    patch_scale = COARSEST_SCALE
+    patch_scale = third.tuning.coarsest_scale
     coarse, second = third.gather(pilot, patch_scale), third.device.second_squares(pilot)
     while True:
-        finer = third.finer(patch_scale, REFINEMENT)
+        finer = third.finer(patch_scale, third.tuning.refinement)
         begun = time.perf_counter()
         fine = third.gather(pilot, finer)
         predicted = (time.perf_counter() - begun) * more * 4

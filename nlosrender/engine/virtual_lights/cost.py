@@ -24,7 +24,6 @@ from nlosrender.engine.launch.cost_pilot import (
     sensor_visits,
 )
 from nlosrender.engine.virtual_lights.gather.block_histogram import BlockHistogram
-from nlosrender.engine.virtual_lights.third_bounce import COARSEST_SCALE, REFINEMENT
 from nlosrender.errors import ConfigError
 from nlosrender.readable import readable_size
 
@@ -40,7 +39,7 @@ def gather_batch_bytes(engine: VirtualLightEngine, plan: Plan, available: float)
     """Return the memory of the largest batch, rows for the lanes of the gather included; see ``Engine.batch_bytes``."""
     gathered = max(BlockHistogram.entries(engine.third.shape(batch)) for batch in plan.batches)
     refuse_many_sums(gathered)
-    needed = engine.tessellator.count(COARSEST_SCALE) * REFINEMENT
+    needed = engine.tessellator.count(engine.third.tuning.coarsest_scale) * engine.third.tuning.refinement
     if needed * PATCH_BYTES > available:
         raise ConfigError.at(
             "time_axis.bin_width_opl",
@@ -78,7 +77,7 @@ def _deposits_per_sensor(engine: VirtualLightEngine, plan: Plan) -> float:
 
     The size of a patch at distance d is 2 sqrt(d w) with w the bin width, so that it covers 2 sqrt(d / w) bins.
     """
-    patches = engine.tessellator.count(COARSEST_SCALE) * (1 + REFINEMENT)
+    patches = engine.tessellator.count(engine.third.tuning.coarsest_scale) * (1 + engine.third.tuning.refinement)
     farthest = float(engine.built.hidden_bounds[1][2]) if engine.built.hidden_bounds is not None else 0.0
     bins = 1 + 2 * math.sqrt(max(farthest, 0.0) / engine.time_axis.bin_width_opl)
     lasers = plan.batches[len(plan.batches) // 2].lasers.size if engine.device.is_exhaustive else 1
@@ -89,7 +88,7 @@ def _light_seconds(engine: VirtualLightEngine, plan: Plan, pilot: Batch, calibra
     """Return the seconds of the gather and of the VPLs."""
     part = middle_of(pilot.sensors, max(1, pilot.sensors.size // 4))
     quarter = Batch(part, part if engine.capture.scan_type == "confocal" else pilot.lasers)
-    scale = calibrated.patch_scale or COARSEST_SCALE
+    scale = calibrated.patch_scale or engine.third.tuning.coarsest_scale
 
     def extrapolated(work: Callable[[Batch], object]) -> float:
         """Return the seconds of ``work`` for the whole plan: what every batch pays, and what every point adds."""

@@ -17,7 +17,6 @@ from nlosrender.engine.interface import Budget, OmittedWork, PilotSeconds, Suppl
 from nlosrender.engine.launch.device_capture import DeviceCapture
 from nlosrender.engine.launch.energy_contrasts import contrasts_of_deviation
 from nlosrender.engine.launch.histogram import Histogram
-from nlosrender.engine.launch.near_surfaces import RARE_SHARE
 from nlosrender.engine.launch.occlusion import nothing_occludes
 from nlosrender.engine.launch.omissions import omitted_by_time_gate, omitted_triangles, omitted_visibility
 from nlosrender.engine.launch.passes import Passes
@@ -25,13 +24,12 @@ from nlosrender.engine.launch.pilot_points import pilot_of
 from nlosrender.engine.launch.schedule import DEFAULT_TARGET
 from nlosrender.engine.virtual_lights.calibration import calibrated_lights
 from nlosrender.engine.virtual_lights.cost import gather_batch_bytes, virtual_light_estimate
-from nlosrender.engine.virtual_lights.elements.tessellator import MAX_PATCHES, Tessellator, wall_sees_itself
+from nlosrender.engine.virtual_lights.elements.tessellator import Tessellator, wall_sees_itself
 from nlosrender.engine.virtual_lights.gather.lighting import GatherSettings
 from nlosrender.engine.virtual_lights.reciprocity import is_reciprocal
-from nlosrender.engine.virtual_lights.third_bounce import COARSEST_SCALE, REFINEMENT, ThirdBounce, difference_divisor
-from nlosrender.engine.virtual_lights.vpls.rounds import REST_OF_MANY, VplBounces
-
-MISSED = 3.0  # times the light found of bounce 5: of its four legs, one that may lead past the laser point is found
+from nlosrender.engine.virtual_lights.third_bounce import ThirdBounce, difference_divisor
+from nlosrender.engine.virtual_lights.tuning import DEFAULT_TUNING, VirtualLightTuning
+from nlosrender.engine.virtual_lights.vpls.rounds import VplBounces
 
 
 class VirtualLightEngine:
@@ -46,25 +44,34 @@ class VirtualLightEngine:
         Engine of the bounces above the third where surfaces are not Lambertian.
     lanes
         Lanes that keep the backend busy.
+    tuning
+        Its numbers.
     """
 
     name = "virtual_lights"
 
-    def __init__(self, device: DeviceCapture, paths: SupplementaryEngine, lanes: int):
+    def __init__(
+        self,
+        device: DeviceCapture,
+        paths: SupplementaryEngine,
+        lanes: int,
+        tuning: VirtualLightTuning = DEFAULT_TUNING,
+    ):
         self.device, self.paths = device, paths
         self.built, self.capture, self.time_axis = device.built, device.capture, device.time_axis
         self.options = device.options
         built, capture = self.built, self.capture
-        self.tessellator = Tessellator(built, capture, self.time_axis.bin_width_opl / built.unit)
+        self.tessellator = Tessellator(built, capture, self.time_axis.bin_width_opl / built.unit, tuning=tuning)
         shapes = (*built.hidden_shapes, *([built.wall_shape] if wall_sees_itself(built) else []))
         self.settings = GatherSettings(
             is_confocal=capture.scan_type == "confocal",
             is_diffuse=all(is_lambertian(shape.bsdf()) for shape in shapes),
             needs_visibility=not nothing_occludes(built),
             has_one_laser=capture.n_lasers == 1,
+            laser_rays=tuning.laser_rays,
         )
         all_lambertian = self.settings.is_diffuse and is_lambertian(built.wall_shape.bsdf())
-        reciprocal = is_reciprocal(built, capture, self.time_axis.n_bins, is_lambertian=all_lambertian)
+        reciprocal = is_reciprocal(built, capture, self.time_axis.n_bins, is_lambertian=all_lambertian, tuning=tuning)
         self.third = ThirdBounce(device, self.tessellator, self.settings, lanes, reciprocal)
         self.further: VplBounces | None = None  # else ``paths``, where further bounces are asked for
         if self.has_further_bounces and self.settings.is_diffuse:
@@ -108,7 +115,7 @@ class VirtualLightEngine:
         sampler = self.device.sampler
         if not self.has_further_bounces or self.capture.scan_type == "confocal" or sampler.is_empty:
             return False
-        return math.pi * self.tessellator.nearest_to_laser**2 < RARE_SHARE * sampler.area
+        return math.pi * self.tessellator.nearest_to_laser**2 < self.tessellator.tuning.rare_share * sampler.area
 
     @property
     def compile_seconds(self) -> float:
@@ -125,8 +132,10 @@ class VirtualLightEngine:
         if budget not in self._calibrated:
             calibrated = calibrated_lights(self.third, self.further, budget, is_alone=not self.has_further_bounces)
             if self.traces_paths:
-                squares = self.third.gather(pilot_of(self.capture), calibrated.patch_scale or COARSEST_SCALE).squares
-                goal = REST_OF_MANY * (budget.target_error or DEFAULT_TARGET)
+                squares = self.third.gather(
+                    pilot_of(self.capture), calibrated.patch_scale or self.third.tuning.coarsest_scale
+                ).squares
+                goal = self.third.tuning.rest_share_of_many * (budget.target_error or DEFAULT_TARGET)
                 paths = self.paths.calibrate(replace(budget, target_error=goal), seconds, squares)
                 calibrated = replace(calibrated, spp=paths.spp)
             if math.isfinite(seconds):
@@ -141,7 +150,7 @@ class VirtualLightEngine:
         """
         begun, passes = time.perf_counter(), passes or Passes()
         budget = self.calibrate(budget)
-        scale = budget.patch_scale or COARSEST_SCALE
+        scale = budget.patch_scale or self.third.tuning.coarsest_scale
         shared = 0.5 if self.has_further_bounces else 1.0
         coarse, fine = self.third.pair(batch, scale, passes.stage("third bounce", 0, shared))
         left = budget.time_limit_s
@@ -153,8 +162,9 @@ class VirtualLightEngine:
         else:
             result = self.device.histogram_without_samples(batch)
         if self.misses_light:
-            np.add(result.variance, np.square(MISSED * result.mean), out=result.variance)
-            result.contrasts[:] += MISSED * result.mean.sum(axis=(2, 3, 4))
+            missed = self.third.tuning.missed_light
+            np.add(result.variance, np.square(missed * result.mean), out=result.variance)
+            result.contrasts[:] += missed * result.mean.sum(axis=(2, 3, 4))
         slot, factor = self.options.bounces.slot(THIRD_BOUNCE), self.device.scale
         third, deviation = fine.values, coarse.values  # large: worked on in place
         np.subtract(third, deviation, out=deviation)
@@ -204,11 +214,12 @@ class VirtualLightEngine:
                 "but most of the light that goes to and fro between the two is not found, and the stated "
                 "error takes all further bounces for unknown. Use render.max_bounces: 3 where they do not matter."
             )
-        needed = self.tessellator.count(COARSEST_SCALE) * REFINEMENT
-        if needed > MAX_PATCHES:
+        most = self.third.tuning.max_patches
+        needed = self.tessellator.count(self.third.tuning.coarsest_scale) * self.third.tuning.refinement
+        if needed > most:
             yield (
                 f"time_axis.bin_width_opl: bins of {self.time_axis.bin_width_opl:.3g} m are so fine that {needed:.1e} "
-                f"patches of the hidden geometry are needed, more than {MAX_PATCHES:.0e}. "
+                f"patches of the hidden geometry are needed, more than {most:.0e}. "
                 "Use wider bins, or render.engine: path."
             )
 

@@ -19,7 +19,7 @@ from nlosrender.engine.launch.launch_params import LaunchParams
 from nlosrender.engine.launch.passes import Passes, Snapshot
 from nlosrender.engine.launch.pilot_points import Pilot
 from nlosrender.engine.virtual_lights.elements.patches import Patches
-from nlosrender.engine.virtual_lights.elements.tessellator import MAX_PATCHES, MOST_KEPT, Tessellator
+from nlosrender.engine.virtual_lights.elements.tessellator import Tessellator
 from nlosrender.engine.virtual_lights.gather.block_histogram import BlockHistogram
 from nlosrender.engine.virtual_lights.gather.device_patches import PatchRegions, upload_patches
 from nlosrender.engine.virtual_lights.gather.gather_passes import GatherPasses
@@ -32,16 +32,8 @@ from nlosrender.engine.virtual_lights.gather.lighting import (
     light_patches,
     pack_patches,
 )
+from nlosrender.engine.virtual_lights.tuning import VirtualLightTuning
 from nlosrender.engine.virtual_lights.visibility.masks import VisibilityMasks, WallTiles, count_sensors
-
-COARSEST_SCALE = 1.0
-NEAR = 1e-3  # engine units: the centres of nearer patches are rounded by more than 1e-4 of their distance
-REFINEMENT = 3.0  # at least so many times more patches between the two resolutions that are compared
-APART = 2.5  # at least so many times fewer patches has what a resolution is compared with, where there is any
-SAME = 0.1  # relative difference in coarseness of resolutions that are as good as one another
-STUCK = 0.9  # of the error before, with twice the patches: refining further is in vain
-ROUGH = 0.2  # an error beyond which the law of its decrease does not hold yet
-MARGIN = 1.1  # on the patches that an extrapolated error asks for
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,7 +100,7 @@ class ThirdBounce:
     ):
         self.device, self.tessellator, self.settings, self.lanes = device, tessellator, settings, lanes
         self.is_reciprocal = is_reciprocal
-        self.masks = VisibilityMasks(device.built)
+        self.masks = VisibilityMasks(device.built, tessellator.tuning)
         self._saved: dict[float, LitPatches] = {}  # per coarseness
 
     def gather(self, batch: Batch | Pilot, patch_scale: float, passes: Passes | None = None) -> Gathered:
@@ -126,6 +118,11 @@ class ThirdBounce:
         merged = float(patches.areas[patches.is_cluster].sum() / max(patches.areas.sum(), 1e-300))
         count = len(patches) if self.tessellator.regions is None else self.tessellator.count(patch_scale)
         return Gathered(values, max(count, 1), patch_scale, merged)  # 1: nothing may face the wall
+
+    @property
+    def tuning(self) -> VirtualLightTuning:
+        """Numbers of the engine: those that the tessellator has."""
+        return self.tessellator.tuning
 
     def forget(self) -> None:
         """Light patches anew from now on, as an engine would that has gathered nothing yet."""
@@ -216,7 +213,7 @@ class ThirdBounce:
             lit_patches = self._light_by_lasers(params, shape, patches, PatchRegions.of([len(patches)]), wall_tiles)
         elif self.settings.needs_visibility and not lit_patches.is_cleared:  # so far few points have looked
             lit_patches = lit_patches.cleared(MaskQuery(self.masks, wall_tiles))
-        if self.settings.lights_once and len(patches) <= MOST_KEPT:
+        if self.settings.lights_once and len(patches) <= self.tuning.max_kept_patches:
             # a batch looks at two resolutions
             others = [(other, lit) for other, lit in self._saved.items() if other != patch_scale]
             self._saved = dict([*others, (patch_scale, lit_patches)][-2:])
@@ -225,8 +222,8 @@ class ThirdBounce:
     def _light_by_lasers(
         self, params: LaunchParams, shape: HistogramShape, patches: Patches, places: PatchRegions, wall_tiles: WallTiles
     ) -> LitPatches:
-        is_near = self.tessellator.nearest < NEAR
-        on_device = upload_patches(self.device.built, patches, places, self.device.options.seed, is_near)
+        is_near = self.tessellator.nearest < self.tuning.near_distance
+        on_device = upload_patches(self.device.built, patches, places, self.device.options.seed, is_near, self.tuning)
         return light_patches(self.settings, params, on_device, MaskQuery(self.masks, wall_tiles), shape.lasers)
 
     def _wall_tiles(self, batch: Batch | Pilot, regions: list[int] | None = None) -> WallTiles:
@@ -242,36 +239,45 @@ class ThirdBounce:
     def pair(self, batch: Batch | Pilot, patch_scale: float, passes: Passes | None = None) -> tuple[Gathered, Gathered]:
         """Gather a batch at ``patch_scale`` and at the coarser resolution it is compared with."""
         passes = passes or Passes()
-        coarse = self.gather(batch, self.coarser(patch_scale), passes.stage("coarse", 0, 1 / (1 + REFINEMENT)))
-        return coarse, self.gather(batch, patch_scale, passes.stage("fine", 1 / (1 + REFINEMENT), 1))
+        coarse = self.gather(
+            batch, self.coarser(patch_scale), passes.stage("coarse", 0, 1 / (1 + self.tuning.refinement))
+        )
+        return coarse, self.gather(batch, patch_scale, passes.stage("fine", 1 / (1 + self.tuning.refinement), 1))
 
     def calibrate(self, pilot: Pilot, target: float) -> tuple[float, Gathered]:
         """Return the fineness whose estimated error is at most ``target``, and the pilot's third bounce at it.
 
         The error is that of the second and third bounce together.
         """
-        second = self.device.second_squares(pilot)
-        levels = [(self.gather(pilot, COARSEST_SCALE), math.inf)]  # and its error, coarse to fine
-        patch_scale = self.finer(COARSEST_SCALE, REFINEMENT)
+        tuning, second = self.tuning, self.device.second_squares(pilot)
+        levels = [(self.gather(pilot, tuning.coarsest_scale), math.inf)]  # and its error, coarse to fine
+        patch_scale = self.finer(tuning.coarsest_scale, tuning.refinement)
         while True:
             fine = self.gather(pilot, patch_scale)
             # None nearer: two that differ in few patches only differ by more than either errs, by how they are cut.
-            levels = levels[_last_at_most(levels, fine.n_patches / APART) :]
+            levels = levels[_last_at_most(levels, fine.n_patches / tuning.min_patch_ratio) :]
             coarse = levels[0][0]
             error = estimated_error(coarse, fine, second)
             coarser = self.coarser(patch_scale)
-            if error <= target and not math.isclose(coarse.patch_scale, coarser, rel_tol=SAME):
+            if error <= target and not math.isclose(coarse.patch_scale, coarser, rel_tol=tuning.same_scale):
                 # as the render will estimate it, from the pair of resolutions that it has
                 error = max(error, estimated_error(self.gather(pilot, coarser), fine, second))
             needed = fine.n_patches * error / target
             # float32 path lengths and grazing contacts leave an error that no refinement takes away
             earlier = levels[_last_at_most(levels, fine.n_patches / 2)][1]
-            is_stuck = STUCK * earlier < error < ROUGH and fine.n_patches > 2 * coarse.n_patches
-            in_vain = is_stuck or (error < ROUGH and needed > MAX_PATCHES)
-            if error <= target or in_vain or 2 * fine.n_patches > MAX_PATCHES:
+            is_stuck = (
+                tuning.stagnation * earlier < error < tuning.max_regular_error and fine.n_patches > 2 * coarse.n_patches
+            )
+            in_vain = is_stuck or (error < tuning.max_regular_error and needed > tuning.max_patches)
+            if error <= target or in_vain or 2 * fine.n_patches > tuning.max_patches:
                 return patch_scale, fine
             levels.append((fine, error))
-            patch_scale = self.finer(patch_scale, min(max(MARGIN * error / target, 1.25), REFINEMENT))
+            patch_scale = self.finer(patch_scale, self._step(error / target))
+
+    def _step(self, excess: float) -> float:
+        """Return how many times more patches the next level has, for an error ``excess`` times the target."""
+        tuning = self.tuning
+        return min(max(tuning.refinement_margin * excess, tuning.min_refinement), tuning.refinement)
 
     def finer(self, patch_scale: float, factor: float) -> float:
         """Return a coarseness with at least ``factor`` times the patches (a mesh may be finer than asked for).
@@ -287,11 +293,14 @@ class ThirdBounce:
 
     def coarser(self, patch_scale: float) -> float:
         """Return the coarseness that ``patch_scale`` is compared with: a third of the patches, or all there are."""
-        counts, coarser = self.tessellator.counts(patch_scale), patch_scale * math.sqrt(REFINEMENT)
-        while coarser < COARSEST_SCALE and any(
-            less > count / REFINEMENT for less, count in zip(self.tessellator.counts(coarser), counts, strict=True)
+        counts, coarser = self.tessellator.counts(patch_scale), patch_scale * math.sqrt(self.tuning.refinement)
+        while coarser < self.tuning.coarsest_scale and any(
+            less > count / self.tuning.refinement
+            for less, count in zip(self.tessellator.counts(coarser), counts, strict=True)
         ):
-            coarser = min(1.1 * coarser, COARSEST_SCALE)  # beyond it the law of the error's decrease does not hold
+            coarser = min(
+                1.1 * coarser, self.tuning.coarsest_scale
+            )  # beyond it the law of the error's decrease does not hold
         return coarser
 
     def shape(self, batch: Batch | Pilot) -> HistogramShape:

@@ -88,8 +88,6 @@ class VirtualLightTuning:
     # 8 and above; 0.12 s at 12, 0.63 s at 24.
     texture_splits: tuple[int, int] = (4, 12)
     few_patches: int = 2**14
-    # Pairs of patch, sensor and laser point in the first kernel, whose speed is not known: 1 s at 30 ns.
-    first_gather_pairs: int = 2**25
     # Points times bins of an exhaustive capture that reciprocity halves: 1 GB of float64. A larger one is cut into
     # batches that hold few of the other halves of their pairs. It saves 36 % of the CPU time (bench --part skips).
     max_reciprocal_sums: int = 2**27
@@ -135,7 +133,6 @@ class VirtualLightTuning:
     min_subpaths: int = 16
     max_subpaths: int = 64
     max_contribution_values: int = 2**24  # of a round, times lasers: 0.3 GB
-    first_vpl_pairs: int = 2**26  # of contributions with sensor and laser points in the first kernel: 1 s at 15 ns
     max_rounds: int = 2**20  # of a target that is out of reach
 
     # ---- Split of the target error (8); squares of shares leave 10 % for what a pilot cannot know ------------------

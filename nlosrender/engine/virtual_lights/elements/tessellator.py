@@ -26,8 +26,6 @@ from nlosrender.scene.build import BuiltScene
 from nlosrender.scene.loading.mitsuba_shapes import WALL_ID
 from nlosrender.scene.loading.round_surfaces import ROUND_PLUGINS
 
-MAX_PATCHES, MOST_KEPT = DEFAULT_TUNING.max_patches, DEFAULT_TUNING.max_kept_patches
-
 
 class Tessellator:
     """Cuts the hidden geometry of one scene, and a wall that sees itself, into patches, as fine as asked.

@@ -27,17 +27,6 @@ from nlosrender.engine.virtual_lights.vpls.gather import VplTable, gather_contri
 from nlosrender.engine.virtual_lights.vpls.sampler import Vpls, VplSampler
 from nlosrender.engine.virtual_lights.vpls.subpaths import ProposalLasers, SubpathPlan, vpl_contributions
 
-VPLS_PER_ROUND = 4096  # of all replicas together
-CONTRIBUTIONS_PER_VPL = 8
-CONFOCAL_CONTRIBUTIONS_PER_VPL = 2
-TRIED_PER_AXIS = 2  # laser points by which the vertices of walks are judged
-MOST_VALUES = 2**24  # impulses of a round times lasers, for memory
-SUBPATHS_PER_VPL = (16, 64)  # walks are cheap beside the gather when many sensor points share them
-MOST_ROUNDS = 2**20  # of a target that is out of reach
-# Of the target error: what the third bounce may take, and the squares of the third bounce and of the rest together.
-SHARES_OF_THIRD, SQUARES = (0.65, 0.5, 0.35), 0.9
-REST_OF_MANY = 0.88  # of the target error, beside the third bounce
-
 
 class VplBounces:
     """Bounces above the third of a scene of Lambertian surfaces before a planar wall.
@@ -55,19 +44,24 @@ class VplBounces:
     def __init__(self, device: DeviceCapture, tessellator: Tessellator, masks: VisibilityMasks | None):
         self.device, self.masks = device, masks
         self.built, self.options = device.built, device.options
+        tuning = self.tuning = tessellator.tuning
         built, capture, time_axis = device.built, device.capture, device.time_axis
         self.tessellator = tessellator
-        proposal_lasers = spread(capture.laser_grid, TRIED_PER_AXIS)
+        proposal_lasers = spread(capture.laser_grid, tuning.proposal_lasers_per_axis)
         points = laser_points(built, capture, time_axis, np.array(proposal_lasers.indices, dtype=np.uint32))
-        self.proposal_lasers = ProposalLasers(points, proposal_lasers.size, proposal_lasers.size == capture.n_lasers)
+        self.proposal_lasers = ProposalLasers(
+            points, proposal_lasers.size, proposal_lasers.size == capture.n_lasers, tuning.untried_share
+        )
         pairs = capture.n_sensors * (capture.n_lasers if capture.scan_type == "exhaustive" else 1)
-        fewest, most = SUBPATHS_PER_VPL
         self.is_confocal = capture.scan_type == "confocal"
         # every impulse of a confocal capture takes a ray of its own to the laser
-        self.contributions_per_vpl = CONFOCAL_CONTRIBUTIONS_PER_VPL if self.is_confocal else CONTRIBUTIONS_PER_VPL
+        kept = tuning.confocal_contributions_per_vpl, tuning.contributions_per_vpl
+        self.contributions_per_vpl = kept[0 if self.is_confocal else 1]
         lasers = capture.n_lasers if capture.scan_type == "exhaustive" else 1
-        self.vpls_per_round = min(VPLS_PER_ROUND, max(64, MOST_VALUES // (self.contributions_per_vpl * lasers)))
-        self.subpaths = int(min(max(pairs / 32, fewest), most))
+        self.vpls_per_round = min(
+            tuning.vpls_per_round, max(64, tuning.max_contribution_values // (self.contributions_per_vpl * lasers))
+        )
+        self.subpaths = int(min(max(pairs / 32, tuning.min_subpaths), tuning.max_subpaths))
 
     @cached_property
     def sampler(self) -> VplSampler:
@@ -89,7 +83,7 @@ class VplBounces:
         return self.vpls_per_round * self.contributions_per_vpl
 
     def share_of_third(self, patches: int, noise: float) -> float:
-        """Return the one of ``SHARES_OF_THIRD`` with which patches and walks together take the fewest rays.
+        """Return the one of ``third_shares`` with which patches and walks together take the fewest rays.
 
         Parameters
         ----------
@@ -98,13 +92,25 @@ class VplBounces:
         noise
             Error of one round over the target error.
         """
-        rays_per_round = self.vpls_per_round * (1 + self.contributions_per_vpl * self.is_confocal)
+        tuning = self.tuning
+        shares, rays_per_round = (
+            tuning.third_shares,
+            self.vpls_per_round * (1 + self.contributions_per_vpl * self.is_confocal),
+        )
 
         def rays(share: float) -> float:
-            finer = patches * (SHARES_OF_THIRD[0] / share) ** (4 / 3)
-            return finer * 4 / 3 + rays_per_round * max(1, math.ceil(noise**2 / (SQUARES - share**2)))
+            finer = patches * (shares[0] / share) ** (4 / 3)
+            return finer * 4 / 3 + rays_per_round * max(1, math.ceil(noise**2 / (tuning.share_squares - share**2)))
 
-        return min(SHARES_OF_THIRD, key=rays)
+        return min(shares, key=rays)
+
+    def rounds_needed(self, error: float, done: int, target: float) -> int:
+        """Return how many rounds bring the ``error`` after ``done`` rounds to ``target``: it falls as 1 / sqrt(rounds).
+
+        At most ``max_rounds``, where no light has been found as well.
+        """
+        most = self.tuning.max_rounds
+        return min(max(1, math.ceil(done * (error / target) ** 2)), most) if math.isfinite(error) else most
 
     def histogram(self, batch: Batch | Pilot, replicas: int) -> DeviceHistogram:
         """Return an empty histogram of a batch: bounce slots from the fourth bounce on."""
@@ -139,7 +145,7 @@ class VplBounces:
             else:
                 share = (time.perf_counter() - begun) / max(budget.time_limit_s or 0.0, 1e-9)
                 if budget.target_error is not None:
-                    goal = REST_OF_MANY * budget.target_error
+                    goal = self.tuning.rest_share_of_many * budget.target_error
                     error = histogram.relative_error(done, known_squares) / goal
                     share = max(share, 1 / max(error, 1e-9) ** 2)
             contrasts.add(done, share >= 1)
@@ -214,8 +220,3 @@ class VplBounces:
             done += steps
             if done < longest:
                 report_progress(done)
-
-
-def rounds_needed(error: float, done: int, target: float) -> int:
-    """Return how many rounds bring the ``error`` after ``done`` rounds to ``target``: it falls as 1 / sqrt(rounds)."""
-    return min(max(1, math.ceil(done * (error / target) ** 2)), MOST_ROUNDS) if math.isfinite(error) else MOST_ROUNDS
