@@ -4,8 +4,9 @@ A cluster's footprint in time is the parallelogram with its members' second mome
 and area A although its members have normals n_i of their own: a Lambertian surface sends light on from direction l to
 direction s by l^T M s, with M the sum of A_i n_i n_i^T. With u = M r for one direction r, the rank-one matrix
 u u^T / (r . u) does the same wherever l or s is r, and errs elsewhere by the product of their differences from r
-(Nystrom approximation); so n = u / |u| and A = |u|^2 / (r . u), with r towards the lasers. The sum of the A_i for A
-would be too bright: 1.5 times for half a sphere, lit and seen from above. docs/virtual-lights.md, 4.
+(Nystrom approximation); so n = u / |u| and A = |u|^2 / (r . u), with r towards the lasers. Half a sphere, lit and seen
+from above, would be 3 times too bright with the sum of the A_i for A, 1.5 times with the length of the sum of the
+A_i n_i: docs/virtual-lights.md, 4.3.
 
 Visibility is that of one member, drawn by area: two sheets in one cluster still hide each other, on average, and the
 difference of two resolutions shows the noise of the draw.

@@ -1,8 +1,9 @@
 """Virtual point lights (VPLs): random points of the hidden geometry whose light the sensor points gather.
 
-A sensor point sees a surface element by its area over its squared distance. Elements of the hidden geometry are chosen
-by that measure, with the distance to the nearest sensor or laser point, so that no connection is near-singular: what a
-VPL contributes to any sensor point is bounded. docs/virtual-lights.md, 7.
+The probability of an element goes with its area over d (d + R), with d its distance from the nearest sensor or laser
+point and R half the extent of the sensor grid: the density that minimises the L2 error over all sensor points. In that
+norm all VPLs count about the same; a single sensor point receives at most 9 (1 + R / d) times as much of one:
+docs/virtual-lights.md, 7.2 and 7.3.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ class Vpls(SurfacePoints):
     """VPLs, sorted along the elements they lie on."""
 
     areas: Float64  # (n,) area that a VPL stands for: the reciprocal of n times its density
-    importance: Float64  # (n,) area over squared distance from the nearest laser or sensor point
+    importance: Float64  # (n,) area over d (d + R), see above
 
 
 class VplSampler:
