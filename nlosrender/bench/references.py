@@ -16,6 +16,7 @@ NARROWEST = 1e-4  # bins
 FIRST_TARGET = 0.01  # of the refinements that end in the reference
 FINEST_TARGET = 1e-3
 LONG_RUN_SEED = 9001  # no contender uses it
+VIRTUAL_LIGHTS = {"engine": "virtual_lights"}
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,27 +47,25 @@ def find_reference(loaded: LoadedScene, seconds: float) -> Reference:
 def _refined(loaded: LoadedScene, seconds: float) -> Reference:
     """Gather at finer and finer targets while the next one can be expected to fit."""
     timer, target = Timer(), FIRST_TARGET
-    options = {"engine": "virtual_lights"}
-    run = render(loaded, Budget(target_error=target), LONG_RUN_SEED, options)
+    run = render(loaded, Budget(target_error=target), LONG_RUN_SEED, VIRTUAL_LIGHTS)
     while target > FINEST_TARGET:
         spent = timer.read()[0]
         target = min(target, run.estimate or target) / 2
         if spent + 3 * run.seconds > seconds:
             break
-        run = render(loaded, Budget(target_error=target), LONG_RUN_SEED, options)
+        run = render(loaded, Budget(target_error=target), LONG_RUN_SEED, VIRTUAL_LIGHTS)
     return Reference(run.values, run.estimate or 0.0, "virtual lights, refined", timer.read()[0])
 
 
 def _long_run(loaded: LoadedScene, seconds: float) -> Reference:
     """Gather the third bounce as finely as a third of the time allows, and trace the rest of the light in the rest."""
     timer = Timer()
-    options = {"engine": "virtual_lights"}
     third = replace(loaded, scene=replace(loaded.scene, max_bounces=3))
-    cost = render(third, Budget(target_error=FIRST_TARGET), LONG_RUN_SEED, options).seconds
+    cost = render(third, Budget(target_error=FIRST_TARGET), LONG_RUN_SEED, VIRTUAL_LIGHTS).seconds
     # a gather's error falls as 1 / seconds
     target = max(FINEST_TARGET, FIRST_TARGET * min(1.0, 3 * cost / seconds))
     budget = Budget(target_error=target, time_limit_s=max(seconds - timer.read()[0], 4 * cost))
-    run = render(loaded, budget, LONG_RUN_SEED, options)
+    run = render(loaded, budget, LONG_RUN_SEED, VIRTUAL_LIGHTS)
     origin = f"third bounce gathered to {target:.1%}, further ones by {run.samples} paths per sensor point"
     return Reference(run.values, run.estimate or 0.0, origin, timer.read()[0])
 
