@@ -45,7 +45,7 @@ def trace_any_hit(loaded: LoadedScene, lit: ShadowRayTargets, *, only_asked: boo
     from nlosrender.engine.virtual_lights.gather.device_patches import to_points
 
     built, n_sensors = loaded.built, loaded.capture.n_sensors
-    points = loaded.capture.sensor_grid.positions.reshape(-1, 3) / built.unit
+    points = loaded.capture.sensor_grid.positions.reshape(-1, 3) / built.metres_per_engine_unit
     order = np.argsort(morton_order(points), kind="stable")
     sensors, tiles = to_points(points[order]), on_device(mi.UInt64, lit.tiles[order])
     centres, normals = to_points(lit.positions), to_points(lit.normals)

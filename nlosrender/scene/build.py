@@ -43,7 +43,7 @@ class EngineScene:
     surfaces: tuple[Surface, ...]  # configured ones; a Mitsuba scene has more
     hidden_shapes: tuple[mi.Shape, ...]  # one per surface, then those of a Mitsuba scene
     hidden_bounds: Bounds | None  # box around these and all lamps [m, local frame]; None when there is none
-    unit: float  # metres per engine unit of length, a power of two
+    metres_per_engine_unit: float  # a power of two, so that conversions are exact
     n_triangles: int  # of the hidden shapes; analytic shapes count as none
     warnings: tuple[str, ...] = ()  # about what was left out, or is likely a mistake
     meshes: tuple[MeshReport, ...] = ()  # of mesh files
@@ -127,7 +127,7 @@ def build_scene(wall: RelayWall, wall_bsdf: Mapping[str, object], surfaces: Sequ
         surfaces=tuple(surfaces),
         hidden_shapes=tuple(shapes),
         hidden_bounds=joined_bounds(boxes),
-        unit=unit,
+        metres_per_engine_unit=unit,
         n_triangles=count_triangles(shapes),
         warnings=read.warnings + warnings + medium_warnings(zip(keys, shapes, strict=True)),
         meshes=read.meshes,

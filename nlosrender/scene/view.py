@@ -42,7 +42,7 @@ class BuiltView(EngineScene):
 
     def to_engine(self, positions: ArrayLike) -> Float64:
         """Take positions (..., 3) [m] of the local frame to the engine's [engine units]."""
-        return self.frame.to_local(self.wall.pose.to_scene(positions)) / self.unit
+        return self.frame.to_local(self.wall.pose.to_scene(positions)) / self.metres_per_engine_unit
 
     def direction_to_engine(self, directions: ArrayLike) -> Float64:
         """Take directions (..., 3) of the local frame to the engine's; their lengths stay."""
@@ -101,7 +101,7 @@ def build_view(scene_config: SceneConfig, capture_config: CaptureConfig) -> Buil
         hidden_shapes=tuple(shapes),
         hidden_bounds=_in_frame_of(plane, frame, joined_bounds(boxes)),
         frame=frame,
-        unit=unit,
+        metres_per_engine_unit=unit,
         n_triangles=count_triangles(shapes),
         warnings=left_out + read.warnings + medium_warnings(zip(keys, shapes, strict=True)),
         meshes=read.meshes + of_whole,

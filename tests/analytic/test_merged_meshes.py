@@ -100,7 +100,7 @@ def test_no_cluster_lies_between_two_sheets(tmp_path: Path, patch_scale: float) 
     tessellator = tessellated(item, folder=tmp_path)
     patches = tessellator.patches(patch_scale)
     assert patches.is_cluster.all()
-    x, y, z = (patches.centres * tessellator.built.unit - item["translate"]).T
+    x, y, z = (patches.centres * tessellator.built.metres_per_engine_unit - item["translate"]).T
     heights = z - 0.2 * x + 0.3 * y
     # less than a share p of the other sheet is let pass: p (1 - p) 0.15^2 = level^2 / 12, the level being 0.08 m
     assert np.abs(heights - 0.15 * (heights > 0.075)).max() < 0.025 * 0.15

@@ -60,7 +60,7 @@ def test_every_round_shape_is_refined() -> None:
     balls = [{"type": "sphere", "center": [x, 0, 1], "radius": radius} for x, radius in ((0.5, 0.3), (-0.5, 0.02))]
     rods = [{"type": "cylinder", "center": [0, 0.5, 1], "axis": [1, 0, 0], "radius": 0.01, "height": 0.8}]
     built, capture, *_ = start(flat_wall(*balls, *rods))
-    tessellator = Tessellator(built, capture, 0.02 / built.unit)
+    tessellator = Tessellator(built, capture, 0.02 / built.metres_per_engine_unit)
     for patch_scale in (1.0, 0.5):
         counts, finer = tessellator.counts(patch_scale), tessellator.counts(patch_scale / 2)
         assert len(counts) == 5
@@ -75,7 +75,7 @@ def test_a_thin_rod_is_cut_along_as_a_flat_strip_is() -> None:
 
     rod = {"type": "cylinder", "center": [0, 0.5, 1], "axis": [1, 0, 0], "radius": 0.002, "height": 0.8}
     built, capture, *_ = start(flat_wall(rod))
-    assert Tessellator(built, capture, 0.02 / built.unit).counts(1.0)[2] < 200
+    assert Tessellator(built, capture, 0.02 / built.metres_per_engine_unit).counts(1.0)[2] < 200
 
 
 def test_a_texture_finer_than_patches_is_averaged(tmp_path: Path) -> None:

@@ -90,7 +90,10 @@ def seen(built: Any, shape: Any, place: Place, to_local: Callable[[Array], Array
         for column in range(COLUMNS):
             point, normal = place((column + 0.5) / COLUMNS, (row + 0.5) / ROWS)
             start, end = to_local(point + 1e-3 * normal), to_local(point - 1e-3 * normal)
-            ray = mi.Ray3f(mi.Point3f(start / built.unit), mi.Vector3f((end - start) / np.linalg.norm(end - start)))
+            ray = mi.Ray3f(
+                mi.Point3f(start / built.metres_per_engine_unit),
+                mi.Vector3f((end - start) / np.linalg.norm(end - start)),
+            )
             met = built.scene.ray_intersect(ray)
             assert np.all(np.array(met.shape == mi.ShapePtr(shape)))
             assert (normal @ normal) == pytest.approx(1)
@@ -163,7 +166,7 @@ def test_a_picture_spans_letters_the_right_way_up(picture: dict[str, Any]) -> No
     centres = share[mesh.faces].mean(axis=1)
     inside = np.abs(centres * [COLUMNS, ROWS] % 1 - 0.5).max(axis=1) < 0.49  # not on an edge between texels
     normal = built.wall.pose.direction_to_local(frame.normal)
-    start = (mesh.vertices[mesh.faces].mean(axis=1) + 0.01 * normal) / built.unit
+    start = (mesh.vertices[mesh.faces].mean(axis=1) + 0.01 * normal) / built.metres_per_engine_unit
     met = built.scene.ray_intersect(mi.Ray3f(mi.Point3f(start.T), mi.Vector3f(-normal)))
     found = np.ravel(met.bsdf().eval_diffuse_reflectance(met))
     column, row = (centres[:, 0] * COLUMNS).astype(int), ((1 - centres[:, 1]) * ROWS).astype(int)

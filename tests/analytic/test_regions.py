@@ -67,7 +67,7 @@ def test_regions_agree_with_one_set_of_patches(hidden: tuple[dict, ...], scan: s
 def test_every_region_covers_every_surface_once() -> None:
     """Shared patches and those of a region add up to the areas of all surfaces, whatever the resolution."""
     engine = eager(ROOM)
-    area = (2 * 2.0 * 1.2 + 2 * 1.6 * 1.2 + 2.0 * 1.6) / engine.built.unit**2
+    area = (2 * 2.0 * 1.2 + 2 * 1.6 * 1.2 + 2.0 * 1.6) / engine.built.metres_per_engine_unit**2
     count = len(engine.tessellator.regions.near)
     for patch_scale in (1.0, 0.4):
         shared = engine.tessellator.patches(patch_scale)
@@ -83,7 +83,7 @@ def test_every_region_covers_every_surface_once() -> None:
 def test_elements_are_no_longer_than_their_distance_from_the_region() -> None:
     """What a region sees is cut as finely as its own sensor points need, and no finer than its neighbour needs."""
     engine = eager(ROOM)
-    grid, unit = engine.capture.sensor_grid, engine.built.unit
+    grid, unit = engine.capture.sensor_grid, engine.built.metres_per_engine_unit
     regions = engine.tessellator.regions
     points = grid.positions.reshape(-1, 3) / unit
     laser = engine.capture.laser_grid.positions.reshape(-1, 3) / unit

@@ -228,9 +228,11 @@ def test_patches_cover_every_surface_once(patch_scale: float) -> None:
     from nlosrender.engine.virtual_lights.elements.tessellator import Tessellator
 
     built, capture, *_ = start(flat_wall(PLATE, BALL))
-    tessellator = Tessellator(built, capture, 0.02 / built.unit)
+    tessellator = Tessellator(built, capture, 0.02 / built.metres_per_engine_unit)
     patches = tessellator.patches(patch_scale)
-    assert patches.areas.sum() * built.unit**2 == pytest.approx(0.8 * 0.6 + 4 * np.pi * 0.3**2, rel=1e-6)
+    assert patches.areas.sum() * built.metres_per_engine_unit**2 == pytest.approx(
+        0.8 * 0.6 + 4 * np.pi * 0.3**2, rel=1e-6
+    )
     assert len(patches) == tessellator.count(patch_scale)
     edges = np.linalg.norm(patches.corners - np.roll(patches.corners, 1, axis=1), axis=-1).max(axis=1)
     assert (edges <= 1.1 * patch_scale * patches.centres[:, 2]).all()  # 1.1: a sphere's parts are not all alike

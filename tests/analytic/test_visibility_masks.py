@@ -229,7 +229,7 @@ def shadow_ray_targets(stage: Stage) -> Any:
 
 def sensor_points(stage: Stage) -> Array:
     """Return the sensor points (n, 3) [engine units], as float32 knows them."""
-    points = stage.engine.capture.sensor_grid.positions.reshape(-1, 3) / stage.engine.built.unit
+    points = stage.engine.capture.sensor_grid.positions.reshape(-1, 3) / stage.engine.built.metres_per_engine_unit
     return points.astype(np.float32).astype(np.float64)
 
 
@@ -257,7 +257,7 @@ def test_the_foremost_plate_is_open_and_the_hidden_one_is_not() -> None:
     """Of two plates one behind the other."""
     stage = stage_of(FRONT, BEHIND | {"center": [0.3, 0, 1.0]}, scan="confocal")
     lit = shadow_ray_targets(stage)
-    is_front = lit.positions[:, 2] * stage.engine.built.unit < 0.9
+    is_front = lit.positions[:, 2] * stage.engine.built.metres_per_engine_unit < 0.9
     assert is_open(lit)[is_front].all()
     assert not is_open(lit)[~is_front].any()
 
@@ -267,7 +267,7 @@ def test_a_two_sided_plate_is_open_in_front() -> None:
     two_sided = {"type": "twosided", "nested": {"type": "diffuse"}}
     stage = stage_of(FRONT | {"bsdf": two_sided}, BEHIND)
     lit = shadow_ray_targets(stage)
-    is_front = lit.positions[:, 2] * stage.engine.built.unit < 0.9
+    is_front = lit.positions[:, 2] * stage.engine.built.metres_per_engine_unit < 0.9
     assert is_front.any()
     assert is_open(lit)[is_front].all()
 
@@ -289,7 +289,9 @@ def test_a_sphere_counts_by_its_box() -> None:
     for z, expected in ((1.2, True), (0.75, False)):
         stage = stage_of(FRONT | {"width": 0.3}, {"type": "sphere", "center": [0.0, 0, z], "radius": 0.2})
         lit = shadow_ray_targets(stage)
-        in_plane = np.abs(lit.positions[:, 2] * stage.engine.built.unit - 0.8) < 5e-6  # rays end at an offset
+        in_plane = (
+            np.abs(lit.positions[:, 2] * stage.engine.built.metres_per_engine_unit - 0.8) < 5e-6
+        )  # rays end at an offset
         plate = in_plane & (lit.normals[:, 2] < -0.999)
         assert plate.any()
         assert is_open(lit)[plate].all() == expected

@@ -154,7 +154,7 @@ def test_a_path_is_late_when_the_straight_way_to_the_laser_ends_after_the_window
     import mitsuba as mi
 
     engine = stage.engine
-    unit = engine.built.unit
+    unit = engine.built.metres_per_engine_unit
     deadline = engine.device.launch_params(stage.batch, engine.device.shape(stage.batch, 1)).time_gate
     # the laser is at (0.3, -0.2, 0); 3 m end in the window
     away = mi.Point3f(0.3, -0.2, 0.8) / unit
@@ -193,7 +193,7 @@ def test_a_deadline_counts_the_legs(scan: str) -> None:
     """From the window's end go the sensor point's own leg and the least of a laser's, or its own."""
     stage = Stage.of(scene(ROOM, scan=scan, lasers=(2, 3), capture=LEGS))
     engine = stage.engine
-    capture, unit, shape = engine.capture, engine.built.unit, engine.device.shape(stage.batch, 1)
+    capture, unit, shape = engine.capture, engine.built.metres_per_engine_unit, engine.device.shape(stage.batch, 1)
     deadline = engine.device.launch_params(stage.batch, shape).time_gate
     own = scan == "confocal"
     legs = capture.sensor_legs.ravel() + (capture.laser_legs.ravel() if own else capture.laser_legs.min())
@@ -247,7 +247,9 @@ def share_in_time(has_time_gate: bool) -> float:
 
     def recorded(plan: Any, params: Any, vpls: Any, *rest: Any) -> Any:
         contributions = vpl_contributions(plan, params, vpls, *rest)
-        heights = vpls.positions[contributions.vpls][:, 2] * engine.built.unit  # over the wall, with its sensor points
+        heights = (
+            vpls.positions[contributions.vpls][:, 2] * engine.built.metres_per_engine_unit
+        )  # over the wall, with its sensor points
         shares.append((np.array(contributions.delays) + heights / 0.1 < SHORT).mean())
         return contributions
 
@@ -266,7 +268,7 @@ def test_walks_are_spent_on_light_in_the_window() -> None:
 def test_sites_that_only_late_light_reaches_are_few() -> None:
     """Of the far side of a deep room there are eight times fewer beside the others, and they stand for its area."""
     stage = Stage.of(scene(room([2.0, 1.6, 2.0]), engine="virtual_lights"))
-    unit, ratios, areas = stage.engine.built.unit, [], []
+    unit, ratios, areas = stage.engine.built.metres_per_engine_unit, [], []
     for has_time_gate in (False, True):
         sampler = with_options(stage.engine, has_time_gate=has_time_gate).further.sampler
         vpls = sampler.sample(2**15, np.random.default_rng(5))

@@ -61,7 +61,7 @@ def test_spot_in_a_scene_of_another_size() -> None:
     spot = {"type": "spot", "position": [0.0005, 0.001, 0], "look_at": [0, -0.001, 0], "intensity": 1e-6}
     camera = {"position": [0, 0.002, 0.004], "look_at": [0, -0.001, 0]}
     view = see(view_config(floor, emitters=[spot], camera=camera, spp=16384, bins=(0, 0.001, 20)))
-    assert view.engine.built.unit < 0.01
+    assert view.engine.built.metres_per_engine_unit < 0.01
     assert_is_steady(view, 1024)
 
 

@@ -100,7 +100,7 @@ def test_every_triangle_and_shape_is_sampled_by_its_area(sampled: Sampled) -> No
         areas += (np.linalg.norm(cross, axis=-1) / 2)[kept].tolist()
         # what is never sampled turns its back to every point of the wall, whose corners are its extremes
         x, y = sampled.built.wall.width / 2, sampled.built.wall.height / 2
-        wall = np.array([[x, y, 0], [x, -y, 0], [-x, y, 0], [-x, -y, 0]]) / sampled.built.unit
+        wall = np.array([[x, y, 0], [x, -y, 0], [-x, y, 0], [-x, -y, 0]]) / sampled.built.metres_per_engine_unit
         heights = np.einsum("ikj,kj->ki", wall[:, None] - corners[None, :, 0], cross)
         assert (heights[~kept] <= 0).all()
     assert sum(counts) == N
@@ -131,7 +131,7 @@ def test_a_triangle_is_sampled_evenly(sampled: Sampled) -> None:
 def test_a_round_shape_is_sampled_evenly(sampled: Sampled, index: int, item: dict) -> None:
     """Height and longitude are uniform on both (Archimedes), and every point lies on the surface."""
     shape = sampled.built.hidden_shapes[index]
-    unit = sampled.built.unit
+    unit = sampled.built.metres_per_engine_unit
     away = sampled.points[sampled.owners == sampled.number(shape)] * unit - item["center"]
     distance = np.linalg.norm(away if index == 1 else away[:, [0, 2]], axis=-1)
     np.testing.assert_allclose(distance, item["radius"], rtol=1e-5)

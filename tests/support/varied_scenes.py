@@ -109,7 +109,7 @@ class Stage:
 
         engine = self.engine
         tuning = replace(engine.tessellator.tuning, **changes)
-        bin_width = engine.time_axis.bin_width_opl / engine.built.unit
+        bin_width = engine.time_axis.bin_width_opl / engine.built.metres_per_engine_unit
         engine.tessellator = Tessellator(engine.built, engine.capture, bin_width, tuning=tuning)
         for part in (engine.third, *([engine.further] if engine.further else [])):
             part.tessellator = engine.tessellator

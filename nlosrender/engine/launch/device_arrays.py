@@ -94,7 +94,7 @@ def laser_points(built: BuiltScene, capture: Capture, time_axis: TimeAxis, index
 def _wall_points(
     built: BuiltScene, positions: Float64, normals: Float64, device: Float64, delay: Float64
 ) -> WallPoints:
-    point = mi.Point3f(*columns(positions / built.unit))
+    point = mi.Point3f(*columns(positions / built.metres_per_engine_unit))
     normal = mi.Vector3f(*columns(normals))
     # The wall's own intersection gives shading frame and texture coordinates for every wall type and BSDF.
     if built.wall_shape.class_name() == "Mesh":
@@ -130,7 +130,7 @@ def _on_mesh(built: BuiltScene, point: mi.Point3f, normal: mi.Vector3f) -> mi.Su
         interaction = dr.select(is_own & ~found, hit, interaction)
         found = found | is_own
     if not dr.all(found):
-        missing = np.array(point).T[~np.array(found)][0] * built.unit
+        missing = np.array(point).T[~np.array(found)][0] * built.metres_per_engine_unit
         place = ", ".join(f"{coordinate:.6g}" for coordinate in missing)
         raise too_fine(f"({place}) m of its frame: float32 does not find the point on it")
     return interaction

@@ -61,7 +61,7 @@ class DeviceCapture:
         self.built, self.capture, self.time_axis, self.options = built, capture, time_axis, options
         self.sampler = SurfaceSampler(built)
         # Throughput is per (engine unit)^2: H falls with the square of a scene's size.
-        self.scale = capture.laser_energy / built.unit**2
+        self.scale = capture.laser_energy / built.metres_per_engine_unit**2
 
     @cached_property
     def capture_gate(self) -> CaptureTimeGate | None:
@@ -131,7 +131,7 @@ class DeviceCapture:
             first_laser=first_laser,
             lasers_per_lane=shape.lasers,
             n_lasers=dr.opaque(mi.UInt32, shape.lasers),
-            bins_per_unit=dr.opaque(mi.Float, built.unit / time_axis.bin_width_opl),
+            bins_per_unit=dr.opaque(mi.Float, built.metres_per_engine_unit / time_axis.bin_width_opl),
             time_gate=None if gate is None else gate.of_sensors(built, capture, time_axis, index, sensor),
             row_of_lane=row_of_lane,
         )

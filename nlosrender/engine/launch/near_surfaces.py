@@ -25,14 +25,14 @@ def points_above_wall(built: BuiltScene, grid: PointGrid) -> Float64:
     """Return a sample of a grid's points, just above the wall (n, 3) [engine units]."""
     index = sampled_indices(grid)
     positions, normals = grid.positions.reshape(-1, 3)[index], grid.normals.reshape(-1, 3)[index]
-    return positions / built.unit + wall_offset(built) * normals
+    return positions / built.metres_per_engine_unit + wall_offset(built) * normals
 
 
 def wall_offset(built: BuiltScene) -> float:
     """Return the largest ray offset from the wall [engine units], see ``ray_offset_at``."""
     if built.wall.is_planar:
         return WALL_OFFSET
-    farthest = float(np.abs(wall_box(built.wall)).max()) / built.unit
+    farthest = float(np.abs(wall_box(built.wall)).max()) / built.metres_per_engine_unit
     return ray_offset(built) * (1 + farthest) * max(1.0, curvature(built.wall_shape))
 
 
@@ -46,7 +46,7 @@ def nearest_above(built: BuiltScene, grid: PointGrid) -> tuple[float, Float64]:
         down = _first_hits(built, starts + (top - offset) * normals, -normals, top - offset / 16)
         heights = np.where(np.isfinite(down), top - down, heights)
     nearest = int(np.argmin(heights))
-    return float(heights[nearest]), np.round(starts[nearest] * built.unit, 9)
+    return float(heights[nearest]), np.round(starts[nearest] * built.metres_per_engine_unit, 9)
 
 
 def _first_hits(built: BuiltScene, starts: Float64, directions: Float64, farthest: float) -> Float64:
@@ -66,10 +66,11 @@ def rare_light_warnings(device: DeviceCapture, p_hidden_sampling: Callable[[], f
     if capture.scan_type == "confocal" or device.sampler.is_empty:
         return
     height, (x, y, z) = nearest_above(built, capture.laser_grid)
+    height_m = height * built.metres_per_engine_unit
     share = max(p_hidden_sampling(), MIN_P_HIDDEN) * math.pi * max(height, WALL_OFFSET) ** 2 / area
     if share < RARE_SHARE:
         yield (
-            f"a hidden surface lies {height * built.unit:.2g} m before the laser point ({x:.4g}, {y:.4g}, {z:.4g}) m: "
+            f"a hidden surface lies {height_m:.2g} m before the laser point ({x:.4g}, {y:.4g}, {z:.4g}) m: "
             f"only one path in {1 / share:.0e} finds the light between the two, up to half of H, and the stated error "
             "misses it as well. Use render.engine: virtual_lights, or scan_type: confocal."
         )

@@ -37,7 +37,7 @@ def nothing_occludes(built: BuiltScene) -> bool:
     real = lengths[:, 0] > 0
     normals = normals[real] / lengths[real]
     offsets = np.einsum("ij,ij->i", corners[real, 0], normals)
-    corners_of_wall = wall_box(built.wall) / built.unit
+    corners_of_wall = wall_box(built.wall) / built.metres_per_engine_unit
     is_convex, is_room = True, True
     for start in range(0, len(normals), FACES_AT_ONCE):
         part = slice(start, start + FACES_AT_ONCE)

@@ -289,7 +289,7 @@ def facing_triangles(built: BuiltScene, mesh: mi.Mesh) -> tuple[Float64, NDArray
     Those are left out that turn their dark side to all of the wall. Occlusion by other surfaces is not looked at.
     """
     triangles = triangles_of(mesh)
-    corners = wall_box(built.wall) / built.unit
+    corners = wall_box(built.wall) / built.metres_per_engine_unit
     # Shading normals may light a little of a geometric back side.
     one_sided = _is_one_sided(mesh) and not mesh.has_vertex_normals()
     saved = np.flatnonzero(_visible_from(corners, triangles, one_sided, built.wall.is_planar))

@@ -101,11 +101,11 @@ class CaptureTimeGate:
         confocal = capture.scan_type == "confocal"
         legs = (sensor_legs + laser_legs).min() if confocal else sensor_legs.min() + laser_legs.min()
         return cls(
-            _box(capture.sensor_grid, built.unit),
-            _box(capture.laser_grid, built.unit),
+            _box(capture.sensor_grid, built.metres_per_engine_unit),
+            _box(capture.laser_grid, built.metres_per_engine_unit),
             survival,
-            float(time_axis.end_opl - legs + capture.laser_spot_radius) / built.unit,
-            2 * max(float(lowest), 0.0) / built.unit,
+            float(time_axis.end_opl - legs + capture.laser_spot_radius) / built.metres_per_engine_unit,
+            2 * max(float(lowest), 0.0) / built.metres_per_engine_unit,
         )
 
     def is_beyond(self, points: Float64) -> NDArray[np.bool_]:
@@ -126,10 +126,12 @@ class CaptureTimeGate:
         own = capture.scan_type == "confocal"
         sensor_legs, laser_legs = capture.sensor_legs.reshape(-1), capture.laser_legs.reshape(-1)
         legs = sensor_legs[index] + (laser_legs[index] if own else laser_legs.min())
-        latest = (time_axis.end_opl - legs + capture.laser_spot_radius) / built.unit
+        latest = (time_axis.end_opl - legs + capture.laser_spot_radius) / built.metres_per_engine_unit
         low, high = (_opaque_point(corner) for corner in self.laser_box)
         if own:
-            points = mi.Point3f(*columns(capture.laser_grid.positions.reshape(-1, 3)[index] / built.unit))
+            points = mi.Point3f(
+                *columns(capture.laser_grid.positions.reshape(-1, 3)[index] / built.metres_per_engine_unit)
+            )
             low = high = dr.gather(mi.Point3f, points, sensor)
         per_lane = dr.gather(mi.Float, on_device(mi.Float, latest), sensor)
         dr.eval(per_lane, low)

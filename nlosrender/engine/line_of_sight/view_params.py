@@ -71,11 +71,15 @@ def view_launch_params(
         scene=built.scene,
         camera=mi.Point3f(built.to_engine(capture.sensor_position).tolist()),
         pixels=per_lane,
-        pixel_x=mi.Vector3f(built.direction_to_engine([grid.size[0] / grid.nx / built.unit, 0.0, 0.0]).tolist()),
-        pixel_y=mi.Vector3f(built.direction_to_engine([0.0, grid.size[1] / grid.ny / built.unit, 0.0]).tolist()),
+        pixel_x=mi.Vector3f(
+            built.direction_to_engine([grid.size[0] / grid.nx / built.metres_per_engine_unit, 0.0, 0.0]).tolist()
+        ),
+        pixel_y=mi.Vector3f(
+            built.direction_to_engine([0.0, grid.size[1] / grid.ny / built.metres_per_engine_unit, 0.0]).tolist()
+        ),
         up=mi.Vector3f(built.direction_to_engine([0.0, 1.0, 0.0]).tolist()),
         indices=refractive_indices(built.scene),
-        bins_per_unit=mi.Float(built.unit / time_axis.bin_width_opl),
+        bins_per_unit=mi.Float(built.metres_per_engine_unit / time_axis.bin_width_opl),
         start_bins=mi.Int32(int(whole)),
         start_fraction=mi.Float(start - np.floor(start)),
     )

@@ -88,7 +88,7 @@ class PathEngine:
             p_hidden_sampling=self.p_hidden_sampling,
             laser_sampling=self.options.laser_sampling,
             russian_roulette=self.options.russian_roulette,
-            spot_radius=self.capture.laser_spot_radius / self.built.unit,
+            spot_radius=self.capture.laser_spot_radius / self.built.metres_per_engine_unit,
             needs_visibility=not nothing_occludes(self.built),
             has_transmission=any(bool(flag & mi.BSDFFlags.Transmission) for flag in flags),
             is_plain_diffuse=is_plain_diffuse(self.built),

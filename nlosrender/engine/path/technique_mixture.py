@@ -22,7 +22,7 @@ def choose_p_hidden_sampling(device: DeviceCapture, tuning: PathTuning) -> float
     built, sampler = device.built, device.sampler
     if sampler.is_empty or built.hidden_bounds is None:
         return 0.0
-    distance = built.hidden_bounds[0][2] / built.unit
+    distance = built.hidden_bounds[0][2] / built.metres_per_engine_unit
     # All light comes from sampled surfaces, and the wall has no mirror lobe that only its own sampling finds.
     only_hidden = built.wall.is_planar and sampler.covers_everything
     only_hidden &= not built.wall_bsdf.flags() & mi.BSDFFlags.Delta
@@ -38,7 +38,7 @@ def box_often_missed(device: DeviceCapture, tuning: PathTuning) -> HiddenAabb | 
     built = device.built
     if not built.wall.is_planar or built.hidden_bounds is None:
         return None
-    low, high = (np.asarray(corner, dtype=np.float64) / built.unit for corner in built.hidden_bounds)
+    low, high = (np.asarray(corner, dtype=np.float64) / built.metres_per_engine_unit for corner in built.hidden_bounds)
     margin = tuning.box_margin * (1 + max(np.abs(low).max(), np.abs(high).max()))
     box = HiddenAabb.of(low - margin, high + margin)
     return box if _share(box.is_missed(_rays_from_sensors(device))) > tuning.min_miss_share else None

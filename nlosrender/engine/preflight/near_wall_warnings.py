@@ -28,17 +28,18 @@ def _near_warnings(built: BuiltScene, capture: Capture) -> Iterator[str]:
     """Yield which surface is so near to a laser or sensor point that float32 does not know how near."""
     grids = {id(grid): grid for grid in (capture.laser_grid, capture.sensor_grid)}.values()
     height, (x, y, z) = min((nearest_above(built, grid) for grid in grids), key=lambda found: found[0])
+    to_m = built.metres_per_engine_unit
     if not built.wall.is_planar:
         if height < OFFSETS_LOST * wall_offset(built):
             yield (
-                f"a hidden surface lies {height * built.unit:.1g} m before the relay wall at ({x:.4g}, {y:.4g}, "
+                f"a hidden surface lies {height * to_m:.1g} m before the relay wall at ({x:.4g}, {y:.4g}, "
                 f"{z:.4g}) m of its frame: on a curved wall, light within "
-                f"{OFFSETS_LOST * wall_offset(built) * built.unit:.0g} m of it is not found."
+                f"{OFFSETS_LOST * wall_offset(built) * to_m:.0g} m of it is not found."
             )
     elif height < NEAREST_KNOWN:
         yield (
-            f"a hidden surface lies {height * built.unit:.1g} m before the wall at ({x:.4g}, {y:.4g}, "
-            f"{z:.4g}) m of its frame, where float32 knows heights to about {NEAREST_KNOWN / 10 * built.unit:.0g} m: "
+            f"a hidden surface lies {height * to_m:.1g} m before the wall at ({x:.4g}, {y:.4g}, "
+            f"{z:.4g}) m of its frame, where float32 knows heights to about {NEAREST_KNOWN / 10 * to_m:.0g} m: "
             "H there is not exact unless the surface is parallel to the wall."
         )
 

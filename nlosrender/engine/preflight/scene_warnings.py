@@ -79,7 +79,7 @@ def dark_surface_warnings(built: BuiltScene, capture: Capture, max_bounces: int 
     """
     facing: list[tuple[Surface, _SurfacePoints]] = []
     n_lit_by_nature = 0  # kinds of shape that cannot be sampled here: taken for visible
-    wall_corners = wall_box(built.wall) / built.unit
+    wall_corners = wall_box(built.wall) / built.metres_per_engine_unit
     for surface, shape in zip(built.surfaces, built.hidden_shapes, strict=True):
         name = f"{surface.key} ({surface.name})"
         if built.wall.is_planar and float(np.ravel(shape.bbox().max)[2]) <= 0:
@@ -189,7 +189,7 @@ def _any_visible(built: BuiltScene, surfaces: list[_SurfacePoints], grid: PointG
 
 
 def _bin_warnings(built: BuiltScene | BuiltView, time_axis: TimeAxis) -> Iterator[str]:
-    finest = FINEST_BIN * built.unit
+    finest = FINEST_BIN * built.metres_per_engine_unit
     if time_axis.bin_width_opl < finest:
         yield (
             f"time_axis.bin_width_opl: bins of {time_axis.bin_width_opl:.3g} m are finer than path lengths in a scene "

@@ -128,7 +128,9 @@ def _followed(
     """
     ray, opl = start.ray, mi.Float(0)  # a lower bound on the optical path length so far [engine units]
     alive, n_rays = mi.Bool(ray.maxt > 0), dr.width(ray.d)
-    latest = (time_axis.end_opl - float(capture.laser_legs.min() + capture.sensor_legs.min())) / built.unit
+    latest = (
+        time_axis.end_opl - float(capture.laser_legs.min() + capture.sensor_legs.min())
+    ) / built.metres_per_engine_unit
     first = np.zeros(n_rays, dtype=np.int64)  # twice the number of the first surface, plus 1 if it reflected the ray
     least: dict[int, int] = {}
     for event in range(MOST_EVENTS):
@@ -172,8 +174,11 @@ def _measured(
     if isinstance(built, BuiltView):
         return active, np.zeros_like(active)
     grid = capture.sensor_grid
-    points = grid.positions.reshape(-1, 3) / built.unit
-    margin = max(size / count for size, count in zip(grid.size, (grid.nx, grid.ny), strict=True)) / built.unit
+    points = grid.positions.reshape(-1, 3) / built.metres_per_engine_unit
+    margin = (
+        max(size / count for size, count in zip(grid.size, (grid.nx, grid.ny), strict=True))
+        / built.metres_per_engine_unit
+    )
     place = np.array(si.p, dtype=np.float64).T
     near = ((place >= points.min(axis=0) - margin) & (place <= points.max(axis=0) + margin)).all(axis=-1)
     on_wall = np.array(si.shape == mi.ShapePtr(built.wall_shape), dtype=bool)

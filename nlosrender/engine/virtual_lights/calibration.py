@@ -56,7 +56,7 @@ def _pilot_of_patches(third: ThirdBounce, pilot: Pilot) -> Pilot:
     built, tessellator = third.device.built, third.tessellator
     nearest = tessellator.nearest
     if built.wall.is_planar and built.hidden_bounds is not None:  # what faces away from it, too
-        nearest = built.hidden_bounds[0][2] / built.unit
+        nearest = built.hidden_bounds[0][2] / built.metres_per_engine_unit
     is_far = nearest > 2 * tessellator.reach / third.tuning.patch_pilot_sensors
     return pilot_of(third.device.capture, third.tuning.patch_pilot_sensors) if is_far else pilot
 

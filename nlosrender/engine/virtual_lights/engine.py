@@ -61,7 +61,9 @@ class VirtualLightEngine:
         self.built, self.capture, self.time_axis = device.built, device.capture, device.time_axis
         self.options = device.options
         built, capture = self.built, self.capture
-        self.tessellator = Tessellator(built, capture, self.time_axis.bin_width_opl / built.unit, tuning=tuning)
+        self.tessellator = Tessellator(
+            built, capture, self.time_axis.bin_width_opl / built.metres_per_engine_unit, tuning=tuning
+        )
         shapes = (*built.hidden_shapes, *([built.wall_shape] if wall_sees_itself(built) else []))
         self.settings = GatherSettings(
             is_confocal=capture.scan_type == "confocal",
@@ -208,7 +210,7 @@ class VirtualLightEngine:
     def warnings(self) -> Iterator[str]:
         """Yield light that is not found, and bins that take too many patches; see ``Engine.warnings``."""
         if self.misses_light:
-            distance = self.tessellator.nearest_to_laser * self.built.unit
+            distance = self.tessellator.nearest_to_laser * self.built.metres_per_engine_unit
             yield (
                 f"a hidden surface lies {distance:.1g} m from a laser point: the third bounce is right, "
                 "but most of the light that goes to and fro between the two is not found, and the stated "

@@ -232,7 +232,7 @@ class ThirdBounce:
         if regions is None or self.tessellator.regions is None:
             return WallTiles.of(built, capture, batch, with_lasers=not self.settings.has_one_laser)
         labels = self.tessellator.regions.labels
-        points = capture.sensor_grid.positions.reshape(-1, 3) / built.unit
+        points = capture.sensor_grid.positions.reshape(-1, 3) / built.metres_per_engine_unit
         groups = [points[labels == label] for label in regions]
         return WallTiles.around(groups, count_sensors(capture, batch) // len(self.tessellator.regions.near))
 

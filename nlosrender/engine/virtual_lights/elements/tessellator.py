@@ -57,8 +57,10 @@ class Tessellator:
         tuning: VirtualLightTuning = DEFAULT_TUNING,
     ):
         self.built, self.capture, self.tuning = built, capture, tuning
-        self.distance = WallDistance(capture, built.unit)
-        self.reach = max(capture.sensor_grid.size) / (2 * built.unit)  # half the sensor grid's extent [engine units]
+        self.distance = WallDistance(capture, built.metres_per_engine_unit)
+        self.reach = max(capture.sensor_grid.size) / (
+            2 * built.metres_per_engine_unit
+        )  # half the sensor grid's extent [engine units]
         triangles: list[Elements] = []
         self.round_shapes: list[RoundShape] = []
         self.wall_index: int | None = None  # of the wall among the scene's shapes, where it is cut as well
@@ -71,12 +73,14 @@ class Tessellator:
                 triangles.append(elements_of_mesh(built, index, shape))
             else:
                 self.round_shapes.append(RoundShape.of(index, shape))
-        light = capture.laser_grid.positions.reshape(-1, 3).mean(axis=0) / built.unit
+        light = capture.laser_grid.positions.reshape(-1, 3).mean(axis=0) / built.metres_per_engine_unit
         self.size_field = SizeField(bin_width, self.wall_index, light, tuning)
         joined = Elements.joined(triangles or [Elements.none()])
         self.elements = subdivide(joined, self.distance, self.wall_index)
         whole = SizedElements(self.elements, self.size_field)
-        self.regions = regions_of(capture, built.unit, self.distance, joined, whole) if may_divide else None
+        self.regions = (
+            regions_of(capture, built.metres_per_engine_unit, self.distance, joined, whole) if may_divide else None
+        )
         self.shared = whole if self.regions is None else self.regions.shared
         self._is_hidden = whole.is_hidden
         self._saved = lru_cache(maxsize=2)(self._make)
@@ -138,7 +142,9 @@ class Tessellator:
     @cached_property
     def nearest_to_laser(self) -> float:
         """Distance from the laser points to the nearest hidden element's centroid, or round shape [engine units]."""
-        lasers = WallDistance(replace(self.capture, sensor_grid=self.capture.laser_grid), self.built.unit)
+        lasers = WallDistance(
+            replace(self.capture, sensor_grid=self.capture.laser_grid), self.built.metres_per_engine_unit
+        )
         on_round = [shape.nearest(lasers) for shape in self.round_shapes if shape.index != self.wall_index]
         centres = self.elements.corners[self._is_hidden].mean(axis=1)
         return min([float(lasers(centres).min(initial=np.inf)) if len(centres) else math.inf, *on_round])

@@ -68,7 +68,7 @@ class WallTiles:
     def of(cls, built: BuiltScene, capture: Capture, batch: Batch | Pilot, *, with_lasers: bool = False) -> WallTiles:
         """Return the rectangle around all sensor points, and all laser points if asked for."""
         grids = [capture.sensor_grid, *([capture.laser_grid] if with_lasers else [])]
-        points = np.concatenate([grid.positions.reshape(-1, 3) / built.unit for grid in grids])
+        points = np.concatenate([grid.positions.reshape(-1, 3) / built.metres_per_engine_unit for grid in grids])
         return cls.around([points], count_sensors(capture, batch))
 
     def tiles(self, index: mi.UInt32) -> mi.Vector4f:
