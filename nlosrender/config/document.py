@@ -46,7 +46,7 @@ class Config(Section):
 
     _notes: tuple[str, ...] = PrivateAttr(default=())  # what of the file has no effect
 
-    def noting(self, notes: Iterable[str]) -> Self:
+    def with_notes(self, notes: Iterable[str]) -> Self:
         """Return this config, which from now on knows what of its file has no effect."""
         self._notes = (*self._notes, *notes)
         return self

@@ -145,7 +145,7 @@ def capture_config(document: Document) -> Config:
     config, found = validated(Config, tree, document)
     if found or document.issues:
         raise ConfigError(in_order(found, document))
-    return config.noting((*document.notes, *notes))
+    return config.with_notes((*document.notes, *notes))
 
 
 def validated(

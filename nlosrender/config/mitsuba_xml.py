@@ -29,7 +29,7 @@ from nlosrender.config.bsdf_table import (
 from nlosrender.config.fields import Checked
 from nlosrender.config.issues import InvalidValue, did_you_mean, invalid_value
 from nlosrender.config.plugin_check import config_folder, existing_file, mitsuba_file
-from nlosrender.config.xml_expansion import LEFT_OUT, START, Expansion, told_by_place
+from nlosrender.config.xml_expansion import LEFT_OUT, START, Expansion, prefixed_with_place
 from nlosrender.config.xml_numbers import check_numbers
 from nlosrender.config.xml_shapes import check_xml_bsdf, check_xml_shape
 from nlosrender.config.xml_transforms import check_rotation
@@ -172,11 +172,11 @@ def _clean(element: Element, folders: Sequence[Path]) -> None:
         if child.tag in _LEFT_OUT:
             element.remove(child)
             continue
-        with told_by_place(child):
+        with prefixed_with_place(child):
             _check(child, folders)
         _clean(child, folders)
         if child.tag in _RULES:  # after its parts, whose line is the nearer one
-            with told_by_place(child):
+            with prefixed_with_place(child):
                 _RULES[child.tag](child, folders[-1])
 
 

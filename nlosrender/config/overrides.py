@@ -104,18 +104,18 @@ def put(document: Document, parts: Sequence[str], value: Any, place: Place) -> N
         path = (*path, step)
         if depth == len(parts) - 1:
             container[step] = value
-            _push_out(document, path)
+            _drop_other_goal(document, path)
         elif isinstance(container, list):
             container = container[step]  # type: ignore[index]
         else:
             if container.get(step) is None:
                 container[step] = {}
-                _own(document, path, place)
+                _set_place(document, path, place)
             container = container[step]
-    _own(document, path, place)
+    _set_place(document, path, place)
 
 
-def _push_out(document: Document, path: KeyPath) -> None:
+def _drop_other_goal(document: Document, path: KeyPath) -> None:
     """Let a goal that is set over the file's win over the other one, which it excludes."""
     section = document.tree.get("render")
     for goal, other in (_GOALS, _GOALS[::-1]):
@@ -125,7 +125,7 @@ def _push_out(document: Document, path: KeyPath) -> None:
             section[other] = None
 
 
-def _own(document: Document, path: KeyPath, place: Place) -> None:
+def _set_place(document: Document, path: KeyPath, place: Place) -> None:
     for known in [known for known in document.places if known[: len(path)] == path]:
         del document.places[known]
     document.places[path] = place

@@ -90,7 +90,7 @@ class Expansion:
         children = list(element)
         element[:] = []
         for child in children:
-            with told_by_place(child):
+            with prefixed_with_place(child):
                 if child.tag in ("default", "alias", "path", "include"):
                     self._fill_in(child, is_read=True)
                     element.extend(list(self._directive(child, path, depth, level)))
@@ -159,7 +159,7 @@ class Expansion:
 
 
 @contextmanager
-def told_by_place(element: Element) -> Iterator[None]:
+def prefixed_with_place(element: Element) -> Iterator[None]:
     """Put the place of an element before what is raised; the innermost element's place stays the only one."""
     try:
         yield
