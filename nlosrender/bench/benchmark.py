@@ -26,7 +26,7 @@ SHARES = {"curves": 0.72, "scaling": 0.16, "rates": 0.05, "skips": 0.03, "proces
 REFERENCE_SHARE = 0.4  # of a scene's time
 
 Report = dict[str, Any]  # plain values, ready for JSON; None: not known, or never reached
-Progress = Callable[[str], None]  # told what is being measured
+Progress = Callable[[str], None]  # called with what is being measured
 
 
 def run_benchmark(

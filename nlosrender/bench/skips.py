@@ -155,7 +155,7 @@ def _of_late_light(loaded: LoadedScene) -> Iterator[Saving]:
     def render(one: Engine) -> Float64:
         return np.concatenate([one.render(batch, one.calibrate(budget)).mean for batch in plan.batches], axis=3)
 
-    for name, what in (("path", "most paths"), ("virtual_lights", "most walks")):
+    for name, what in (("path", "most paths"), ("virtual_lights", "most subpaths")):
         plan, gated = prepared(loaded, {"engine": name})
         _, patient = prepared(loaded, {"engine": name}, {"has_time_gate": False})
         budget = Budget(target_error=ROOM_TARGET) if gated.name == "virtual_lights" else Budget(spp=PATHS)

@@ -47,7 +47,7 @@ FIGURES: Mapping[str, Callable[[Study], PaperFigure]] = {
 
 
 def reproduce(
-    study: Study, names: Iterable[str] = FIGURES, told: Callable[[PaperFigure], None] = lambda figure: None
+    study: Study, names: Iterable[str] = FIGURES, report_figure: Callable[[PaperFigure], None] = lambda figure: None
 ) -> tuple[list[PaperFigure], Path]:
     """Make figures and the page that shows them.
 
@@ -57,8 +57,8 @@ def reproduce(
         Where from, where to, how much.
     names
         Keys of ``FIGURES``.
-    told
-        Told each figure as it is done.
+    report_figure
+        Called with each figure as it is finished.
 
     Returns
     -------
@@ -85,6 +85,6 @@ def reproduce(
         timer = Timer()
         figure = FIGURES[name](study)
         figures.append(replace(figure, seed=study.seed, seconds=timer.read()[0]))
-        told(figures[-1])
+        report_figure(figures[-1])
         page = write_page(figures, study.folder, facts | {"seconds": round(begun.read()[0], 1)})
     return figures, page

@@ -86,8 +86,8 @@ def worst_deviation(ours: Float64, variance: Float64, theirs: Float64, noise: Fl
     """
     difference = _blocks(ours - theirs)
     deviation = np.sqrt(_blocks(variance + noise))
-    told = deviation > 0
-    z = np.abs(difference[told]) / deviation[told]
+    is_noisy = deviation > 0
+    z = np.abs(difference[is_noisy]) / deviation[is_noisy]
     limit = float(stats.norm.isf((1 - (1 - SIGNIFICANCE) ** (1 / max(z.size, 1))) / 2))
     return float(z.max(initial=0.0)), limit, int(z.size)
 

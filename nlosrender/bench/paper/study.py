@@ -19,7 +19,7 @@ from nlosrender.files.reading.reader import open_capture
 from nlosrender.rendering.render_report import RenderReport
 
 Float64 = NDArray[np.float64]
-Progress = Callable[[str], None]  # told what is being done
+Progress = Callable[[str], None]  # called with what is being done
 T = TypeVar("T")
 
 
@@ -70,7 +70,7 @@ class Study:
     seed
         Of every render.
     progress
-        Told what is being done.
+        Called with what is being done.
     """
 
     configs: Path
