@@ -70,7 +70,7 @@ def rare_light_warnings(device: DeviceCapture, p_hidden_sampling: Callable[[], f
     share = max(p_hidden_sampling(), MIN_P_HIDDEN) * math.pi * max(height, WALL_OFFSET) ** 2 / area
     if share < RARE_SHARE:
         yield (
-            f"a hidden surface lies {height_m:.2g} m before the laser point ({x:.4g}, {y:.4g}, "
-            f"{z:.4g}) m: only one path in {1 / share:.0e} finds the light between the two, up to half of H, and the "
-            "stated error misses it as well. Use render.engine: virtual_lights, or scan_type: confocal."
+            f"a hidden surface lies {height_m:.2g} m before the laser point ({x:.4g}, {y:.4g}, {z:.4g}) m: "
+            f"only one path in {1 / share:.0e} finds the light between the two, up to half of H, and the stated error "
+            "misses it as well. Use render.engine: virtual_lights, or scan_type: confocal."
         )

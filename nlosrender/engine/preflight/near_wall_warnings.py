@@ -32,16 +32,15 @@ def _near_warnings(built: BuiltScene, capture: Capture) -> Iterator[str]:
     if not built.wall.is_planar:
         if height < OFFSETS_LOST * wall_offset(built):
             yield (
-                f"a hidden surface lies {height * to_m:.1g} m before the relay wall at ({x:.4g}, "
-                f"{y:.4g}, {z:.4g}) m of its frame: on a curved wall, light within "
+                f"a hidden surface lies {height * to_m:.1g} m before the relay wall at ({x:.4g}, {y:.4g}, "
+                f"{z:.4g}) m of its frame: on a curved wall, light within "
                 f"{OFFSETS_LOST * wall_offset(built) * to_m:.0g} m of it is not found."
             )
     elif height < NEAREST_KNOWN:
         yield (
             f"a hidden surface lies {height * to_m:.1g} m before the wall at ({x:.4g}, {y:.4g}, "
             f"{z:.4g}) m of its frame, where float32 knows heights to about {NEAREST_KNOWN / 10 * to_m:.0g} m: "
-            "H there is not exact unless the surface is parallel "
-            "to the wall."
+            "H there is not exact unless the surface is parallel to the wall."
         )
 
 
