@@ -42,7 +42,7 @@ def test_half_of_the_pairs_say_all(hidden: tuple[dict, ...], occluded: bool) -> 
     than twice the root of the sum of its squares apart.
     """
     engine, batch = engine_of(*hidden)
-    from nlosrender.engine.virtual_lights.third_bounce import estimated_error
+    from nlosrender.engine.virtual_lights.refinement import estimated_error
 
     assert engine.third.is_reciprocal
     assert engine.settings.needs_visibility == occluded

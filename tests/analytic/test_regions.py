@@ -51,7 +51,7 @@ def test_regions_agree_with_one_set_of_patches(hidden: tuple[dict, ...], scan: s
     Two is what a stated error is held to. Light is not lost: the energies, whose errors of patches here and there
     cancel, agree within a tenth of that.
     """
-    from nlosrender.engine.virtual_lights.third_bounce import estimated_error
+    from nlosrender.engine.virtual_lights.refinement import estimated_error
 
     divided, one = eager(*hidden, scan=scan), undivided(*hidden, scan=scan)
     assert divided.tessellator.regions is not None

@@ -40,7 +40,7 @@ def trace_view(
     steps = recurrence_steps(2)
     max_bounces = settings.bounces.max_bounces
 
-    # ---- State ---------------------------------------------------------------------------------------------------
+    # ---- State ------------------------------------------------------------------------------------------------------
     generator = mi.PCG32(randomness.generator)
     seq_u, seq_v = (mi.UInt32(start) for start in randomness.sequence[:2])
     started = mi.UInt32(0)  # paths begun by this lane
@@ -55,7 +55,7 @@ def trace_view(
     before = dr.zeros(mi.Interaction3f)  # the last vertex
 
     while dr.hint(alive | (started < n_samples), exclude=[settings, params, histogram, scene]):
-        # ---- Start the next path ---------------------------------------------------------------------------------
+        # ---- Start the next path ------------------------------------------------------------------------------------
         start = ~alive
         started = dr.select(start, started + 1, started)
         seq_u = dr.select(start, seq_u + steps[0], seq_u)
@@ -70,7 +70,7 @@ def trace_view(
         medium = dr.select(start, 1, medium)
         before.p = dr.select(start, params.camera, before.p)
 
-        # ---- Intersect -------------------------------------------------------------------------------------------
+        # ---- Intersect ----------------------------------------------------------------------------------------------
         si = scene.ray_intersect(ray, mi.RayFlags.All, coherent=False)
         hit = si.is_valid()
         leg = medium * dr.norm(si.p - before.p)
@@ -79,7 +79,7 @@ def trace_view(
         opl = dr.select(hit, opl + leg, opl)
         slot = _slot(settings, bounce)
 
-        # ---- An emitter found by chance: deposit -----------------------------------------------------------------
+        # ---- An emitter found by chance: deposit --------------------------------------------------------------------
         emitter = si.emitter(scene)
         found = emitter != None  # noqa: E711  # an array of pointers
         direction = mi.DirectionSample3f(scene, si, before)
@@ -91,7 +91,7 @@ def trace_view(
             arrival = dr.select(hit, arrival, -1)  # from infinitely far away: outside any window
         histogram.deposit(lane, no_laser, slot, arrival, carried * dr.select(is_delta, 1, share), found)
 
-        # ---- Connect to an emitter: deposit ----------------------------------------------------------------------
+        # ---- Connect to an emitter: deposit -------------------------------------------------------------------------
         bounce += 1
         go_on = mi.Bool(hit)
         if dr.hint(max_bounces is not None, mode="scalar"):
@@ -117,7 +117,7 @@ def trace_view(
             arrival = dr.select(mi.has_flag(towards.emitter.flags(), mi.EmitterFlags.Infinite), -1, arrival)
         histogram.deposit(lane, no_laser, _slot(settings, bounce), arrival, carried * share, connects)
 
-        # ---- Sample the next direction ---------------------------------------------------------------------------
+        # ---- Sample the next direction ------------------------------------------------------------------------------
         lobe = generator.next_float32(go_on)
         at = mi.Point2f(generator.next_float32(go_on), generator.next_float32(go_on))
         bs, weight = bsdf.sample(context, si, lobe, at, go_on)
@@ -130,7 +130,7 @@ def trace_view(
         before.p = si.p
         before.n = si.n
 
-        # ---- Stop ------------------------------------------------------------------------------------------------
+        # ---- Stop ---------------------------------------------------------------------------------------------------
         brightness = dr.max(mi.unpolarized_spectrum(throughput))
         alive = go_on & (brightness > 0)
         if dr.hint(settings.russian_roulette, mode="scalar"):

@@ -99,7 +99,7 @@ def trace_paths(
     stride = systematic.stride
     time_gate = params.time_gate if settings.has_time_gate else None
 
-    # ---- State -------------------------------------------------------------------------------------------------
+    # ---- State ------------------------------------------------------------------------------------------------------
     generator = mi.PCG32(randomness.generator)
     seq_v, seq_t = (mi.UInt32(start) for start in randomness.sequence[1:])
     starts = PathStarts(mi.UInt32(0), mi.UInt64(systematic.at), seq_v, seq_t)
@@ -116,7 +116,7 @@ def trace_paths(
         alive | (starts.count < n_samples),
         exclude=[settings, params, histogram, built, sampler, sensor, time_gate, n_samples, stride],
     ):
-        # ---- Intersect -----------------------------------------------------------------------------------------
+        # ---- Intersect ----------------------------------------------------------------------------------------------
         there = arrive(settings, params, way, alive)
         opl += medium * there.distance
         hit = mi.Bool(there.is_reached)
@@ -129,12 +129,12 @@ def trace_paths(
             time_gate, generator, hit, is_past_gate, opl, there.si.p, there.on_wall, throughput
         )
 
-        # ---- Connect to the lasers and deposit -----------------------------------------------------------------
+        # ---- Connect to the lasers and deposit ----------------------------------------------------------------------
         if dr.hint(settings.laser_sampling, mode="scalar"):
             lit_vertex = PathVertex(there.si, way.origin, there.leg, opl, throughput, bounce)
             connect_to_lasers(settings, params, histogram, generator, lit_vertex, hit & settings.is_deposited(bounce))
 
-        # ---- Continue, or start the next path ------------------------------------------------------------------
+        # ---- Continue, or start the next path -----------------------------------------------------------------------
         go_on = hit & settings.may_go_on(bounce)
         start = ~go_on & (starts.count < n_samples)
         alive = go_on | start
@@ -146,7 +146,7 @@ def trace_paths(
         is_past_gate &= ~start
         on_wall = vertex.shape == wall
 
-        # ---- Sample the next direction -------------------------------------------------------------------------
+        # ---- Sample the next direction ------------------------------------------------------------------------------
         if dr.hint(settings.goes_on, mode="scalar"):
             further = DirectionNumbers.drawn(generator, go_on)
             numbers = dr.select(start, numbers, further)
@@ -172,7 +172,7 @@ def trace_paths(
             alive &= ~misses
         medium *= eta
 
-        # ---- Stop ----------------------------------------------------------------------------------------------
+        # ---- Stop ---------------------------------------------------------------------------------------------------
         if dr.hint(settings.goes_on and settings.russian_roulette, mode="scalar"):
             survival = _survival(settings, params, survival, start, bounce)
             alive &= generator.next_float32(alive & ~start) < survival

@@ -12,7 +12,8 @@ from dataclasses import replace
 from nlosrender.engine.interface import Budget
 from nlosrender.engine.launch.pilot_points import Pilot, pilot_of
 from nlosrender.engine.launch.schedule import DEFAULT_TARGET
-from nlosrender.engine.virtual_lights.third_bounce import ThirdBounce, estimated_error
+from nlosrender.engine.virtual_lights.refinement import Gathered, estimated_error, finer_scale, refined_to
+from nlosrender.engine.virtual_lights.third_bounce import ThirdBounce
 from nlosrender.engine.virtual_lights.vpls.rounds import VplBounces
 
 
@@ -30,7 +31,7 @@ def calibrated_lights(third: ThirdBounce, further: VplBounces | None, budget: Bu
     if further is not None:
         share = tuning.third_shares[0]
     few = _pilot_of_patches(third, pilot)
-    patch_scale, gathered = third.calibrate(few, share * target)
+    patch_scale, gathered = _refined(third, few, share * target)
     if further is None:
         return replace(budget, patch_scale=patch_scale)
     goal, squares = tuning.rest_share_of_many * target, gathered.squares * (pilot.sensors.size / few.sensors.size)
@@ -43,9 +44,14 @@ def calibrated_lights(third: ThirdBounce, further: VplBounces | None, budget: Bu
         error = histogram.relative_error(done, squares)
     share = further.share_of_third(gathered.n_patches, error * math.sqrt(done) / target)
     if share < tuning.third_shares[0]:
-        patch_scale, _ = third.calibrate(few, share * target)
+        patch_scale, _ = _refined(third, few, share * target)
     rounds = further.rounds_needed(error, done, math.sqrt(tuning.share_squares - share**2) * target)
     return replace(budget, patch_scale=patch_scale, rounds=rounds)
+
+
+def _refined(third: ThirdBounce, pilot: Pilot, target: float) -> tuple[float, Gathered]:
+    known_squares = third.device.second_squares(pilot)
+    return refined_to(target, third.tessellator, lambda scale: third.gather(pilot, scale), known_squares)
 
 
 def _pilot_of_patches(third: ThirdBounce, pilot: Pilot) -> Pilot:
@@ -70,7 +76,7 @@ def _patch_scale_in_time(third: ThirdBounce, time_limit_s: float, target: float)
     patch_scale = third.tuning.coarsest_scale
     coarse, second = third.gather(pilot, patch_scale), third.device.second_squares(pilot)
     while True:
-        finer = third.finer(patch_scale, third.tuning.refinement)
+        finer = finer_scale(third.tessellator, patch_scale, third.tuning.refinement)
         begun = time.perf_counter()
         fine = third.gather(pilot, finer)
         predicted = (time.perf_counter() - begun) * more * 4

@@ -64,7 +64,7 @@ def virtual_light_estimate(
     calibrated = engine.calibrate(budget, seconds.calibration)
     calibration = time.perf_counter() - begun
     total, lit_shares, parts = calibration + _light_seconds(engine, plan, pilot, calibrated), None, []
-    parts.append("patches and walks settled")
+    parts.append("patch scale and VPL rounds calibrated")
     if engine.traces_paths:
         traced, lit_shares = sampling_cost(engine.paths, plan, calibrated, pilot, lanes, seconds.tracing)
         total += traced

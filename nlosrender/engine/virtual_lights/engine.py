@@ -27,7 +27,8 @@ from nlosrender.engine.virtual_lights.cost import gather_batch_bytes, virtual_li
 from nlosrender.engine.virtual_lights.elements.tessellator import Tessellator, wall_sees_itself
 from nlosrender.engine.virtual_lights.gather.lighting import GatherSettings
 from nlosrender.engine.virtual_lights.reciprocity import is_reciprocal
-from nlosrender.engine.virtual_lights.third_bounce import ThirdBounce, difference_divisor
+from nlosrender.engine.virtual_lights.refinement import difference_divisor
+from nlosrender.engine.virtual_lights.third_bounce import ThirdBounce
 from nlosrender.engine.virtual_lights.tuning import DEFAULT_TUNING, VirtualLightTuning
 from nlosrender.engine.virtual_lights.vpls.rounds import VplBounces
 
@@ -201,7 +202,7 @@ class VirtualLightEngine:
 
     def shared_samples(self) -> str:
         """Return what makes errors correlated; see ``Engine.shared_samples``."""
-        return "all sensor points share the same patches" + (" and walks" if self.further is not None else "")
+        return "all sensor points share the same patches" + (" and VPLs" if self.further is not None else "")
 
     def batch_bytes(self, plan: Plan, available: float = math.inf) -> int:
         """Return the memory of the largest batch; see ``Engine.batch_bytes``."""

@@ -1,4 +1,4 @@
-"""The third bounce of a batch: patches of the hidden geometry gathered at two resolutions, as fine as needed."""
+"""The third bounce of a batch: patches of the hidden geometry, lit by the lasers and gathered by the sensor points."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nlosrender.capture.plan import Batch
-from nlosrender.capture.relative_error import relative_l2_error
 from nlosrender.engine.launch.device_arrays import on_device
 from nlosrender.engine.launch.device_capture import DeviceCapture
 from nlosrender.engine.launch.histogram import HistogramShape
@@ -22,7 +21,7 @@ from nlosrender.engine.virtual_lights.elements.patches import Patches
 from nlosrender.engine.virtual_lights.elements.tessellator import Tessellator
 from nlosrender.engine.virtual_lights.gather.block_histogram import BlockHistogram
 from nlosrender.engine.virtual_lights.gather.device_patches import PatchRegions, upload_patches
-from nlosrender.engine.virtual_lights.gather.gather_passes import GatherPasses
+from nlosrender.engine.virtual_lights.gather.kernel import GatherPasses
 from nlosrender.engine.virtual_lights.gather.lighting import (
     ROWS,
     GatherSettings,
@@ -32,23 +31,9 @@ from nlosrender.engine.virtual_lights.gather.lighting import (
     light_patches,
     pack_patches,
 )
+from nlosrender.engine.virtual_lights.refinement import Gathered, coarser_scale
 from nlosrender.engine.virtual_lights.tuning import VirtualLightTuning
 from nlosrender.engine.virtual_lights.visibility.masks import VisibilityMasks, WallTiles, count_sensors
-
-
-@dataclass(frozen=True, eq=False)
-class Gathered:
-    """The third bounce at one resolution, (channel, 1, laser, sensor, row), per J and (engine unit)^2."""
-
-    values: NDArray[np.float64]
-    n_patches: int
-    patch_scale: float
-    merged: float  # share of the area that is in clusters
-
-    @property
-    def squares(self) -> float:
-        """Sum of squares inside the time window."""
-        return _squares(self.values)
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,12 +86,12 @@ class ThirdBounce:
         self.device, self.tessellator, self.settings, self.lanes = device, tessellator, settings, lanes
         self.is_reciprocal = is_reciprocal
         self.masks = VisibilityMasks(device.built, tessellator.tuning)
-        self._saved: dict[float, LitPatches] = {}  # per coarseness
+        self._saved: dict[float, LitPatches] = {}  # per patch scale
 
     def gather(self, batch: Batch | Pilot, patch_scale: float, passes: Passes | None = None) -> Gathered:
         """Gather a batch at one resolution."""
         passes = passes or Passes()
-        patches = self.tessellator.patches(patch_scale)  # made once: large ones are not kept
+        patches = self.tessellator.patches(patch_scale)  # made here once: the tessellator keeps small resolutions only
         if (earlier := passes.resumed("values")) is not None:
             values = earlier.arrays["values"]
         elif self.is_reciprocal and isinstance(batch, Batch):
@@ -115,9 +100,9 @@ class ThirdBounce:
             values = self._sums(batch, patch_scale, patches, passes.stage("sums")).on_host()
         passes.finish(Snapshot({"values": values}))
         # of the shared ones: how a capture is cut must not show in the error it states
-        merged = float(patches.areas[patches.is_cluster].sum() / max(patches.areas.sum(), 1e-300))
+        clustered = float(patches.areas[patches.is_cluster].sum() / max(patches.areas.sum(), 1e-300))
         count = len(patches) if self.tessellator.regions is None else self.tessellator.count(patch_scale)
-        return Gathered(values, max(count, 1), patch_scale, merged)  # 1: nothing may face the wall
+        return Gathered(values, max(count, 1), patch_scale, clustered)  # 1: nothing may face the wall
 
     @property
     def tuning(self) -> VirtualLightTuning:
@@ -207,14 +192,14 @@ class ThirdBounce:
     def _shared_lights(
         self, params: LaunchParams, shape: HistogramShape, patch_scale: float, patches: Patches, wall_tiles: WallTiles
     ) -> PackedPatches:
-        """Return what all sensor points gather; patches are kept lit where that serves other batches, too."""
+        """Return what all sensor points gather; lit patches are saved where other batches have the same lasers."""
         lit_patches = self._saved.get(patch_scale)
         if lit_patches is None:
             lit_patches = self._light_by_lasers(params, shape, patches, PatchRegions.of([len(patches)]), wall_tiles)
         elif self.settings.needs_visibility and not lit_patches.is_cleared:  # so far few points have looked
             lit_patches = lit_patches.cleared(MaskQuery(self.masks, wall_tiles))
         if self.settings.lights_once and len(patches) <= self.tuning.max_kept_patches:
-            # a batch looks at two resolutions
+            # a batch gathers two resolutions
             others = [(other, lit) for other, lit in self._saved.items() if other != patch_scale]
             self._saved = dict([*others, (patch_scale, lit_patches)][-2:])
         return pack_patches(self.settings, params, lit_patches, shape.replicas, shape.lasers)
@@ -238,70 +223,10 @@ class ThirdBounce:
 
     def pair(self, batch: Batch | Pilot, patch_scale: float, passes: Passes | None = None) -> tuple[Gathered, Gathered]:
         """Gather a batch at ``patch_scale`` and at the coarser resolution it is compared with."""
-        passes = passes or Passes()
-        coarse = self.gather(
-            batch, self.coarser(patch_scale), passes.stage("coarse", 0, 1 / (1 + self.tuning.refinement))
-        )
-        return coarse, self.gather(batch, patch_scale, passes.stage("fine", 1 / (1 + self.tuning.refinement), 1))
-
-    def calibrate(self, pilot: Pilot, target: float) -> tuple[float, Gathered]:
-        """Return the fineness whose estimated error is at most ``target``, and the pilot's third bounce at it.
-
-        The error is that of the second and third bounce together.
-        """
-        tuning, second = self.tuning, self.device.second_squares(pilot)
-        levels = [(self.gather(pilot, tuning.coarsest_scale), math.inf)]  # and its error, coarse to fine
-        patch_scale = self.finer(tuning.coarsest_scale, tuning.refinement)
-        while True:
-            fine = self.gather(pilot, patch_scale)
-            # None nearer: two that differ in few patches only differ by more than either errs, by how they are cut.
-            levels = levels[_last_at_most(levels, fine.n_patches / tuning.min_patch_ratio) :]
-            coarse = levels[0][0]
-            error = estimated_error(coarse, fine, second)
-            coarser = self.coarser(patch_scale)
-            if error <= target and not math.isclose(coarse.patch_scale, coarser, rel_tol=tuning.same_scale):
-                # as the render will estimate it, from the pair of resolutions that it has
-                error = max(error, estimated_error(self.gather(pilot, coarser), fine, second))
-            needed = fine.n_patches * error / target
-            # float32 path lengths and grazing contacts leave an error that no refinement takes away
-            earlier = levels[_last_at_most(levels, fine.n_patches / 2)][1]
-            is_stuck = (
-                tuning.stagnation * earlier < error < tuning.max_regular_error and fine.n_patches > 2 * coarse.n_patches
-            )
-            in_vain = is_stuck or (error < tuning.max_regular_error and needed > tuning.max_patches)
-            if error <= target or in_vain or 2 * fine.n_patches > tuning.max_patches:
-                return patch_scale, fine
-            levels.append((fine, error))
-            patch_scale = self.finer(patch_scale, self._step(error / target))
-
-    def _step(self, excess: float) -> float:
-        """Return how many times more patches the next level has, for an error ``excess`` times the target."""
-        tuning = self.tuning
-        return min(max(tuning.refinement_margin * excess, tuning.min_refinement), tuning.refinement)
-
-    def finer(self, patch_scale: float, factor: float) -> float:
-        """Return a coarseness with at least ``factor`` times the patches (a mesh may be finer than asked for).
-
-        Of hidden surfaces and wall each: if only one of them became finer, the error of the other would not show.
-        """
-        counts, finer = self.tessellator.counts(patch_scale), patch_scale / math.sqrt(factor)
-        while any(
-            0 < more < 0.9 * factor * count for more, count in zip(self.tessellator.counts(finer), counts, strict=True)
-        ):
-            finer *= 0.9
-        return finer
-
-    def coarser(self, patch_scale: float) -> float:
-        """Return the coarseness that ``patch_scale`` is compared with: a third of the patches, or all there are."""
-        counts, coarser = self.tessellator.counts(patch_scale), patch_scale * math.sqrt(self.tuning.refinement)
-        while coarser < self.tuning.coarsest_scale and any(
-            less > count / self.tuning.refinement
-            for less, count in zip(self.tessellator.counts(coarser), counts, strict=True)
-        ):
-            coarser = min(
-                1.1 * coarser, self.tuning.coarsest_scale
-            )  # beyond it the law of the error's decrease does not hold
-        return coarser
+        passes, coarser = passes or Passes(), coarser_scale(self.tessellator, patch_scale)
+        share = 1 / (1 + self.tuning.refinement)
+        coarse = self.gather(batch, coarser, passes.stage("coarse", 0, share))
+        return coarse, self.gather(batch, patch_scale, passes.stage("fine", share, 1))
 
     def shape(self, batch: Batch | Pilot) -> HistogramShape:
         """Return the histogram's shape, whose replicas are slices: lanes that share the patches of a sensor point.
@@ -326,34 +251,3 @@ class ThirdBounce:
         if self.tessellator.regions is not None:
             regions = np.tile(self.tessellator.regions.labels[indices][order], shape.replicas)
         return _Lanes(params, lane, replica, order, regions)
-
-
-def _last_at_most(levels: list[tuple[Gathered, float]], n_patches: float) -> int:
-    """Return the index of the finest resolution of at most so many patches, of the coarsest if all have more."""
-    return max((index for index, (gathered, _) in enumerate(levels) if gathered.n_patches <= n_patches), default=0)
-
-
-def estimated_error(coarse: Gathered, fine: Gathered, known_squares: float = 0.0) -> float:
-    """Return the relative L2 error of the finer resolution, with ``known_squares`` of other bounces beside it."""
-    noise = _squares(fine.values - coarse.values) / difference_divisor(coarse, fine) ** 2
-    return relative_l2_error(noise, fine.squares + noise + known_squares)
-
-
-def difference_divisor(coarse: Gathered, fine: Gathered) -> float:
-    """Return what to divide the difference of two resolutions by to have the error of the finer one.
-
-    The error of patches cut from the same surfaces falls as 1 / n patches: the difference is (r - 1) times the
-    finer's error, with r the ratio of the counts. The error of random visibility rays falls as n^(-3/4) and is
-    independent: sqrt(r^1.5 + 1). So are those of clusters, whose boxes lie elsewhere at every coarseness; they fall at
-    least as fast, with the boxes' size: where small triangles cease to be merged there may be many more patches.
-    """
-    ratio = min(fine.n_patches / coarse.n_patches, (coarse.patch_scale / fine.patch_scale) ** 2)
-    ratio = max(ratio, 1.0 + 1e-9)
-    independent = math.sqrt(ratio**1.5 + 1)
-    return (1 - fine.merged) * min(ratio - 1, independent) + fine.merged * independent
-
-
-def _squares(values: NDArray[np.float64]) -> float:
-    """Return the sum of the squares inside the time window, without a copy of it."""
-    inside = values[..., :-1]
-    return float(np.einsum("abcde,abcde->", inside, inside))

@@ -1,18 +1,23 @@
-"""The gather: every sensor point looks at every patch; each patch's light is spread over the bins it covers.
+"""The gather of the third bounce: every sensor point adds the light of every patch to the bins it covers.
 
-One lane per sensor point walks over all patches, so that a lane owns its rows of the histogram (``spread``). The lanes
-of a packet are neighbouring sensor points that look at one point of the same patch: packets of rays stay together.
+One lane per sensor point loops over all patches, so that a lane owns its rows of the histogram. The lanes of a packet
+are neighbouring sensor points whose shadow rays go to one point of the same patch: packets of rays stay together. The
+loop is cut into passes, kernels of about half a second; a lane adds its patches one after the other, so the cuts change
+no bit.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
-from nlosrender.engine.launch.device_arrays import WallPoints
+from nlosrender.engine.launch.device_arrays import WallPoints, on_device
 from nlosrender.engine.launch.launch_params import LaunchParams
+from nlosrender.engine.launch.passes import Passes, PassSize, Snapshot
 from nlosrender.engine.virtual_lights.gather.block_histogram import BlockHistogram
 from nlosrender.engine.virtual_lights.gather.delay_distribution import Delays, deposit_patch
 from nlosrender.engine.virtual_lights.gather.lighting import (
@@ -20,8 +25,58 @@ from nlosrender.engine.virtual_lights.gather.lighting import (
     GatherSettings,
     PackedPatches,
     four_corners,
-    is_visible,
 )
+from nlosrender.engine.virtual_lights.visibility.shadow_rays import is_visible
+
+
+class GatherPasses:
+    """Gathers groups of patches, the same ones in the same order every time, into a histogram.
+
+    Parameters
+    ----------
+    settings, histogram
+        What is gathered, and where to.
+    passes
+        Reported to between two kernels; may hold a saved state to go on from.
+    first_pairs
+        Of patches with sensor and laser points in the first kernel.
+    """
+
+    def __init__(self, settings: GatherSettings, histogram: BlockHistogram, passes: Passes, first_pairs: int):
+        self._settings, self._histogram, self._passes = settings, histogram, passes
+        self._group = self._first_group = self._skipped = 0
+        if (earlier := passes.resumed("sums")) is not None:
+            histogram.sums, histogram.outside = (
+                on_device(mi.Float64, earlier.arrays[name]) for name in ("sums", "outside")
+            )
+            self._first_group, self._skipped = earlier.numbers["group"], earlier.numbers["skipped"]
+        self._size = PassSize(max(1, first_pairs // (histogram.shape.lanes * histogram.shape.lasers)))
+
+    def gather(
+        self, params: LaunchParams, packed: PackedPatches, lane: mi.UInt32, part: mi.UInt32, tile: mi.UInt64
+    ) -> None:
+        """Gather the next group; parameters as for ``gather_third_bounce``."""
+        group, self._group = self._group, self._group + 1
+        if group < self._first_group:
+            return
+        longest = int(np.diff(np.array(packed.first)).max())
+        done = self._skipped if group == self._first_group else 0
+        while done < longest:
+            steps = min(self._size.steps, longest - done)
+            self._size.begin()
+            cut = (dr.opaque(mi.UInt32, number) for number in (done, steps))
+            gather_third_bounce(self._settings, params, packed, self._histogram, lane, part, tile, *cut)
+            dr.eval(self._histogram.sums, self._histogram.outside)
+            dr.sync_thread()
+            self._size.end()
+            done += steps
+            share = 1 - 0.5**group * (1 - done / longest)  # how many groups there are is not known
+            self._passes.between(share, partial(self._state, group, done))
+
+    def _state(self, group: int, done: int) -> Snapshot:
+        histogram = self._histogram
+        arrays = {"sums": histogram.sums.numpy(), "outside": histogram.outside.numpy()}
+        return Snapshot(arrays, {"group": group, "skipped": done})
 
 
 @dr.syntax
@@ -61,7 +116,7 @@ def gather_third_bounce(
 
     end = dr.gather(mi.UInt32, packed.first, part + 1)
 
-    # ---- State ---------------------------------------------------------------------------------------------------
+    # ---- State ------------------------------------------------------------------------------------------------------
     patch = dr.gather(mi.UInt32, packed.first, part) + skipped
     end = dr.minimum(end, patch + most)
 
@@ -81,7 +136,7 @@ def gather_third_bounce(
             tile,
         ],
     ):
-        # ---- The patch as the sensor point sees it -----------------------------------------------------------------
+        # ---- The patch as the sensor point sees it ------------------------------------------------------------------
         rows = [dr.gather(mi.Vector4f, packed.packed, patch * ROWS + k) for k in range(ROWS)]
         a, b, c, centre, shown, offset = (mi.Point3f(row.x, row.y, row.z) for row in rows)
         from_sensor = centre - sensor.p
@@ -103,14 +158,14 @@ def gather_third_bounce(
         if dr.hint(packed.has_clusters, mode="scalar"):
             is_cluster = rows[3].w > 0
 
-        # ---- Visibility --------------------------------------------------------------------------------------------
+        # ---- Visibility ---------------------------------------------------------------------------------------------
         if dr.hint(settings.needs_visibility, mode="scalar"):
             # in front of the plane through the point that is looked at, not through the centre
             way = from_sensor + shown
             mask = dr.select(dr.dot(areas, way) < 0, dr.gather(mi.UInt64, packed.mask, patch), 0)
             active = is_visible(built, sensor, way, mi.Vector3f(offset), active, mask, tile)
 
-        # ---- Reflect towards the lasers and deposit ----------------------------------------------------------------
+        # ---- Reflect towards the lasers and deposit -----------------------------------------------------------------
         scale = params.bins_per_unit
         delays = mi.Vector4f(
             *(dr.norm(end - sensor.p) * scale + sensors.delay_fraction for end in four_corners(a, b, c))

@@ -10,10 +10,10 @@ import numpy as np
 
 from nlosrender.engine.launch.device_arrays import on_device
 from nlosrender.engine.launch.launch_params import LaunchParams
-from nlosrender.engine.launch.ray_offsets import off_the_wall
 from nlosrender.engine.virtual_lights.gather.device_patches import DevicePatches
 from nlosrender.engine.virtual_lights.tuning import DEFAULT_TUNING
 from nlosrender.engine.virtual_lights.visibility.masks import VisibilityMasks, WallTiles
+from nlosrender.engine.virtual_lights.visibility.shadow_rays import is_visible
 from nlosrender.scene.build import BuiltScene
 
 ROWS = 6  # of four numbers each, aligned loads: what the gather reads of a patch
@@ -228,29 +228,6 @@ def _lit_fraction(
         takes = is_lit & (mi.sample_tea_float32(index, patches.start.x) * mi.Float(n_seen) < 1)
         chosen = dr.select(takes, point, chosen)
     return mi.Float(n_seen) / settings.laser_rays, chosen
-
-
-def is_visible(
-    built: BuiltScene,
-    wall_point: mi.SurfaceInteraction3f,
-    way: mi.Vector3f,
-    offset: mi.Vector3f,
-    active: mi.Bool,
-    mask: mi.UInt64 | None = None,
-    tile: mi.UInt64 | None = None,
-) -> mi.Bool:
-    """Return whether nothing lies on the way from a point of the wall to a point of a hidden surface.
-
-    The shadow ray ends at the latter moved by ``offset``, the ray offset along the surface's normal, to the side that
-    faces the wall point. Where ``mask``, that of the surface point, holds ``tile``, that of the wall point, no ray is
-    traced.
-    """
-    origin = off_the_wall(built, wall_point)
-    direction = way - (origin - wall_point.p)
-    direction -= offset * dr.sign(dr.dot(offset, direction))
-    asked = active if mask is None else active & ((mask & tile) == 0)
-    ray = mi.Ray3f(origin, direction, mi.Float(1), mi.Float(0), [])
-    return active & ~(asked & built.scene.ray_test(ray, coherent=False, active=asked))
 
 
 def four_corners(a: mi.Point3f, b: mi.Point3f, c: mi.Point3f) -> tuple[mi.Point3f, ...]:

@@ -14,8 +14,8 @@ from nlosrender.engine.launch.histogram import DeviceHistogram, HistogramShape
 from nlosrender.engine.launch.launch_params import LaunchParams
 from nlosrender.engine.launch.ray_offsets import off_the_surface
 from nlosrender.engine.virtual_lights.gather.device_patches import to_points
-from nlosrender.engine.virtual_lights.gather.lighting import is_visible
 from nlosrender.engine.virtual_lights.visibility.masks import Surface, VisibilityMasks, WallTiles
+from nlosrender.engine.virtual_lights.visibility.shadow_rays import is_visible
 from nlosrender.engine.virtual_lights.vpls.sampler import Vpls
 from nlosrender.engine.virtual_lights.vpls.subpaths import VplContributions, arriving
 from nlosrender.scene.build import BuiltScene
@@ -23,13 +23,13 @@ from nlosrender.scene.build import BuiltScene
 
 @dataclass(frozen=True, eq=False)
 class VplTable:
-    """What the gather reads of the sites that anything leaves, one lane per site."""
+    """What the gather reads of the VPLs that have contributions, one lane per VPL."""
 
-    packed: mi.Float  # eight a site: position, first impulse; normal times area, end of the impulses
+    packed: mi.Float  # eight a VPL: position, first contribution; normal times area, end of its contributions
     offset: mi.Vector3f  # ray offset along the normal
     shading: mi.Normal3f
     mask: mi.UInt64  # see ``VisibilityMasks.of``
-    first: mi.UInt32  # per replica: its sites are first[r] to first[r + 1]
+    first: mi.UInt32  # per replica: its VPLs are first[r] to first[r + 1]
 
     @classmethod
     def of(
@@ -86,9 +86,9 @@ def gather_contributions(
     shape: HistogramShape,
     histogram: DeviceHistogram,
 ) -> None:
-    """Deposit what leaves the sites: lane by lane over the sites of its replica, site by site over the impulses.
+    """Deposit the contributions of VPLs: a lane loops over the VPLs of its replica and, for each, its contributions.
 
-    Of the sites of a replica so many are skipped, and so many are gathered at most, as ``cut`` says (opaque).
+    ``cut`` (opaque): how many VPLs of a replica are skipped, and how many are gathered at most.
     """
     built, sensors = params.built, params.sensors
     sensor, wall_bsdf, context = sensors.interaction, built.wall_bsdf, mi.BSDFContext()
@@ -106,23 +106,23 @@ def gather_contributions(
         vpl < end,
         exclude=[params, table, contributions, histogram, built, sensors, sensor, wall_bsdf, end, own_laser, tile],
     ):
-        # ---- The site as the sensor point sees it ------------------------------------------------------------------
+        # ---- Connect to the VPL -------------------------------------------------------------------------------------
         at = dr.gather(mi.Vector4f, table.packed, vpl * 2)
         by = dr.gather(mi.Vector4f, table.packed, vpl * 2 + 1)
         position, areas = mi.Point3f(at.x, at.y, at.z), mi.Vector3f(by.x, by.y, by.z)
-        to_site = position - sensor.p
-        distance2 = dr.squared_norm(to_site)
+        to_vpl = position - sensor.p
+        distance2 = dr.squared_norm(to_vpl)
         distance = dr.sqrt(distance2)
-        direction = to_site / distance
+        direction = to_vpl / distance
         weight = wall_bsdf.eval(context, sensor, sensor.to_local(direction))
         weight *= dr.maximum(-dr.dot(areas, direction), 0) / distance2
         active = dr.any(weight > 0)
         if dr.hint(needs_visibility, mode="scalar"):
             mask = dr.gather(mi.UInt64, table.mask, vpl)
             offset = dr.gather(mi.Vector3f, table.offset, vpl)
-            active = is_visible(built, sensor, to_site, offset, active, mask, tile)
+            active = is_visible(built, sensor, to_vpl, offset, active, mask, tile)
 
-        # ---- Deposit its impulses ------------------------------------------------------------------------------------
+        # ---- Deposit its contributions ------------------------------------------------------------------------------
         delay = distance * scale + sensors.delay_fraction
         contribution = dr.reinterpret_array(mi.UInt32, at.w)
         last = dr.select(active, dr.reinterpret_array(mi.UInt32, by.w), 0)

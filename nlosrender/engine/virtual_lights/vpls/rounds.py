@@ -36,7 +36,7 @@ class VplBounces:
     device
         The capture on the device.
     tessellator
-        Holds the cells the sites lie on.
+        Holds the elements that VPLs lie on.
     masks
         Tell what may lie between wall and hidden surfaces; None: nothing may.
     """
@@ -54,7 +54,7 @@ class VplBounces:
         )
         pairs = capture.n_sensors * (capture.n_lasers if capture.scan_type == "exhaustive" else 1)
         self.is_confocal = capture.scan_type == "confocal"
-        # every impulse of a confocal capture takes a ray of its own to the laser
+        # every contribution of a confocal capture takes a shadow ray of its own to the laser
         kept = tuning.confocal_contributions_per_vpl, tuning.contributions_per_vpl
         self.contributions_per_vpl = kept[0 if self.is_confocal else 1]
         lasers = capture.n_lasers if capture.scan_type == "exhaustive" else 1
@@ -65,11 +65,11 @@ class VplBounces:
 
     @cached_property
     def sampler(self) -> VplSampler:
-        """What draws the sites; made when it is needed, for it holds all cells."""
+        """Sampler of VPL positions; made when it is needed, for it holds all elements."""
         return VplSampler(self.tessellator, self.device.capture_gate)
 
     def plan(self, replicas: int) -> SubpathPlan:
-        """Return the numbers of a round of ``replicas`` independent sets of sites."""
+        """Return the numbers of a round of ``replicas`` independent sets of VPLs."""
         vpls = max(self.vpls_per_round // replicas, 16)
         max_bounces = self.options.bounces.max_bounces
         confocal, capture_gate = self.is_confocal, self.device.capture_gate
@@ -79,11 +79,11 @@ class VplBounces:
 
     @property
     def contributions_per_round(self) -> int:
-        """Impulses that every sensor point receives per round, at most."""
+        """Contributions that every sensor point receives per round, at most."""
         return self.vpls_per_round * self.contributions_per_vpl
 
     def share_of_third(self, patches: int, noise: float) -> float:
-        """Return the one of ``third_shares`` with which patches and walks together take the fewest rays.
+        """Return the one of ``third_shares`` that takes the fewest rays in all (docs/virtual-lights.md, 8).
 
         Parameters
         ----------
@@ -180,9 +180,9 @@ class VplBounces:
         batch, histogram, number
             What is rendered, where to; which round.
         report_progress
-            Called between kernels with the sites that every replica is done with.
+            Called between kernels with the number of VPLs that every replica is done with.
         skipped
-            Sites that every replica is done with already.
+            VPLs that every replica is done with already.
         """
         shape = histogram.shape
         plan = self.plan(shape.replicas)

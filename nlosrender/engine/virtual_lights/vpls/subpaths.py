@@ -91,7 +91,7 @@ def trace_subpaths(
     square = mi.Point2f(mi.Float(randomness.sequence[0] >> 8), mi.Float(randomness.sequence[1] >> 8)) * 2.0**-24
     gate_survival = 1.0 if time_gate is None else time_gate.survival
 
-    # ---- State -------------------------------------------------------------------------------------------------
+    # ---- State ------------------------------------------------------------------------------------------------------
     throughput = mi.Spectrum(reflectance)
     direction = vpls.sh_frame.to_world(mi.warp.square_to_cosine_hemisphere(square))
     ray = mi.Ray3f(offset_origin(built, vpls, direction), direction)
@@ -106,18 +106,18 @@ def trace_subpaths(
     is_past_gate = mi.Bool(False)  # all light still to be found comes too late; survived that roulette
 
     while dr.hint(alive, exclude=[built, scene, proposal_lasers, vpls, time_gate]):
-        # ---- Intersect -------------------------------------------------------------------------------------------
+        # ---- Intersect ----------------------------------------------------------------------------------------------
         si = scene.ray_intersect(ray, mi.RayFlags.All, coherent=False, active=alive)
         alive = alive & si.is_valid()
         opl += dr.norm(si.p - origin)
         bounce += 1
 
-        # ---- Roulette for what comes after the time window, once a subpath -----------------------------------------
+        # ---- Roulette for what comes after the time window, once a subpath ------------------------------------------
         alive, is_past_gate, throughput = time_gate_roulette(
             time_gate, generator, alive, is_past_gate, opl, si.p, si.shape == wall, throughput
         )
 
-        # ---- Light expected of the lasers, visibility aside; a plane is dark to its own laser points ---------------
+        # ---- Light expected of the lasers, visibility aside; a plane is dark to its own laser points ----------------
         bsdf = si.bsdf()
         hidden = alive & (mi.Frame3f.cos_theta(si.wi) > 0)
         if dr.hint(built.wall.is_planar, mode="scalar"):
@@ -141,7 +141,7 @@ def trace_subpaths(
         found = SubpathVertex(si.p, si.n, mi.Normal3f(si.sh_frame.n), si.shape, leaving, opl, bounce, lit)
         vertex = dr.select(pick, found, vertex)
 
-        # ---- Sample the next direction -----------------------------------------------------------------------------
+        # ---- Sample the next direction ------------------------------------------------------------------------------
         if dr.hint(max_bounces is not None, mode="scalar"):
             alive &= bounce < max_bounces
         lobe = generator.next_float32(alive)

@@ -1,0 +1,128 @@
+"""Refinement of the third bounce: two resolutions, the error that their difference states, and how fine is enough.
+
+Richardson extrapolation, docs/virtual-lights.md, 6.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nlosrender.capture.relative_error import relative_l2_error
+from nlosrender.engine.virtual_lights.elements.tessellator import Tessellator
+
+
+@dataclass(frozen=True, eq=False)
+class Gathered:
+    """The third bounce at one resolution, (channel, 1, laser, sensor, row), per J and (engine unit)^2."""
+
+    values: NDArray[np.float64]
+    n_patches: int
+    patch_scale: float
+    clustered_share: float  # of the area
+
+    @property
+    def squares(self) -> float:
+        """Sum of squares inside the time window."""
+        return _squares(self.values)
+
+
+def estimated_error(coarse: Gathered, fine: Gathered, known_squares: float = 0.0) -> float:
+    """Return the relative L2 error of the finer resolution, with ``known_squares`` of other bounces beside it."""
+    noise = _squares(fine.values - coarse.values) / difference_divisor(coarse, fine) ** 2
+    return relative_l2_error(noise, fine.squares + noise + known_squares)
+
+
+def difference_divisor(coarse: Gathered, fine: Gathered) -> float:
+    """Return the divisor that turns the difference of two resolutions into the error of the finer one.
+
+    The error of patches cut from the same surfaces falls as 1 / n: the difference is (r - 1) times the finer's error,
+    with r the ratio of the numbers of patches (Richardson 1911). The error of random shadow rays falls as n^(-3/4) and
+    is independent: sqrt(r^1.5 + 1). So is that of clusters, whose boxes lie elsewhere at every scale; it falls at least
+    as fast, with the boxes' size: where small triangles cease to be merged there may be many more patches.
+    """
+    ratio = min(fine.n_patches / coarse.n_patches, (coarse.patch_scale / fine.patch_scale) ** 2)
+    ratio = max(ratio, 1.0 + 1e-9)
+    independent = math.sqrt(ratio**1.5 + 1)
+    return (1 - fine.clustered_share) * min(ratio - 1, independent) + fine.clustered_share * independent
+
+
+def finer_scale(tessellator: Tessellator, patch_scale: float, factor: float) -> float:
+    """Return a patch scale with at least ``factor`` times the patches (a mesh may be finer than asked for).
+
+    Of hidden surfaces and wall each: if only one of them became finer, the error of the other would not show.
+    """
+    counts, finer = tessellator.counts(patch_scale), patch_scale / math.sqrt(factor)
+    while any(0 < more < 0.9 * factor * count for more, count in zip(tessellator.counts(finer), counts, strict=True)):
+        finer *= 0.9
+    return finer
+
+
+def coarser_scale(tessellator: Tessellator, patch_scale: float) -> float:
+    """Return the patch scale that ``patch_scale`` is compared with: a third of the patches, or the coarsest there is.
+
+    Beyond the coarsest the law of the error's decrease does not hold.
+    """
+    refinement, coarsest = tessellator.tuning.refinement, tessellator.tuning.coarsest_scale
+    counts, coarser = tessellator.counts(patch_scale), patch_scale * math.sqrt(refinement)
+    while coarser < coarsest and any(
+        less > count / refinement for less, count in zip(tessellator.counts(coarser), counts, strict=True)
+    ):
+        coarser = min(1.1 * coarser, coarsest)
+    return coarser
+
+
+def refined_to(
+    target: float, tessellator: Tessellator, gather: Callable[[float], Gathered], known_squares: float
+) -> tuple[float, Gathered]:
+    """Return the patch scale whose estimated error is at most ``target``, and the third bounce at it.
+
+    Ends earlier where refining is in vain: float32 path lengths and grazing contacts leave an error that no refinement
+    takes away, and ``max_patches`` bounds the number of patches.
+
+    Parameters
+    ----------
+    target
+        Relative L2 error of the second and third bounce together.
+    tessellator, gather
+        Count the patches of a scale, and gather them on a few points of the capture.
+    known_squares
+        Sum of the squares of the second bounce at these points [(engine unit)^-4].
+    """
+    tuning = tessellator.tuning
+    levels = [(gather(tuning.coarsest_scale), math.inf)]  # and its error, coarse to fine
+    patch_scale = finer_scale(tessellator, tuning.coarsest_scale, tuning.refinement)
+    while True:
+        fine = gather(patch_scale)
+        # no level nearer: two that differ in few patches differ by more than either errs, by how they are cut
+        levels = levels[_last_at_most(levels, fine.n_patches / tuning.min_patch_ratio) :]
+        coarse = levels[0][0]
+        error = estimated_error(coarse, fine, known_squares)
+        coarser = coarser_scale(tessellator, patch_scale)
+        if error <= target and not math.isclose(coarse.patch_scale, coarser, rel_tol=tuning.same_scale):
+            # as the render will estimate it, from the pair of resolutions that it has
+            error = max(error, estimated_error(gather(coarser), fine, known_squares))
+        earlier = levels[_last_at_most(levels, fine.n_patches / 2)][1]
+        is_stuck = tuning.stagnation * earlier < error and fine.n_patches > 2 * coarse.n_patches
+        is_beyond = fine.n_patches * error / target > tuning.max_patches
+        in_vain = error < tuning.max_regular_error and (is_stuck or is_beyond)
+        if error <= target or in_vain or 2 * fine.n_patches > tuning.max_patches:
+            return patch_scale, fine
+        levels.append((fine, error))
+        more = max(tuning.refinement_margin * error / target, tuning.min_refinement)
+        patch_scale = finer_scale(tessellator, patch_scale, min(more, tuning.refinement))
+
+
+def _last_at_most(levels: list[tuple[Gathered, float]], n_patches: float) -> int:
+    """Return the index of the finest level of at most ``n_patches``, of the coarsest if all have more."""
+    return max((index for index, (gathered, _) in enumerate(levels) if gathered.n_patches <= n_patches), default=0)
+
+
+def _squares(values: NDArray[np.float64]) -> float:
+    """Return the sum of the squares inside the time window, without a copy of it."""
+    inside = values[..., :-1]
+    return float(np.einsum("abcde,abcde->", inside, inside))
