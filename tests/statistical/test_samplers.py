@@ -12,7 +12,7 @@ from support.agreement import FALSE_ALARM
 from support.rendering import configured, flat_wall
 
 from nlosrender.engine.backend.start import start_backend
-from nlosrender.engine.launch.recurrence import recurrence_steps
+from nlosrender.engine.launch.sequences import recurrence_steps
 from nlosrender.rendering import stages
 
 N = 2**20

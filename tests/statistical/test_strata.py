@@ -38,22 +38,22 @@ def path_engine(config: dict):
 
 @pytest.mark.parametrize(("first", "n"), [(0, 1), (0, 7), (32, 4096), (5, 100_003)])
 def test_every_stratum_is_visited_once(first: int, n: int) -> None:
-    """Path i of a stage of n takes its first coordinate from the i-th of n equal parts, at one place in all parts."""
+    """Path i of a block of n takes its first coordinate from the i-th of n equal parts, at one place in all parts."""
     import mitsuba as mi
 
-    from nlosrender.engine.launch.systematic_sequence import SystematicSequence, first_coordinate
+    from nlosrender.engine.launch.sequences import SystematicSequence, first_coordinate
 
     starts = np.array([0, 1, 2**31, 2**32 - 1], dtype=np.uint32)
     strata = SystematicSequence.of_paths(range(first, first + n), mi.UInt32(starts))
     stride = int(np.array(strata.stride)[0])
-    at = np.array(strata.at)
+    position = np.array(strata.position)
     for lane in range(len(starts)):
-        exact = [int(at[lane]) + i * stride for i in range(n)]
+        exact = [int(position[lane]) + i * stride for i in range(n)]
         # the upper 32 bits are what is used: parts are 2^32 / n wide
         parts = [(value >> 32) * n // 2**32 for value in exact]
         off = np.array(parts) - np.arange(n)
         assert set(off) <= {0, -1}  # -1: the place is the part's left edge, rounded down to 32 bits
-    np.testing.assert_array_equal(np.array(first_coordinate(strata.at)), at >> np.uint64(32))
+    np.testing.assert_array_equal(np.array(first_coordinate(strata.position)), position >> np.uint64(32))
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -63,12 +63,12 @@ def test_the_place_within_the_parts_is_uniform(seed: int) -> None:
     from scipy import stats
 
     from nlosrender.engine.launch.lane_random_state import LaneRandomness
-    from nlosrender.engine.launch.systematic_sequence import SystematicSequence, first_coordinate
+    from nlosrender.engine.launch.sequences import SystematicSequence, first_coordinate
 
     n = 5
     lanes = mi.UInt32(np.arange(4096, dtype=np.uint32))
     strata = SystematicSequence.of_paths(range(64, 64 + n), LaneRandomness.seeded(seed, lanes).sequence[0])
-    within = np.array(first_coordinate(strata.at)) / 2.0**32 * n
+    within = np.array(first_coordinate(strata.position)) / 2.0**32 * n
     assert within.max() < 1 + 1e-6
     assert stats.kstest(within, "uniform").pvalue > 1e-4  # false alarm in one of 1e4
 

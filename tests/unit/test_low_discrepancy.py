@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from nlosrender.engine.launch.recurrence import recurrence_steps
+from nlosrender.engine.launch.sequences import recurrence_steps
 
 
 @pytest.mark.parametrize("dimensions", [1, 2, 3])

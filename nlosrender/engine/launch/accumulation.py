@@ -80,7 +80,7 @@ class Accumulation:
         begun, is_first = time.perf_counter() - before, True
         while (more := schedule.next_samples(done, time.perf_counter() - begun)) > 0:
             launched = time.perf_counter()
-            randomness = self.launch(histogram, randomness, more, schedule.stage)
+            randomness = self.launch(histogram, randomness, more, schedule.block)
             dr.sync_thread()
             seconds = time.perf_counter() - launched
             if is_first:

@@ -10,7 +10,7 @@ import numpy as np
 
 from nlosrender.engine.launch.device_arrays import on_device
 from nlosrender.engine.launch.passes import Snapshot
-from nlosrender.engine.launch.systematic_sequence import SystematicSequence
+from nlosrender.engine.launch.sequences import SystematicSequence
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,10 +28,10 @@ class LaneRandomness:
         arrays |= {f"sequence{k}": state for k, state in enumerate(self.sequence)}
         numbers: dict[str, object] = {}
         if self.phase is not None:
-            arrays["turn"] = self.phase
+            arrays["phase"] = self.phase
         if self.systematic is not None:
-            arrays["at"] = self.systematic.at
-            numbers["stage"] = [self.systematic.stage.start, self.systematic.stage.stop]
+            arrays["position"] = self.systematic.position
+            numbers["block"] = [self.systematic.block.start, self.systematic.block.stop]
         return Snapshot({name: np.asarray(values.numpy()) for name, values in arrays.items()}, numbers)
 
     @classmethod
@@ -41,11 +41,11 @@ class LaneRandomness:
         generator = mi.PCG32(len(arrays["state"]))
         generator.state, generator.inc = (on_device(mi.UInt64, arrays[name]) for name in ("state", "inc"))
         sequence = [on_device(mi.UInt32, arrays[f"sequence{k}"]) for k in range(3)]
-        phase = on_device(mi.UInt32, arrays["turn"]) if "turn" in arrays else None
+        phase = on_device(mi.UInt32, arrays["phase"]) if "phase" in arrays else None
         systematic = None
-        if "at" in arrays:
+        if "position" in arrays:
             systematic = SystematicSequence.at_position(
-                range(*snapshot.numbers["stage"]), on_device(mi.UInt64, arrays["at"])
+                range(*snapshot.numbers["block"]), on_device(mi.UInt64, arrays["position"])
             )
         return cls(generator, sequence, phase, systematic)
 

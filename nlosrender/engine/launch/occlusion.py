@@ -7,7 +7,7 @@ import numpy as np
 
 from nlosrender.scene.build import BuiltScene, wall_box
 
-MOST_FACES = 4000  # beyond it the test itself, faces times vertices, costs more than the rays it saves
+MAX_FACES = 4000  # beyond it the test itself, faces times vertices, costs more than the rays it saves
 FACES_AT_ONCE = 64
 PLANARITY = 1e-6  # engine units: float32 vertices of a plane of size 1 are good to 1e-7
 
@@ -27,7 +27,7 @@ def nothing_occludes(built: BuiltScene) -> bool:
         return False
     if not shape.is_mesh():
         return shape.class_name() == "Sphere" and not shape.has_flipped_normals()
-    if shape.face_count() > MOST_FACES or shape.has_vertex_normals():
+    if shape.face_count() > MAX_FACES or shape.has_vertex_normals():
         return False
     parameters = mi.traverse(shape)
     vertices = np.asarray(parameters["vertex_positions"], dtype=np.float64).reshape(-1, 3)

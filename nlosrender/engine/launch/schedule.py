@@ -127,7 +127,7 @@ class Schedule:
         self.limit = math.ceil(budget.spp / replicas) if budget.spp is not None else None
         self.errors: list[tuple[int, float]] = []  # (samples per lane, relative L2 error)
         self.speed = math.inf  # samples per lane and second
-        self.stage = range(0)  # samples that are going to be complete, whatever the launches
+        self.block = range(0)  # samples that are going to be complete, whatever the launches
         self._next_look = self.tuning.first_samples
 
     def numbers(self) -> dict[str, object]:
@@ -141,8 +141,8 @@ class Schedule:
         # of another machine, maybe: the first launch is a small one again
         self.speed = (numbers["speed"] or 1.0) / 4
         self._next_look = numbers["next_look"]
-        if "stage" in numbers:
-            self.stage = range(*numbers["stage"])
+        if "block" in numbers:
+            self.block = range(*numbers["block"])
 
     def next_samples(self, done: int, seconds: float) -> int:
         """Return the samples per lane of the next launch; 0 when the budget is met."""
@@ -151,7 +151,7 @@ class Schedule:
             first = min(self.tuning.first_samples, self.limit or self.tuning.first_samples)
             if self.limit is not None or budget.time_limit_s is not None:  # what a launch takes changes no result
                 first = max(1, min(first, self.tuning.max_first_pairs // self.lanes))
-            self.stage = range(first if budget.time_limit_s is not None or self.limit is None else self.limit)
+            self.block = range(first if budget.time_limit_s is not None or self.limit is None else self.limit)
             return first
         if budget.time_limit_s is not None and seconds >= budget.time_limit_s:
             return 0
@@ -168,9 +168,9 @@ class Schedule:
             launch = min(launch, max(1.0, self.speed * (budget.time_limit_s - seconds)))
         more = int(min(goal - done, launch if math.isfinite(launch) else 4 * done))
         if budget.time_limit_s is not None:  # there may be no other launch
-            self.stage = range(done, done + more)
-        elif done == self.stage.stop:
-            self.stage = range(done, goal)
+            self.block = range(done, done + more)
+        elif done == self.block.stop:
+            self.block = range(done, goal)
         return more
 
     def wants_error(self, done: int) -> bool:

@@ -23,7 +23,7 @@ from nlosrender.scene.triangle_point import triangle_weights
 
 SAMPLEABLE_PLUGINS = ("Rectangle", "Disk", "Sphere", "Cylinder")
 _FULL = 2.0**32
-MOST_GUIDE_BITS = 22  # 16 MB
+MAX_GUIDE_BITS = 22  # 16 MB
 ANALYTIC = 0xFFFFFFFF  # primitive of a point that lies on no triangle
 
 
@@ -239,7 +239,7 @@ class _Table:
         areas = np.concatenate([areas / 2, *analytic_areas])
         area = float(areas.sum())
         cumulative = np.minimum(np.rint(np.cumsum(areas) / max(area, 1e-300) * _FULL), _FULL - 1)
-        guide_bits = min(max((len(areas) - 1).bit_length() + 1, 1), MOST_GUIDE_BITS)
+        guide_bits = min(max((len(areas) - 1).bit_length() + 1, 1), MAX_GUIDE_BITS)
         parts = np.arange(2**guide_bits, dtype=np.uint64) << np.uint64(32 - guide_bits)
         guide = np.append(np.searchsorted(cumulative[:-1], parts, side="right"), len(areas) - 1)
         table = cls(

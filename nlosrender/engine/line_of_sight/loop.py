@@ -15,7 +15,7 @@ import mitsuba as mi
 from nlosrender.engine.launch.histogram import DeviceHistogram
 from nlosrender.engine.launch.lane_random_state import LaneRandomness
 from nlosrender.engine.launch.launch_params import MAX_SURVIVAL
-from nlosrender.engine.launch.recurrence import recurrence_steps
+from nlosrender.engine.launch.sequences import recurrence_steps
 from nlosrender.engine.line_of_sight.view_params import ViewLaunchParams, ViewSettings
 
 ROULETTE_AFTER = 3  # surface interactions: what is brightest is never thinned out

@@ -26,7 +26,7 @@ from nlosrender.engine.launch.passes import Passes
 from nlosrender.engine.launch.pilot_points import Pilot, pilot_of
 from nlosrender.engine.launch.plain_diffuse import is_plain_diffuse
 from nlosrender.engine.launch.schedule import Schedule, calibrated_by_pilot, pilot_replicas
-from nlosrender.engine.launch.systematic_sequence import SystematicSequence
+from nlosrender.engine.launch.sequences import SystematicSequence
 from nlosrender.engine.launch.temporal_kernel import TemporalKernel
 from nlosrender.engine.path.full_loop import trace_paths
 from nlosrender.engine.path.roulette import best_continuation_period, first_phases
@@ -162,7 +162,7 @@ class PathEngine:
         loop = trace_third_bounce if is_third_bounce_loop(self.settings, self.sampler) else trace_paths
         count = dr.opaque(mi.UInt32, n_samples)
         advanced, systematic = loop(self.settings, params, histogram, randomness, systematic, count)
-        dr.eval(histogram.sums, advanced.generator, advanced.sequence, advanced.phase, systematic.at)
+        dr.eval(histogram.sums, advanced.generator, advanced.sequence, advanced.phase, systematic.position)
         return advanced, systematic
 
     def _accumulation(self, batch: Batch | Pilot, shape: HistogramShape, budget: Budget) -> Accumulation:
@@ -173,15 +173,15 @@ class PathEngine:
         params = self._path_params(batch, shape, period)
         seed = self.options.seed
 
-        def launch(histogram: DeviceHistogram, randomness: LaneRandomness, more: int, stage: range) -> LaneRandomness:
+        def launch(histogram: DeviceHistogram, randomness: LaneRandomness, more: int, block: range) -> LaneRandomness:
             if randomness.phase is None:
                 phases = first_phases(seed, points, nx, shape.lanes, params.continuation_period)
                 randomness = replace(randomness, phase=phases)
             systematic = randomness.systematic
-            if systematic is None or systematic.stage != stage:
-                systematic = SystematicSequence.of_paths(stage, randomness.sequence[0])
+            if systematic is None or systematic.block != block:
+                systematic = SystematicSequence.of_paths(block, randomness.sequence[0])
             advanced, systematic = self.trace(params, histogram, randomness, systematic, more)
-            return replace(advanced, systematic=replace(systematic, stage=stage))
+            return replace(advanced, systematic=replace(systematic, block=block))
 
         first = 1 if bounces.split else 0  # the second bounce has slot 0
         slots = range(-first, bounces.n_slots - first)

@@ -33,9 +33,8 @@ import mitsuba as mi
 from nlosrender.capture.bounces import FIRST_BOUNCE, THIRD_BOUNCE
 from nlosrender.engine.launch.histogram import DeviceHistogram
 from nlosrender.engine.launch.lane_random_state import LaneRandomness
-from nlosrender.engine.launch.recurrence import recurrence_steps
+from nlosrender.engine.launch.sequences import SystematicSequence, first_coordinate, recurrence_steps
 from nlosrender.engine.launch.surface_sampler import SurfaceSample
-from nlosrender.engine.launch.systematic_sequence import SystematicSequence, first_coordinate
 from nlosrender.engine.launch.time_gate import time_gate_roulette
 from nlosrender.engine.path.laser_connections import PathVertex, connect_to_lasers, deposit_spot
 from nlosrender.engine.path.settings import PathParams, PathSettings
@@ -102,7 +101,7 @@ def trace_paths(
     # ---- State ------------------------------------------------------------------------------------------------------
     generator = mi.PCG32(randomness.generator)
     seq_v, seq_t = (mi.UInt32(start) for start in randomness.sequence[1:])
-    starts = PathStarts(mi.UInt32(0), mi.UInt64(systematic.at), seq_v, seq_t)
+    starts = PathStarts(mi.UInt32(0), mi.UInt64(systematic.position), seq_v, seq_t)
     alive = mi.Bool(False)  # a ray is under way
     way = Departure.none(built)  # that ray
     bounce = mi.UInt32(FIRST_BOUNCE)  # bounce index that a laser connection at the last vertex has

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nlosrender.engine.launch.device_arrays import on_device
-from nlosrender.engine.launch.systematic_sequence import GOLDEN
+from nlosrender.engine.launch.sequences import GOLDEN
 from nlosrender.engine.path.tuning import PHASE_TILE, LoopCost
 
 

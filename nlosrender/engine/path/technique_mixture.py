@@ -10,10 +10,10 @@ import mitsuba as mi
 import numpy as np
 
 from nlosrender.engine.interface import OmittedWork
-from nlosrender.engine.launch.device_arrays import sensor_points
 from nlosrender.engine.launch.device_capture import DeviceCapture
 from nlosrender.engine.launch.hidden_aabb import HiddenAabb
 from nlosrender.engine.launch.ray_offsets import offset_origin
+from nlosrender.engine.launch.wall_points import sensor_points
 from nlosrender.engine.path.tuning import PathTuning
 
 

@@ -21,9 +21,8 @@ from nlosrender.capture.bounces import THIRD_BOUNCE
 from nlosrender.engine.launch.histogram import DeviceHistogram
 from nlosrender.engine.launch.lane_random_state import LaneRandomness
 from nlosrender.engine.launch.ray_offsets import connection_segment
-from nlosrender.engine.launch.recurrence import recurrence_steps
+from nlosrender.engine.launch.sequences import SystematicSequence, first_coordinate, recurrence_steps
 from nlosrender.engine.launch.surface_sampler import SurfaceSample, SurfaceSampler
-from nlosrender.engine.launch.systematic_sequence import SystematicSequence, first_coordinate
 from nlosrender.engine.launch.time_gate import time_gate_roulette
 from nlosrender.engine.path.laser_connections import PathVertex, connect_to_lasers
 from nlosrender.engine.path.settings import PathParams, PathSettings
@@ -54,14 +53,14 @@ def trace_third_bounce(
 
     # ---- State ------------------------------------------------------------------------------------------------------
     generator = mi.PCG32(randomness.generator)
-    at = mi.UInt64(systematic.at)
+    position = mi.UInt64(systematic.position)
     seq_v = mi.UInt32(randomness.sequence[1])
     phase = mi.UInt32(randomness.phase)  # paths until the next one that goes on
     done = mi.UInt32(0)  # paths of this lane
 
     while dr.hint(done < n_samples, exclude=[settings, params, histogram, sampler, sensors, sensor, own_laser, every]):
         # ---- Sample a point of the hidden geometry ------------------------------------------------------------------
-        sample = sampler.sample(first_coordinate(at), unit_interval(seq_v), mi.Bool(True))
+        sample = sampler.sample(first_coordinate(position), unit_interval(seq_v), mi.Bool(True))
         goes_on = mi.Bool(False)
         if dr.hint(settings.goes_on, mode="scalar"):
             goes_on = phase == 0
@@ -72,12 +71,12 @@ def trace_third_bounce(
         generator = _connect_sample(settings, params, histogram, generator, sample, active, goes_on)
 
         # ---- Next path ----------------------------------------------------------------------------------------------
-        at += stride
+        position += stride
         seq_v += step
         done += 1
 
     sequence = [randomness.sequence[0], seq_v, randomness.sequence[2]]
-    return LaneRandomness(generator, sequence, phase), SystematicSequence(at, stride)
+    return LaneRandomness(generator, sequence, phase), SystematicSequence(position, stride)
 
 
 @dr.syntax

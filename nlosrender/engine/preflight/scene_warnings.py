@@ -24,7 +24,7 @@ from nlosrender.scene.triangle_point import triangle_weights
 from nlosrender.scene.view import BuiltView
 
 POINTS_PER_SURFACE = 64
-MOST_RAYS = 1_000_000  # of all surfaces together: a warning must not take longer than a small render
+MAX_RAYS = 1_000_000  # of all surfaces together: a warning must not take longer than a small render
 RAY_MARGIN = 2e-5  # share of a ray's length that is left out
 GRAZING = 1e-2  # cosine below which a ray may slip past the limb of a round shape within its margin
 FINEST_BIN = 2e-6  # engine units; float32 path lengths of a scene of size 1 are good to about 5e-7
@@ -163,7 +163,7 @@ def _turned_to(surface: _SurfacePoints, wall_points: Float64, least_cosine: floa
 def _any_visible(built: BuiltScene, surfaces: list[_SurfacePoints], grid: PointGrid) -> NDArray[np.bool_]:
     """Return for each surface whether any of its points is seen from any of a sample of the grid's points."""
     wall_points = points_above_wall(built, grid)
-    step = max(1, len(surfaces) * len(wall_points) * POINTS_PER_SURFACE // MOST_RAYS)
+    step = max(1, len(surfaces) * len(wall_points) * POINTS_PER_SURFACE // MAX_RAYS)
     origins, targets, row_points = [], [], []
     seen = np.zeros(len(surfaces), dtype=bool)
     for row_of_lane, surface in enumerate(surfaces):

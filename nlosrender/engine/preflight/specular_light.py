@@ -18,16 +18,17 @@ from numpy.typing import NDArray
 from nlosrender.capture.arrivals import sampled_indices
 from nlosrender.capture.grids import Capture
 from nlosrender.capture.time_axis import TimeAxis
-from nlosrender.engine.launch.device_arrays import columns, laser_points
+from nlosrender.engine.launch.device_arrays import columns
 from nlosrender.engine.launch.ray_offsets import offset_origin
 from nlosrender.engine.launch.surface_sampler import SAMPLEABLE_PLUGINS
+from nlosrender.engine.launch.wall_points import laser_points
 from nlosrender.scene.build import BuiltScene
 from nlosrender.scene.pose import Float64
 from nlosrender.scene.view import BuiltView
 
 RAYS = 2**16  # in all, shared by surfaces and laser points: light of less than about 1e-4 of a mirror is not noticed
-LEAST_RAYS = 256  # of one surface and one laser point
-MOST_EVENTS = 16  # specular events that are followed
+MIN_RAYS = 256  # of one surface and one laser point
+MAX_EVENTS = 16  # specular events that are followed
 RAY_MARGIN = 1e-4  # share of a ray's length that is left out before its end
 WALL_NAME = "scene.relay_wall"
 
@@ -65,7 +66,7 @@ def light_after_laser(
     if not shapes:
         return []
     index = sampled_indices(capture.laser_grid)
-    per_pair = max(LEAST_RAYS, RAYS // (len(shapes) * len(index)))
+    per_pair = max(MIN_RAYS, RAYS // (len(shapes) * len(index)))
     targets = np.concatenate([_points_on(shape, per_pair, seed) for seed, shape in enumerate(shapes)])
     lasers = np.repeat(index, len(targets)).astype(np.uint32)
     lit = laser_points(built, capture, time_axis, lasers).interaction
@@ -84,7 +85,7 @@ def light_mirrored_by_wall(
     if not bool(built.wall_bsdf.flags() & mi.BSDFFlags.Delta):
         return []
     index = sampled_indices(capture.laser_grid)
-    lasers = np.repeat(index, LEAST_RAYS).astype(np.uint32)
+    lasers = np.repeat(index, MIN_RAYS).astype(np.uint32)
     lit = laser_points(built, capture, time_axis, lasers).interaction
     bs, weight = built.wall_bsdf.sample(mi.BSDFContext(), lit, *_numbers(len(lasers), 0))
     mirrored = _is_delta(bs) & _carries(weight)
@@ -133,7 +134,7 @@ def _followed(
     ) / built.metres_per_engine_unit
     first = np.zeros(n_rays, dtype=np.int64)  # twice the number of the first surface, plus 1 if it reflected the ray
     least: dict[int, int] = {}
-    for event in range(MOST_EVENTS):
+    for event in range(MAX_EVENTS):
         count = interactions + event + 1  # interactions up to the surface that is met now
         if max_bounces is not None and count > max_bounces:
             break

@@ -33,7 +33,7 @@ from nlosrender.engine.preflight.specular_light import (
 )
 from nlosrender.scene.view import BuiltView
 
-MOST_NAMED = 3  # items in a sentence
+MAX_NAMED = 3  # items in a sentence
 SPOT = "Give the laser a spot, such as capture.laser_spot_radius: 0.02 (m), which paths find by chance (slowly)"
 ROUGH = "make the surface rough (roughconductor, roughdielectric, roughplastic)"
 
@@ -107,5 +107,5 @@ def _classes(notation: str, found: Iterable[SpecularLight], what: str, advice: s
 
 
 def _listed(items: tuple[str, ...]) -> str:
-    more = f" and {len(items) - MOST_NAMED} more" if len(items) > MOST_NAMED else ""
-    return ", ".join(items[:MOST_NAMED]) + more
+    more = f" and {len(items) - MAX_NAMED} more" if len(items) > MAX_NAMED else ""
+    return ", ".join(items[:MAX_NAMED]) + more

@@ -11,8 +11,8 @@ import numpy as np
 from nlosrender.capture.arrivals import sampled_indices
 from nlosrender.capture.bounces import THIRD_BOUNCE
 from nlosrender.engine.interface import Engine
-from nlosrender.engine.launch.device_arrays import laser_points, sensor_points
 from nlosrender.engine.launch.ray_offsets import offset_origin
+from nlosrender.engine.launch.wall_points import laser_points, sensor_points
 from nlosrender.engine.preflight.scene_warnings import dark_surface_warnings
 from nlosrender.engine.preflight.unsampled_paths import UnsampledPaths
 from nlosrender.scene.build import BuiltScene

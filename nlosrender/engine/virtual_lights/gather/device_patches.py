@@ -14,7 +14,7 @@ from nlosrender.engine.launch.device_arrays import columns, on_device
 from nlosrender.engine.launch.morton import morton_order
 from nlosrender.engine.launch.plain_diffuse import is_uniform_diffuse
 from nlosrender.engine.launch.ray_offsets import off_the_surface
-from nlosrender.engine.launch.recurrence import recurrence_steps
+from nlosrender.engine.launch.sequences import recurrence_steps
 from nlosrender.engine.virtual_lights.elements.patches import Patches, SurfacePoints, split_weights
 from nlosrender.engine.virtual_lights.elements.round_shapes import RoundShape
 from nlosrender.engine.virtual_lights.tuning import DEFAULT_TUNING, VirtualLightTuning

@@ -15,9 +15,10 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from nlosrender.engine.launch.device_arrays import WallPoints, on_device
+from nlosrender.engine.launch.device_arrays import on_device
 from nlosrender.engine.launch.launch_params import LaunchParams
 from nlosrender.engine.launch.passes import Passes, PassSize, Snapshot
+from nlosrender.engine.launch.wall_points import WallPoints
 from nlosrender.engine.virtual_lights.gather.block_histogram import BlockHistogram
 from nlosrender.engine.virtual_lights.gather.delay_distribution import Delays, deposit_patch
 from nlosrender.engine.virtual_lights.gather.lighting import (

@@ -15,12 +15,13 @@ import numpy as np
 from nlosrender.capture.bounces import THIRD_BOUNCE
 from nlosrender.capture.plan import Batch
 from nlosrender.engine.interface import Budget
-from nlosrender.engine.launch.device_arrays import laser_points, on_device
+from nlosrender.engine.launch.device_arrays import on_device
 from nlosrender.engine.launch.device_capture import DeviceCapture
 from nlosrender.engine.launch.energy_contrasts import RoundContrasts
 from nlosrender.engine.launch.histogram import DeviceHistogram, Histogram
 from nlosrender.engine.launch.passes import Passes, PassSize, Snapshot
 from nlosrender.engine.launch.pilot_points import Pilot, spread
+from nlosrender.engine.launch.wall_points import laser_points
 from nlosrender.engine.virtual_lights.elements.tessellator import Tessellator
 from nlosrender.engine.virtual_lights.visibility.masks import VisibilityMasks, WallTiles
 from nlosrender.engine.virtual_lights.vpls.gather import VplTable, gather_contributions

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from nlosrender.engine.launch.morton import morton_order
-from nlosrender.engine.launch.recurrence import recurrence_steps
+from nlosrender.engine.launch.sequences import recurrence_steps
 from nlosrender.engine.launch.time_gate import CaptureTimeGate
 from nlosrender.engine.virtual_lights.elements.patches import SurfacePoints
 from nlosrender.engine.virtual_lights.elements.round_shapes import onto_round_shapes

@@ -18,11 +18,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nlosrender.capture.bounces import FIRST_BOUNCE
-from nlosrender.engine.launch.device_arrays import WallPoints, on_device
+from nlosrender.engine.launch.device_arrays import on_device
 from nlosrender.engine.launch.lane_random_state import LaneRandomness
 from nlosrender.engine.launch.launch_params import MAX_SURVIVAL, LaunchParams
 from nlosrender.engine.launch.ray_offsets import connection_segment, offset_origin
 from nlosrender.engine.launch.time_gate import CaptureTimeGate, TimeGate, time_gate_roulette
+from nlosrender.engine.launch.wall_points import WallPoints
 from nlosrender.engine.virtual_lights.gather.device_patches import normal_reflectance, surface_at
 from nlosrender.engine.virtual_lights.tuning import DEFAULT_TUNING
 from nlosrender.engine.virtual_lights.vpls.sampler import Vpls

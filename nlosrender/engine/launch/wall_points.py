@@ -1,0 +1,106 @@
+"""Laser and sensor points of the relay wall as device arrays.
+
+Positions and grids are data, never constants of a kernel: one compiled kernel serves a whole sweep.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+
+from nlosrender.capture.grids import Capture
+from nlosrender.capture.time_axis import TimeAxis
+from nlosrender.engine.launch.device_arrays import columns, on_device
+from nlosrender.scene.build import BuiltScene
+from nlosrender.scene.loading.mitsuba_shapes import WALL_ID
+from nlosrender.scene.pose import Float64
+from nlosrender.scene.walls.mesh_wall import MIN_SAME_COSINE, too_fine
+
+MESH_LIFT = 1e-4  # engine units: less than any fold of a mesh wall, far more than the rounding of its points
+MESH_NUDGE = 1e-6  # engine units: off the edges of its triangles, where rays may slip through
+
+
+@dataclass(frozen=True, eq=False)
+class WallPoints:
+    """Points of the relay wall on the device, in engine units, seen from a device (laser or sensor).
+
+    ``delay_bins`` and ``delay_fraction`` are the constant part of the point's delay in bins, split in float64:
+    a leg of kilometres must not eat the float32 precision of the path between the two legs.
+    """
+
+    interaction: mi.SurfaceInteraction3f  # on the wall; wi points to the device
+    delay_bins: mi.Int32
+    delay_fraction: mi.Float  # in [0, 1)
+
+    def gather(self, index: mi.UInt32) -> WallPoints:
+        """Return the points at ``index``, one per lane."""
+        return WallPoints(
+            dr.gather(mi.SurfaceInteraction3f, self.interaction, index),
+            dr.gather(mi.Int32, self.delay_bins, index),
+            dr.gather(mi.Float, self.delay_fraction, index),
+        )
+
+
+def sensor_points(built: BuiltScene, capture: Capture, time_axis: TimeAxis, index: NDArray[np.integer]) -> WallPoints:
+    """Return the sensor points with flat indices ``index``, legs and the window's start as their delay."""
+    grid = capture.sensor_grid
+    delay = (capture.sensor_legs.reshape(-1)[index] - time_axis.start_opl) / time_axis.bin_width_opl
+    positions, normals = grid.positions.reshape(-1, 3)[index], grid.normals.reshape(-1, 3)[index]
+    return _wall_points(built, positions, normals, capture.sensor_position, delay)
+
+
+def laser_points(built: BuiltScene, capture: Capture, time_axis: TimeAxis, index: NDArray[np.integer]) -> WallPoints:
+    """Return the laser points with flat indices ``index``, their legs as delay."""
+    grid = capture.laser_grid
+    delay = capture.laser_legs.reshape(-1)[index] / time_axis.bin_width_opl
+    positions, normals = grid.positions.reshape(-1, 3)[index], grid.normals.reshape(-1, 3)[index]
+    return _wall_points(built, positions, normals, capture.laser_position, delay)
+
+
+def _wall_points(
+    built: BuiltScene, positions: Float64, normals: Float64, device: Float64, delay: Float64
+) -> WallPoints:
+    point = mi.Point3f(*columns(positions / built.metres_per_engine_unit))
+    normal = mi.Vector3f(*columns(normals))
+    # The wall's own intersection gives shading frame and texture coordinates for every wall type and BSDF.
+    if built.wall_shape.class_name() == "Mesh":
+        interaction = _on_mesh(built, point, normal)
+    else:
+        interaction = built.wall_shape.ray_intersect(mi.Ray3f(point + 1e-2 * normal, -normal))
+    interaction.p = point  # the exact grid point, not where a float32 ray met the wall
+    to_device = device - positions
+    to_device /= np.maximum(np.linalg.norm(to_device, axis=-1, keepdims=True), 1e-300)
+    interaction.wi = interaction.to_local(mi.Vector3f(*columns(to_device)))
+    whole = np.floor(delay)
+    points = WallPoints(
+        interaction,
+        on_device(mi.Int32, np.clip(whole, -(2**30), 2**30)),
+        on_device(mi.Float, delay - whole),
+    )
+    dr.eval(points.interaction, points.delay_bins, points.delay_fraction)
+    return points
+
+
+def _on_mesh(built: BuiltScene, point: mi.Point3f, normal: mi.Vector3f) -> mi.SurfaceInteraction3f:
+    """Return where points of a mesh wall lie on the faces with these normals.
+
+    Only a scene can intersect a mesh: one of the wall alone. Points on an edge are looked for beside it, too.
+    """
+    alone = mi.load_dict({"type": "scene", WALL_ID: built.wall_shape})
+    frame = mi.Frame3f(normal)
+    interaction, found = dr.zeros(mi.SurfaceInteraction3f, dr.width(point)), mi.Bool(False)
+    for along, across in ((0, 0), (1, 0), (-1, 0), (0, 1), (0, -1)):
+        beside = point + MESH_NUDGE * (along * frame.s + across * frame.t)
+        hit = alone.ray_intersect(mi.Ray3f(beside + MESH_LIFT * normal, -normal))
+        is_own = hit.is_valid() & (dr.dot(hit.n, normal) > MIN_SAME_COSINE)
+        interaction = dr.select(is_own & ~found, hit, interaction)
+        found = found | is_own
+    if not dr.all(found):
+        missing = np.array(point).T[~np.array(found)][0] * built.metres_per_engine_unit
+        place = ", ".join(f"{coordinate:.6g}" for coordinate in missing)
+        raise too_fine(f"({place}) m of its frame: float32 does not find the point on it")
+    return interaction
