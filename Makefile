@@ -33,7 +33,7 @@ render: install ## Render configs/z-letter.yaml to out/: an HDF5 capture and a p
 	@echo "picture: $$($(BIN)/nlosrender plot out/z-letter.hdf5)"
 
 test: $(VENV)/.dev ## Run the default test suite.
-	$(BIN)/python -m pytest -m 'not slow and not peers and not stress'
+	$(BIN)/python -m pytest -n logical --maxprocesses 4 --dist worksteal -m 'not slow and not peers and not stress'
 
 test-slow: $(VENV)/.dev ## Run the tests that take longer.
 	$(BIN)/python -m pytest -m slow
