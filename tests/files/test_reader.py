@@ -192,9 +192,9 @@ def test_absurd_shapes(tmp_path: Path) -> None:
     """A file that claims a petabyte is described at once; reading it is refused before memory runs out."""
     path = tmp_path / "a.hdf5"
     _hdf5(data=(1, 10**6, 6, 10**4, 10**4), deltaT=0.003, cameraGridPositions=(3, 10**7, 10**7))(path)
-    start = time.monotonic()
+    start = time.process_time()
     assert summarise(path)["size_of_samples"] == 4 * 6 * 10**14
-    assert time.monotonic() - start < 1
+    assert time.process_time() - start < 1
     with pytest.raises(FileError, match="too large for a picture: data has shape"):
         plot_capture(path, tmp_path / "a.png")
     with open_capture(path) as capture:
@@ -226,9 +226,9 @@ def test_metadata_of_many_chunks_is_quick(tmp_path: Path) -> None:
         data = file.create_dataset("data", (1, 2, 6, 100, 200), "f4", chunks=(1, 2, 1, 1, 1))
         data[:, :, 1] = 1
         file["deltaT"] = 0.003
-    start = time.monotonic()
+    start = time.process_time()
     assert summarise(path)["scan_type"] == "confocal"
-    assert time.monotonic() - start < 0.5
+    assert time.process_time() - start < 0.5
 
 
 def test_a_file_with_a_bounce_axis_out_of_all_proportion_is_no_capture(tmp_path: Path) -> None:

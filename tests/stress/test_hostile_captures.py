@@ -77,9 +77,9 @@ def test_claimed_samples_that_were_never_written_take_no_time(tmp_path: Path) ->
         properties.set_alloc_time(h5py.h5d.ALLOC_TIME_LATE)
         space = h5py.h5s.create_simple((1, 10**9, 6, 200, 200))
         h5py.h5d.create(file.id, b"data", h5py.h5t.IEEE_F32LE, space, properties)
-    begun = time.perf_counter()
+    begun = time.process_time()
     assert validate_file(path)
-    assert time.perf_counter() - begun < 2
+    assert time.process_time() - begun < 2
 
 
 def test_a_damaged_text_attribute_does_not_end_the_process(tmp_path: Path, contained: Containment) -> None:

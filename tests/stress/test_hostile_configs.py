@@ -26,12 +26,12 @@ LONGEST_RENDER = 5.0  # s, as `plan` estimates it
 @given(text=damaged_configs())
 def test_damaged_configs_are_judged(text: str, ledger: Ledger) -> None:
     """A config is valid, or every problem has a message; within seconds."""
-    begun, messages = time.perf_counter(), ["valid"]
+    begun, messages = time.process_time(), ["valid"]
     try:
         parse_config(text, "fuzz.yaml", Path("/nonexistent"))
     except ConfigError as error:
         messages = [problem.message for problem in error.issues]
-    assert time.perf_counter() - begun < SLOWEST
+    assert time.process_time() - begun < SLOWEST
     assert messages
     assert all(messages)
     ledger.count("damaged configs, parsed", refused=messages != ["valid"], fault="")
