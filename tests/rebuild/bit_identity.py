@@ -233,7 +233,7 @@ def compare_records(
         if old is None or new is None:
             yield name, "MISSING", f"not in {'BEFORE' if old is None else 'AFTER'}"
             continue
-        if old["config"] != new["config"]:
+        if len({entry["config"] for entry in (old, new) if "config" in entry}) > 1:  # early records have none
             yield name, "DIFFERENT", "another configuration: record both trees with one list"
             continue
         differing = [key for key in dict.fromkeys((*old["datasets"], *new["datasets"])) if _differ(old, new, key)]

@@ -120,6 +120,7 @@ SLANTED = plate((0.15, -0.1, 0.6), (0.2, -0.1, -1.0), (0.8, 0.6))
 SIDE = plate((-0.6, 0.0, 0.55), (1.0, 0.1, -0.2), (0.6, 0.8), 0.8)
 SCREEN = plate((0.3, 0.0, 0.35), (0.1, 0.0, -1.0), (0.25, 0.3), 0.4)
 STANDING = plate((0.52, 0.0, 0.3), (-1.0, 0.0, 0.0), (0.6, 0.6), 0.8)  # touches the wall between sensor points
+FAR_BOX = {"type": "box", "center": [0.1, 0.05, 1.2], "size": [0.3, 0.2, 0.2], "rotate_deg": [20, 30, 10]}
 DEVICES = {"laser_position": [-0.5, 0, 0.25], "sensor_position": [0.4, 0.3, 1.1]}
 LEGS = {"account_first_and_last_bounces": True} | DEVICES
 EQUAL_LEGS = {"account_first_and_last_bounces": True, "laser_position": [0, 0, 1], "sensor_position": [0, 0, 1]}
@@ -204,6 +205,22 @@ def _virtual_lights() -> dict[str, Item]:
         "single-rough-third-only": nlos(
             plate((0.15, -0.1, 0.6), (0.2, -0.1, -1.0), (0.8, 0.6), ROUGH), SIDE, max_bounces=3, **by_name
         ),
+        "single-rough-5-bounces": nlos(  # the further ones by paths
+            plate((0.15, -0.1, 0.6), (0.2, -0.1, -1.0), (0.8, 0.6), ROUGH),
+            SIDE,
+            max_bounces=5,
+            target_error=0.3,
+            **by_name,
+        ),
+        "single-many-patches": nlos(  # more than are kept for the next batch
+            SLANTED,
+            SIDE,
+            sensors=(3, 2),
+            bins=(0.8, 0.0008, 1500),
+            max_bounces=3,
+            memory_limit="404MB",
+            target_error=0.0008,
+        ),
         "single-clusters": nlos(mesh("fine.ply", translate=[0.1, 0.0, 0.9]), max_bounces=3, bins=(0.2, 0.1, 50)),
         "single-clusters-occluded": nlos(mesh("fine.ply", translate=[0.1, 0.0, 0.9]), SCREEN, bins=(0.2, 0.1, 50)),
         "single-masks": nlos(SLANTED, SCREEN, SIDE, **grid),
@@ -280,6 +297,23 @@ def _paths() -> dict[str, Item]:
     return {
         "single": nlos(*two, **by_name),
         "single-small-far-plate": nlos(small, max_bounces=6, **by_name),
+        "single-spot-far-box": nlos(FAR_BOX, capture=SPOT, **by_name),  # most sampled points show their dark side
+        "single-polarised-far-box": nlos(FAR_BOX, polarized=True, engine="path", spp=64),
+        # enough paths for the pilot of the continuation period, in either loop
+        "single-pilot-third-loop": nlos(small, SLANTED, sensors=(16, 16), spp=4096, max_bounces=5, engine="path"),
+        "single-pilot-third-loop-no-limit": nlos(FAR_BOX, sensors=(16, 16), spp=4096, max_bounces=None, engine="path"),
+        "single-pilot-full-loop": nlos(
+            *two, sensors=(16, 16), spp=4096, max_bounces=5, split_bounces=False, engine="path"
+        ),
+        "single-pilot-full-loop-no-limit": nlos(
+            ball((0.1, 0.05, 0.9), 0.1),
+            SIDE,
+            sensors=(16, 16),
+            spp=4096,
+            max_bounces=None,
+            split_bounces=False,
+            engine="path",
+        ),
         "single-small-far-ball": nlos(ball((0.1, 0.05, 0.9), 0.1), max_bounces=6, **by_name),
         "single-seed-7": nlos(*two, seed=7, **by_name),
         "single-target-error": nlos(*two, engine="path", target_error=0.3),

@@ -93,6 +93,22 @@ def test_a_missing_capture_is_wrong(recorded: Path, tmp_path: Path, capsys: pyte
     assert compare(recorded, recorded, capsys, "--only", "none*")[0] == 1
 
 
+def test_an_early_record_has_no_configurations(
+    recorded: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """It is compared all the same; two records of different configurations are not."""
+    record = json.loads((recorded / bit_identity.RECORD).read_text())
+    record["captures"][FIRST]["config"] = "other"
+    (tmp_path / "other.json").write_text(json.dumps(record))
+    code, table = compare(tmp_path / "other.json", recorded, capsys)
+    assert code == 1
+    assert "another configuration" in table
+    del record["captures"][FIRST]["config"]
+    (tmp_path / "early.json").write_text(json.dumps(record))
+    for pair in ((tmp_path / "early.json", recorded), (recorded, tmp_path / "early.json")):
+        assert compare(*pair, capsys)[0] == 0
+
+
 def test_parts_have_to_be_the_whole(recorded: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """A capture rendered in parts is held against the whole one of its own record."""
     record = json.loads((recorded / bit_identity.RECORD).read_text())
