@@ -15,8 +15,16 @@ OF_CODE = [ROOT / "docs" / name for name in ("virtual-lights.md", "architecture.
 MODULES = {path: ast.parse(path.read_text()) for path in PACKAGE.rglob("*.py")}
 ENGINE = PACKAGE / "engine"
 FOLDERS = (ROOT, PACKAGE, PACKAGE / "rendering", ENGINE, ENGINE / "path", ENGINE / "virtual_lights")
-FOREIGN = {"bsdf.eval", "wall_bsdf.eval"}  # Mitsuba's
-WORDS = {"confocal", "auto", "target_missed", "seconds", "execution_time"}  # of configurations and files
+FOREIGN = {"bsdf.eval", "wall_bsdf.eval", "ray_test", "sample_emitter_direction", "SmoothDiffuse"}  # Mitsuba's
+WORDS = {
+    "confocal",
+    "auto",
+    "diffuse",
+    "twosided",
+    "target_missed",
+    "seconds",
+    "execution_time",
+}  # of configurations and files
 
 
 def defined_in(tree: ast.AST) -> set[str]:
@@ -65,6 +73,35 @@ def test_every_name_in_backquotes_is_defined_in_the_code(page: Path) -> None:
             found = all(name in NAMES for name in (first, *rest))
         if not found:
             missing.append(span)
+    assert not missing
+
+
+def module(name: str) -> Path:
+    """Return the module that a page calls ``name``, below one of ``FOLDERS``."""
+    return next(folder / name for folder in FOLDERS if (folder / name).exists())
+
+
+@pytest.mark.parametrize("page", OF_CODE, ids=lambda page: page.name)
+def test_a_name_beside_a_file_is_defined_in_that_file(page: Path) -> None:
+    """```name` in file.py`` and ```name` (file.py)``; a list of names, too. Of ``Class.attribute`` the class."""
+    placed = re.compile(r"((?:`[^`\n]+`(?:,?\s+and\s+|,\s+)?)+)\s+(?:in\s+|\()([a-z_][\w/-]*\.py)\b")
+    found = placed.findall(page.read_text())
+    assert found
+    missing = []
+    for names, path in found:
+        defined = defined_in(MODULES[module(path)])
+        missing += [(span, path) for span in re.findall(r"`([^`]+)`", names) if span.split(".")[0] not in defined]
+    assert not missing
+
+
+@pytest.mark.parametrize("page", OF_CODE, ids=lambda page: page.name)
+def test_a_constant_is_defined_in_a_file_that_its_section_names(page: Path) -> None:
+    """Somewhere in the package is not enough: other modules have constants of the same name."""
+    missing = []
+    for section in re.split(r"^#+ ", page.read_text(), flags=re.MULTILINE):
+        paths = set(re.findall(r"(?<![\w/])[a-z_][\w/-]*\.py\b", section))
+        defined = set().union(*(defined_in(MODULES.get(module(path), ast.Module([], []))) for path in paths))
+        missing += [name for name in re.findall(r"`([A-Z][A-Z_\d]+)`", section) if name not in defined]
     assert not missing
 
 
