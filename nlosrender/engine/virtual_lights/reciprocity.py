@@ -1,4 +1,4 @@
-"""Helmholtz reciprocity: whether H(l, s) = H(s, l), so that half of an exhaustive capture says all."""
+"""Helmholtz reciprocity: whether H(l, s) = H(s, l), so that half of an exhaustive capture is enough to compute."""
 
 from __future__ import annotations
 

@@ -48,12 +48,12 @@ class ShadowRayTargets:
 
 @dataclass(frozen=True, eq=False)
 class _Lanes:
-    """One lane per sensor point and replica, neighbours together."""
+    """One lane per sensor point and slice of the patches, neighbours together."""
 
     params: LaunchParams  # what they read
     index: mi.UInt32
-    replica: mi.UInt32
-    order: NDArray[np.int64]  # (sensors,) the sensor point of each lane of a replica, numbered as in the batch
+    slice_index: mi.UInt32  # of the patches that all sensor points share
+    order: NDArray[np.int64]  # (sensors,) the sensor point of each lane of a slice, numbered as in the batch
     regions: NDArray[np.int64]  # (lanes,)
 
 
@@ -158,19 +158,19 @@ class ThirdBounce:
             wall_tiles = self._wall_tiles(batch)
             packed = self._shared_lights(lanes.params, shape, patch_scale, patches, wall_tiles)
             tile = wall_tiles.tile_bit(mi.UInt32(0), lanes.params.sensors.interaction.p)
-            work.gather(lanes.params, packed, lanes.index, lanes.replica, tile)
+            work.gather(lanes.params, packed, lanes.index, lanes.slice_index, tile)
         for labels, near in self.tessellator.regional_patches(patch_scale, np.unique(lanes.regions).tolist()):
             places = PatchRegions.of([len(one) for one in near])
             if not len(places.numbers):  # nothing is close to the wall there
                 continue
             chosen = np.flatnonzero(np.isin(lanes.regions, labels))
-            part = np.searchsorted(labels, lanes.regions[chosen]) * shape.replicas + chosen // shape.sensors
+            slice_index = np.searchsorted(labels, lanes.regions[chosen]) * shape.replicas + chosen // shape.sensors
             index = on_device(mi.UInt32, chosen)
             some, wall_tiles = lanes.params.gather_lanes(index), self._wall_tiles(batch, labels)
             lit_patches = self._light_by_lasers(some, shape, Patches.joined(near), places, wall_tiles)
             packed = pack_patches(self.settings, some, lit_patches, shape.replicas, shape.lasers)
-            tile = wall_tiles.tile_bit(on_device(mi.UInt32, part // shape.replicas), some.sensors.interaction.p)
-            work.gather(some, packed, index, on_device(mi.UInt32, part), tile)
+            tile = wall_tiles.tile_bit(on_device(mi.UInt32, slice_index // shape.replicas), some.sensors.interaction.p)
+            work.gather(some, packed, index, on_device(mi.UInt32, slice_index), tile)
         return histogram
 
     def shadow_ray_targets(self, batch: Batch | Pilot, patch_scale: float) -> ShadowRayTargets:
@@ -229,7 +229,7 @@ class ThirdBounce:
         return coarse, self.gather(batch, patch_scale, passes.stage("fine", share, 1))
 
     def shape(self, batch: Batch | Pilot) -> HistogramShape:
-        """Return the histogram's shape, whose replicas are slices: lanes that share the patches of a sensor point.
+        """Return the histogram's shape; its ``replicas`` are slices: lanes that share the patches of a sensor point.
 
         As many as the capture needs, not the batch: how a capture is cut must not show in the result. No more than
         the replicas that the plan has counted memory for.
@@ -243,11 +243,11 @@ class ThirdBounce:
         indices, order = self.device.sensor_indices(batch), self.device.lane_order(batch)
         lane = dr.arange(mi.UInt32, shape.lanes)
         params = params.gather_lanes(dr.gather(mi.UInt32, on_device(mi.UInt32, order), lane % shape.sensors))
-        replica = lane // shape.sensors
-        dr.eval(lane, replica)
+        slice_index = lane // shape.sensors
+        dr.eval(lane, slice_index)
         if lasers is not None:
             params = replace(params, n_lasers=on_device(mi.UInt32, np.tile(lasers[order], shape.replicas)))
         regions = np.zeros(shape.lanes, np.int64)
         if self.tessellator.regions is not None:
             regions = np.tile(self.tessellator.regions.labels[indices][order], shape.replicas)
-        return _Lanes(params, lane, replica, order, regions)
+        return _Lanes(params, lane, slice_index, order, regions)

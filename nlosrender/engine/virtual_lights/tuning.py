@@ -122,10 +122,10 @@ class VirtualLightTuning:
     # The same of confocal captures, where each takes a ray to the sensor point's own laser. Plates 14 / 7.3 / 8.1, room
     # 1480 / 1080 / 810.
     confocal_contributions_per_vpl: int = 2
-    # Laser points along each side by which vertices are judged. Confocal: plates 6.5 / 7.3 / 6.6, room 800 / 1030 /
+    # Proposal lasers along each side of the grid. Confocal: plates 6.5 / 7.3 / 6.6, room 800 / 1030 /
     # 1800 at 1 / 2 / 3; at 1 nothing tells a vertex of one side of the wall from one of the other.
     proposal_lasers_per_axis: int = 2
-    # Of the light of an average laser, expected of those that a vertex was not judged by. Confocal: plates 5.8 / 6.3 /
+    # Of the light of an average laser, expected of those that are no proposal lasers. Confocal: plates 5.8 / 6.3 /
     # 6.8, room 1310 / 990 / 960 at half / as is / twice.
     untried_share: float = 0.2
     # Subpaths of a VPL: one per 32 pairs of sensor and laser point, within these. 16 x 16 points: plates 3.3 / 2.7 /

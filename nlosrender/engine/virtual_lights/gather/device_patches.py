@@ -38,16 +38,16 @@ class PatchRegions:
         regions = np.repeat(np.arange(len(counts)), counts)
         return cls(regions, np.concatenate([np.arange(count) for count in counts]))
 
-    def in_parts(self, patch: NDArray[np.integer], slices: int) -> tuple[NDArray[np.integer], NDArray[np.integer]]:
-        """Sort patches by part, within it by number; return them and where each part begins, and the last one ends.
+    def in_slices(self, patch: NDArray[np.integer], per_region: int) -> tuple[NDArray[np.integer], NDArray[np.integer]]:
+        """Sort patches by slice, within it by number; return them and where each slice begins, and the last one ends.
 
-        Each part, one of ``slices`` of a region, is gathered by lanes of its own. A patch's number within its region
+        A region has ``per_region`` slices, each gathered by lanes of its own. A patch's number within its region
         decides its slice, so that the batch's other lasers, which may light other patches, change nothing.
         """
-        part = (self.regions * slices + self.numbers % slices)[patch]
-        order = np.lexsort((patch, part))
-        n_parts = (int(self.regions[-1]) + 1) * slices
-        return patch[order], np.searchsorted(part[order], np.arange(n_parts + 1))
+        slice_index = (self.regions * per_region + self.numbers % per_region)[patch]
+        order = np.lexsort((patch, slice_index))
+        n_slices = (int(self.regions[-1]) + 1) * per_region
+        return patch[order], np.searchsorted(slice_index[order], np.arange(n_slices + 1))
 
 
 @dataclass(frozen=True, eq=False)

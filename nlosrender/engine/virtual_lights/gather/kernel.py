@@ -54,7 +54,7 @@ class GatherPasses:
         self._size = PassSize(max(1, first_pairs // (histogram.shape.lanes * histogram.shape.lasers)))
 
     def gather(
-        self, params: LaunchParams, packed: PackedPatches, lane: mi.UInt32, part: mi.UInt32, tile: mi.UInt64
+        self, params: LaunchParams, packed: PackedPatches, lane: mi.UInt32, slice_index: mi.UInt32, tile: mi.UInt64
     ) -> None:
         """Gather the next group; parameters as for ``gather_third_bounce``."""
         group, self._group = self._group, self._group + 1
@@ -66,7 +66,7 @@ class GatherPasses:
             steps = min(self._size.steps, longest - done)
             self._size.begin()
             cut = (dr.opaque(mi.UInt32, number) for number in (done, steps))
-            gather_third_bounce(self._settings, params, packed, self._histogram, lane, part, tile, *cut)
+            gather_third_bounce(self._settings, params, packed, self._histogram, lane, slice_index, tile, *cut)
             dr.eval(self._histogram.sums, self._histogram.outside)
             dr.sync_thread()
             self._size.end()
@@ -87,14 +87,14 @@ def gather_third_bounce(
     packed: PackedPatches,
     histogram: BlockHistogram,
     lane: mi.UInt32,
-    part: mi.UInt32,
+    slice_index: mi.UInt32,
     tile: mi.UInt64,
     skipped: mi.UInt32,
     most: mi.UInt32,
 ) -> None:
-    """Deposit the third bounce: lane by lane over ``most`` patches of its part, after the first ``skipped`` ones.
+    """Deposit the third bounce: lane by lane over ``most`` patches of its slice, after the first ``skipped`` ones.
 
-    Several lanes may share the patches of one sensor point, each into rows of its own.
+    Several lanes may share the patches of one sensor point: each gathers a slice, into rows of its own.
 
     Parameters
     ----------
@@ -102,8 +102,8 @@ def gather_third_bounce(
         What is gathered, and by whom.
     histogram, lane
         Where to, and the row of each lane of ``params``.
-    part
-        The part of ``packed`` that each lane gathers.
+    slice_index
+        The slice of ``packed`` that each lane gathers.
     tile
         The bit of the tile that its sensor point lies in, see ``WallTiles``.
     skipped, most
@@ -115,10 +115,10 @@ def gather_third_bounce(
     n_lasers, count = params.n_lasers, packed.count
     own_laser = params.lasers.gather(params.first_laser)
 
-    end = dr.gather(mi.UInt32, packed.first, part + 1)
+    end = dr.gather(mi.UInt32, packed.first, slice_index + 1)
 
     # ---- State ------------------------------------------------------------------------------------------------------
-    patch = dr.gather(mi.UInt32, packed.first, part) + skipped
+    patch = dr.gather(mi.UInt32, packed.first, slice_index) + skipped
     end = dr.minimum(end, patch + most)
 
     while dr.hint(
@@ -162,9 +162,9 @@ def gather_third_bounce(
         # ---- Visibility ---------------------------------------------------------------------------------------------
         if dr.hint(settings.needs_visibility, mode="scalar"):
             # in front of the plane through the point that is looked at, not through the centre
-            way = from_sensor + shown
-            mask = dr.select(dr.dot(areas, way) < 0, dr.gather(mi.UInt64, packed.mask, patch), 0)
-            active = is_visible(built, sensor, way, mi.Vector3f(offset), active, mask, tile)
+            to_surface = from_sensor + shown
+            mask = dr.select(dr.dot(areas, to_surface) < 0, dr.gather(mi.UInt64, packed.mask, patch), 0)
+            active = is_visible(built, sensor, to_surface, mi.Vector3f(offset), active, mask, tile)
 
         # ---- Reflect towards the lasers and deposit -----------------------------------------------------------------
         scale = params.bins_per_unit
@@ -221,7 +221,7 @@ def _deposit(
     seen: _SeenPatch,
 ) -> None:
     """Deposit what a patch sends on from one laser; ``entry`` is the pair of patch and laser."""
-    value = seen.weight * dr.gather(mi.Spectrum, packed.arriving, entry)
+    value = seen.weight * dr.gather(mi.Spectrum, packed.laser_light, entry)
     lit = seen.active & dr.any(value > 0)
     if not settings.is_diffuse:
         centre = dr.gather(mi.Point3f, packed.interaction.p, seen.patch)

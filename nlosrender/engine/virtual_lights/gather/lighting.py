@@ -1,4 +1,4 @@
-"""Lighting: what the lasers make of patches (virtual lights), packed as sensor points gather it."""
+"""Light of the lasers on patches, third bounce: BSDFs, distance, visibility, packed as sensor points gather it."""
 
 from __future__ import annotations
 
@@ -49,11 +49,11 @@ class PackedPatches:
     reflectance: mi.Spectrum  # confocal Lambertian patches: reflectance / pi
     # index = laser * count + patch: light that arrives, per area perpendicular to it; of Lambertian patches the light
     # that leaves; empty for confocal captures
-    arriving: mi.Spectrum
+    laser_light: mi.Spectrum
     delays: mi.Float  # four an index: from the laser point to each corner [bins]
     has_clusters: bool
     count: mi.UInt32  # of lit patches, opaque
-    first: mi.UInt32  # of part k: its patches are first[k] to first[k + 1]
+    first: mi.UInt32  # of slice k: its patches are first[k] to first[k + 1]
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,7 +79,7 @@ class LitPatches:
     """Patches and what the lasers of a batch send them; those of confocal captures are lit as they are gathered."""
 
     patches: DevicePatches
-    arriving: mi.Spectrum  # index = laser * n_patches + patch; see ``PackedPatches``
+    laser_light: mi.Spectrum  # index = laser * n_patches + patch; see ``PackedPatches``
     is_lit: mi.Bool  # by any of the lasers
     shadow_target: mi.Vector3f  # from the centres to where the sensor points' shadow rays end
     mask: mi.UInt64  # there, see ``VisibilityMasks.of``
@@ -110,20 +110,22 @@ def light_patches(
 
 
 def pack_patches(
-    settings: GatherSettings, params: LaunchParams, lit_patches: LitPatches, slices: int, n_lasers: int
+    settings: GatherSettings, params: LaunchParams, lit_patches: LitPatches, slices_per_region: int, n_lasers: int
 ) -> PackedPatches:
-    """Return what the gather reads: the patches that are lit, in as many parts per region as there are ``slices``."""
-    patches, arriving, delays = lit_patches.patches, lit_patches.arriving, mi.Float(0)
+    """Return what the gather reads: the patches that are lit, sorted by slice (see ``PatchRegions.in_slices``)."""
+    patches, laser_light, delays = lit_patches.patches, lit_patches.laser_light, mi.Float(0)
     count = dr.width(patches.areas)
     lit = dr.compress(lit_patches.is_lit)
     if not dr.width(lit):
         lit = mi.UInt32(0)  # all is dark: one dark patch, since arrays of no length cannot be read
-    lit, first = (on_device(mi.UInt32, values) for values in patches.regions.in_parts(np.array(lit.numpy()), slices))
+    lit, first = (
+        on_device(mi.UInt32, values) for values in patches.regions.in_slices(np.array(lit.numpy()), slices_per_region)
+    )
     n_lit = dr.opaque(mi.UInt32, dr.width(lit))  # as a constant it would be part of the kernel
     if not settings.is_confocal:
         index = dr.arange(mi.UInt32, dr.width(lit) * n_lasers)
         laser, patch = index // n_lit, dr.gather(mi.UInt32, lit, index % n_lit)
-        arriving = dr.gather(mi.Spectrum, arriving, laser * dr.opaque(mi.UInt32, count) + patch)
+        laser_light = dr.gather(mi.Spectrum, laser_light, laser * dr.opaque(mi.UInt32, count) + patch)
         points = dr.gather(mi.Point3f, params.lasers.interaction.p, laser)
         ends = four_corners(*_corners(patches, patch))
         delays = dr.ravel(mi.Vector4f(*(dr.norm(end - points) * params.bins_per_unit for end in ends)))
@@ -148,7 +150,7 @@ def pack_patches(
         shading=interaction.sh_frame.n,
         interaction=interaction,
         reflectance=dr.gather(mi.Spectrum, patches.reflectance, lit) * dr.inv_pi,
-        arriving=arriving,
+        laser_light=laser_light,
         delays=delays,
         has_clusters=patches.has_clusters,
         count=n_lit,
@@ -177,12 +179,12 @@ def _light_by_lasers(
     to_patch = to_rounded + dr.gather(mi.Vector3f, patches.rounding_residual, patch)
     distance2 = dr.squared_norm(to_patch)
     direction = to_patch * dr.rsqrt(distance2)
-    arriving = built.wall_bsdf.eval(mi.BSDFContext(), lit, lit.to_local(direction)) / distance2
+    laser_light = built.wall_bsdf.eval(mi.BSDFContext(), lit, lit.to_local(direction)) / distance2
     cosine = -dr.dot(dr.gather(mi.Normal3f, patches.interaction.sh_frame.n, patch), direction)
-    active = dr.any(arriving > 0)
+    active = dr.any(laser_light > 0)
     if settings.is_diffuse:
-        arriving *= dr.maximum(cosine, 0) * dr.gather(mi.Spectrum, patches.reflectance, patch) * dr.inv_pi
-        active &= dr.any(arriving > 0)
+        laser_light *= dr.maximum(cosine, 0) * dr.gather(mi.Spectrum, patches.reflectance, patch) * dr.inv_pi
+        active &= dr.any(laser_light > 0)
     else:
         flags = dr.gather(mi.SurfaceInteraction3f, patches.interaction, patch).bsdf().flags()
         active &= (cosine > 0) | mi.has_flag(flags, mi.BSDFFlags.BackSide)
@@ -191,18 +193,18 @@ def _light_by_lasers(
         seen, shadow_target = _lit_fraction(settings, built, patches, lit, to_rounded, active)
     elif settings.needs_visibility:
         # the very point where the sensor points' rays end: what hides a part of a patch from both hides the same part
-        way = to_rounded + dr.gather(mi.Vector3f, shadow_target, patch)
+        to_surface = to_rounded + dr.gather(mi.Vector3f, shadow_target, patch)
         offset = dr.gather(mi.Vector3f, patches.offset_at(shadow_target), patch)
         tile = mask_query.wall_tiles.tile_bit(mi.UInt32(0), lit.p)
-        is_before = dr.dot(dr.gather(mi.Vector3f, patches.areas, patch), way) < 0  # the plane through that point
+        is_before = dr.dot(dr.gather(mi.Vector3f, patches.areas, patch), to_surface) < 0  # the plane through that point
         mask = dr.select(is_before, dr.gather(mi.UInt64, dark.mask, patch), 0)
-        seen = dr.select(is_visible(built, lit, way, offset, active, mask, tile), mi.Float(1), 0)
-    arriving = dr.select(active, arriving * seen, 0)
+        seen = dr.select(is_visible(built, lit, to_surface, offset, active, mask, tile), mi.Float(1), 0)
+    laser_light = dr.select(active, laser_light * seen, 0)
     brightest = dr.zeros(mi.Float, n_patches)
-    dr.scatter_reduce(dr.ReduceOp.Max, brightest, dr.max(arriving), patch)
+    dr.scatter_reduce(dr.ReduceOp.Max, brightest, dr.max(laser_light), patch)
     is_lit = brightest > 0
-    dr.eval(arriving, is_lit, shadow_target)
-    return replace(dark, arriving=arriving, is_lit=is_lit, shadow_target=shadow_target)
+    dr.eval(laser_light, is_lit, shadow_target)
+    return replace(dark, laser_light=laser_light, is_lit=is_lit, shadow_target=shadow_target)
 
 
 def _lit_fraction(

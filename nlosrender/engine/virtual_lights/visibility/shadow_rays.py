@@ -12,20 +12,20 @@ from nlosrender.scene.build import BuiltScene
 def is_visible(
     built: BuiltScene,
     wall_point: mi.SurfaceInteraction3f,
-    way: mi.Vector3f,
+    to_surface: mi.Vector3f,
     offset: mi.Vector3f,
     active: mi.Bool,
     mask: mi.UInt64 | None = None,
     tile: mi.UInt64 | None = None,
 ) -> mi.Bool:
-    """Return whether nothing lies on the way from a point of the wall to a point of a hidden surface.
+    """Return whether nothing lies between a point of the wall and the point ``to_surface`` away on a hidden surface.
 
     The shadow ray ends at the latter moved by ``offset``, the ray offset along the surface's normal, to the side that
     faces the wall point. Where ``mask``, that of the surface point, holds ``tile``, that of the wall point, no ray is
     traced.
     """
     origin = off_the_wall(built, wall_point)
-    direction = way - (origin - wall_point.p)
+    direction = to_surface - (origin - wall_point.p)
     direction -= offset * dr.sign(dr.dot(offset, direction))
     asked = active if mask is None else active & ((mask & tile) == 0)
     ray = mi.Ray3f(origin, direction, mi.Float(1), mi.Float(0), [])

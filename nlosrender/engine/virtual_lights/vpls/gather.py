@@ -17,7 +17,7 @@ from nlosrender.engine.virtual_lights.gather.device_patches import to_points
 from nlosrender.engine.virtual_lights.visibility.masks import Surface, VisibilityMasks, WallTiles
 from nlosrender.engine.virtual_lights.visibility.shadow_rays import is_visible
 from nlosrender.engine.virtual_lights.vpls.sampler import Vpls
-from nlosrender.engine.virtual_lights.vpls.subpaths import VplContributions, arriving
+from nlosrender.engine.virtual_lights.vpls.subpaths import VplContributions, irradiance
 from nlosrender.scene.build import BuiltScene
 
 
@@ -135,7 +135,7 @@ def gather_contributions(
                 end_point = dr.gather(mi.Point3f, contributions.ends, contribution)
                 facing = dr.gather(mi.Normal3f, contributions.shading, contribution)
                 value = weight * dr.gather(mi.Spectrum, contributions.values, contribution)
-                value *= arriving(built, own_laser, end_point, facing)
+                value *= irradiance(built, own_laser, end_point, facing)
                 lit = dr.any(value > 0)
                 if dr.hint(needs_visibility, mode="scalar"):
                     end_offset = dr.gather(mi.Vector3f, contributions.offset, contribution)

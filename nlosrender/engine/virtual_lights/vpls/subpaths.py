@@ -33,7 +33,7 @@ from nlosrender.scene.pose import Float64
 
 @dataclass(frozen=True, eq=False)
 class ProposalLasers:
-    """Laser points by which the vertices of subpaths are judged, the same for every batch of a capture."""
+    """Laser points whose light, visibility aside, is the proposal for choosing a vertex; the same for every batch."""
 
     points: WallPoints
     count: int
@@ -129,7 +129,7 @@ def trace_subpaths(
         lit = mi.Float(0)
         for k in range(proposal_lasers.count):
             point = proposal_lasers.points.gather(mi.UInt32(k))
-            lit += dr.mean(leaving * arriving(built, point, si.p, si.sh_frame.n)) / proposal_lasers.count
+            lit += dr.mean(leaving * irradiance(built, point, si.p, si.sh_frame.n)) / proposal_lasers.count
         if dr.hint(not proposal_lasers.are_all, mode="scalar"):
             away = dr.squared_norm(si.p - proposal_lasers.points.gather(mi.UInt32(0)).interaction.p)
             lit += proposal_lasers.untried_share * dr.mean(leaving) / away
@@ -158,7 +158,7 @@ def trace_subpaths(
     return vertex, total
 
 
-def arriving(built: BuiltScene, laser: WallPoints, point: mi.Point3f, shading: mi.Normal3f) -> mi.Spectrum:
+def irradiance(built: BuiltScene, laser: WallPoints, point: mi.Point3f, shading: mi.Normal3f) -> mi.Spectrum:
     """Return the irradiance at a point from a laser point that it sees [1 / (engine unit)^2 per J]."""
     to_point = point - laser.interaction.p
     distance2 = dr.squared_norm(to_point)
@@ -300,7 +300,7 @@ def _connect(
     to_laser = lasers.interaction.p - si.p
     distance = dr.norm(to_laser)
     value = dr.gather(mi.Spectrum, ends.carried, end) / dr.gather(mi.Float, ends.expected, end)
-    value *= arriving(built, lasers, si.p, dr.gather(mi.Normal3f, ends.shading, end))
+    value *= irradiance(built, lasers, si.p, dr.gather(mi.Normal3f, ends.shading, end))
     value *= dr.gather(mi.Float, scale, entry)
     active = dr.any(value > 0)
     segment = connection_segment(built, si, to_laser / distance, lasers.interaction)
