@@ -12,7 +12,9 @@ ROOT = Path(__file__).parents[2]
 PACKAGE = ROOT / "nlosrender"
 PAGES = sorted([*ROOT.glob("docs/*.md"), ROOT / "README.md", ROOT / "CONTRIBUTING.md"])
 OF_CODE = [ROOT / "docs" / name for name in ("virtual-lights.md", "architecture.md")]
-MODULES = {path: ast.parse(path.read_text()) for path in PACKAGE.rglob("*.py")}
+MODULES = {
+    path: ast.parse(path.read_text()) for path in (*PACKAGE.rglob("*.py"), ROOT / "tests/support/constant_engine.py")
+}
 ENGINE = PACKAGE / "engine"
 FOLDERS = (ROOT, PACKAGE, PACKAGE / "rendering", ENGINE, ENGINE / "path", ENGINE / "virtual_lights")
 FOREIGN = {"bsdf.eval", "wall_bsdf.eval", "ray_test", "sample_emitter_direction", "SmoothDiffuse"}  # Mitsuba's
