@@ -84,12 +84,14 @@ def test_all_pairs_where_the_halves_may_differ(tmp_path: Path, hidden: dict, mor
 
 @pytest.mark.parametrize("hidden", [(PLATE,), (PLATE, BEFORE)], ids=["plate", "one before the other"])
 def test_how_a_capture_is_cut_does_not_show(hidden: tuple[dict, ...]) -> None:
-    """Batches of some lasers, or some sensor points, have the same bits as the whole capture, in either half."""
+    """Batches of some lasers, of one, or of some sensor points, have the bits of the whole capture in either half."""
     from nlosrender.capture.plan import Batch, Tile
 
     engine, whole = engine_of(*hidden)
     values = engine.third.gather(whole, 0.3).values
-    for sensors, lasers in ((Tile(0, 3, 0, 5), Tile(1, 2, 2, 4)), (Tile(0, 2, 0, 3), Tile(1, 3, 1, 5))):
+    everything, one = Tile(0, 3, 0, 5), Tile(1, 2, 2, 3)
+    pairs = ((everything, Tile(1, 2, 2, 4)), (Tile(0, 2, 0, 3), Tile(1, 3, 1, 5)), (everything, one), (one, everything))
+    for sensors, lasers in pairs:
         part = engine.third.gather(Batch(sensors, lasers), 0.3).values
         expected = values[:, :, lasers.flat_indices(5)][:, :, :, sensors.flat_indices(5)]
         assert expected.any()
