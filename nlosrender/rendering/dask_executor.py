@@ -72,7 +72,7 @@ def render_on_cluster(
     workers = cluster.processes.workers
     if len(items) < workers:
         monitor.warn(
-            f"--workers: the capture is cut into {len(items)} units, so that some of {workers} workers have no work."
+            f"--workers: the capture is cut into {len(items)} work items: some of {workers} workers have no work."
         )
     if budget.time_limit_s is not None and items:
         left = max(0.0, budget.time_limit_s - partial.finished.sums.seconds / workers)
@@ -126,8 +126,8 @@ class _Flight:
         while not flying.is_empty():
             if stop.came and not self._recalled:
                 warn(
-                    f"{stop.signal_name}: the units in flight have {STOP_SECONDS:g} s to be finished; once more stops "
-                    "at once."
+                    f"{stop.signal_name}: the work items in flight have {STOP_SECONDS:g} s to be finished; once more "
+                    "stops at once."
                 )
                 self._recall()
                 self._given_up_at = time.monotonic() + STOP_SECONDS
@@ -181,11 +181,11 @@ class _Flight:
             result: FinishedItem | RemoteError = future.result()
         except KilledWorker as error:
             raise IncompleteRender(
-                "a unit has ended every worker process it was given to. Lower render.memory_limit if they ran out "
+                "a work item has ended every worker process it was given to. Lower render.memory_limit if they ran out "
                 "of memory; the workers' logs tell."
             ) from error
         except (CancelledError, OSError) as error:
-            raise IncompleteRender("the dask scheduler is gone, and the units in flight with it.") from error
+            raise IncompleteRender("the dask scheduler is gone, and the work items in flight with it.") from error
         except ImportError as error:
             raise BackendError(f"a worker lacks a package ({error}). Install nlosrender on every machine.") from error
         if isinstance(result, RemoteError):

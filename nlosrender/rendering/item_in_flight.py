@@ -66,7 +66,8 @@ class ItemInFlight:
         kept = self._state.read() or {}
         if not kept and self._state.path.exists():
             warn(
-                f"{partial.path}: what was kept of the unit in flight is damaged, or of another target; it begins anew."
+                f"{partial.path}: what was kept of the work item in flight is damaged, or of another target; "
+                "it begins anew."
             )
         self.earlier_seconds = float(kept[OF_ITEM].numbers["seconds"]) if OF_ITEM in kept else 0.0
         self.passes = Passes(progress, self._look, kept)
@@ -97,5 +98,5 @@ class ItemInFlight:
             with uninterrupted(), explained_write(self._partial.path):
                 self._state.write(kept | {OF_ITEM: noted})
         except FileError as error:  # a full disk: an earlier state is left as it was
-            self._warn(f"{error} What is done of the unit in flight cannot be kept.")
+            self._warn(f"{error} What is done of the work item in flight cannot be kept.")
             self._pause *= 4

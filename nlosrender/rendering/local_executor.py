@@ -93,8 +93,8 @@ def render_items(
                 monitor.progress((done + share) / total)
                 if stop.came:
                     monitor.warn(
-                        f"{stop.signal_name}: the unit in flight is finished, or kept as it is after a few seconds; "
-                        "once more stops at once."
+                        f"{stop.signal_name}: the work item in flight is finished, or saved as it is after a few "
+                        "seconds; once more stops at once."
                     )
 
             own_budget = replace(budget, time_limit_s=limit)
@@ -132,4 +132,4 @@ def saved_suffix(partial: PartialCapture, total: int | None = None) -> str:
         return " before anything was finished; nothing is kept."
     of_all = "" if total is None else f" of {total}"
     begun = ", and so is what was done of the one in flight" if partial.has_states else ""
-    return f"; {finished}{of_all} units are finished and saved{begun}. The same command goes on from there."
+    return f"; {finished}{of_all} work items are finished and saved{begun}. The same command goes on from there."

@@ -106,7 +106,7 @@ def test_a_flipped_bit_in_a_chunk_costs_its_unit(
         partial.open(header_of("single"), {}, "none", store_variance=True)
         assert partial.finished.items == state.finished.items[1:]
         (message,) = partial.damage
-        assert "1 of 3 finished units are damaged on the disk and are rendered again" in message
+        assert "1 of 3 finished work items are damaged on the disk and are rendered again" in message
     header = header_of("single")
     assert write_part(path, header, block_of(header), compression="none") == UNITS - 1
 

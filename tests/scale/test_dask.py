@@ -139,7 +139,7 @@ def test_ctrl_c_saves_and_either_executor_goes_on(folder: Path) -> None:
     code, errors = ended(process)
     assert code == 130, errors
     assert "stopped by SIGINT; " in errors
-    assert f" of {N_UNITS} units are finished and saved" in errors
+    assert f" of {N_UNITS} work items are finished and saved" in errors
     resumed = report_of(started(folder, "--resume", "--json"))["resumed_units"]
     assert 4 <= resumed < N_UNITS  # at least one that was in flight
     assert_same(folder / "whole.hdf5", folder / "a.hdf5")
@@ -158,8 +158,8 @@ def test_a_unit_that_ends_its_workers_stops_the_render(folder: Path, monkeypatch
         local_workers(process)[0].kill()
         code, errors = ended(process)
     assert code == 5, errors
-    assert "a unit has ended every worker process it was given to. Lower render.memory_limit" in errors
-    assert f" of {N_UNITS} units are finished and saved. The same command goes on from there." in errors
+    assert "a work item has ended every worker process it was given to. Lower render.memory_limit" in errors
+    assert f" of {N_UNITS} work items are finished and saved. The same command goes on from there." in errors
     assert 2 <= report_of(started(folder, *DASK, "--json"))["resumed_units"] < N_UNITS
     assert_same(folder / "whole.hdf5", folder / "a.hdf5")
 

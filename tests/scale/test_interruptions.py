@@ -123,7 +123,7 @@ def test_a_full_disk_keeps_what_is_finished(fresh: Path) -> None:
     code, errors = ended(start_render(fresh, file_limit=whole * 2 // 3))
     assert code == 5, errors
     assert "a.hdf5: cannot be written: File too large. Free some space" in errors
-    assert "units are finished and saved" in errors
+    assert "work items are finished and saved" in errors
     assert (fresh / "a.hdf5").read_bytes() == (fresh / "whole.hdf5").read_bytes()
     report = rendered(fresh)
     assert 0 < report["resumed_units"] < N_UNITS

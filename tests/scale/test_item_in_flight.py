@@ -79,7 +79,9 @@ def whole(config: Config) -> np.ndarray:
 def test_a_signal_ends_a_long_unit_and_the_same_command_goes_on(config: Config) -> None:
     """No more of the unit is lost than the pass in flight, though not one unit is finished."""
     undisturbed = whole(config)
-    with pytest.raises(InterruptedRender, match="0 of 1 units are finished and saved, and so is what was done of the"):
+    with pytest.raises(
+        InterruptedRender, match="0 of 1 work items are finished and saved, and so is what was done of the"
+    ):
         render_capture(config, at(0.1), saving=AT_ONCE)
     assert len(states(config)) == 1
     shares: list[float] = []

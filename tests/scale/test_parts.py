@@ -89,7 +89,7 @@ def test_going_on_with_other_memory(tmp_path: Path, memory: str) -> None:
     many["render"] = {**many["render"], "memory_limit": "403MB"}
     render(many, tmp_path / "whole.hdf5")
     path = tmp_path / "a.hdf5"
-    with pytest.raises(InterruptedRender, match=r"interrupted; \d+ units are finished and saved"):
+    with pytest.raises(InterruptedRender, match=r"interrupted; \d+ work items are finished and saved"):
         render(many, path, progress=_Interruption(0.4, KeyboardInterrupt))
     assert not path.exists()
     many["render"] = {**many["render"], "memory_limit": memory}

@@ -85,7 +85,7 @@ def module(name: str) -> Path:
 
 @pytest.mark.parametrize("page", OF_CODE, ids=lambda page: page.name)
 def test_a_name_beside_a_file_is_defined_in_that_file(page: Path) -> None:
-    """```name` in file.py`` and ```name` (file.py)``; a list of names, too. Of ``Class.attribute`` the class."""
+    """Names before ``in file.py`` or ``(file.py``, one or a list; of ``Class.attribute`` the class."""
     placed = re.compile(r"((?:`[^`\n]+`(?:,?\s+and\s+|,\s+)?)+)\s+(?:in\s+|\()([a-z_][\w/-]*\.py)\b")
     found = placed.findall(page.read_text())
     assert found

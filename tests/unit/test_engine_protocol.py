@@ -124,7 +124,7 @@ def test_an_interrupted_render_goes_on(constant_light: Choose, tmp_path: Path) -
             os.kill(os.getpid(), signal.SIGTERM)
 
     config = config_in(tmp_path, "parts")
-    with pytest.raises(InterruptedRender, match="units are finished and saved"):
+    with pytest.raises(InterruptedRender, match="work items are finished and saved"):
         render_capture(config, stop)
     resumed = render_capture(config, resume=True)
     assert 0 < resumed.resumed_units < resumed.units

@@ -329,7 +329,7 @@ class PartialCapture:
                         self.store(item, _copies(stored, chunks), sums)
             lost = len(earlier.finished.items) - len(self.finished.items)
             if lost:
-                of_all = f"{lost} of {len(earlier.finished.items)} finished units"
+                of_all = f"{lost} of {len(earlier.finished.items)} finished work items"
                 self.damage.append(f"{old}: {of_all} are damaged on the disk and are rendered again.")
             with explained_write(self.path):
                 synchronise(self._samples())  # before the old file is removed: a power failure must not lose both
