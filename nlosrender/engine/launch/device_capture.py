@@ -4,28 +4,31 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from nlosrender.capture.bounces import BounceAxis
-from nlosrender.capture.grids import Capture
-from nlosrender.capture.plan import Batch
-from nlosrender.capture.time_axis import TimeAxis
 from nlosrender.engine.launch.device_arrays import on_device
 from nlosrender.engine.launch.energy_contrasts import no_contrasts
 from nlosrender.engine.launch.histogram import DeviceHistogram, Histogram, HistogramShape
 from nlosrender.engine.launch.launch_params import LaunchParams
 from nlosrender.engine.launch.morton import morton_order
-from nlosrender.engine.launch.pilot_points import Pilot
 from nlosrender.engine.launch.schedule import DEFAULT_SCHEDULE, ScheduleTuning
 from nlosrender.engine.launch.second_bounce import deposit_second_bounce
 from nlosrender.engine.launch.surface_sampler import SurfaceSampler
 from nlosrender.engine.launch.time_gate import CaptureTimeGate, light_leaves_window
 from nlosrender.engine.launch.wall_points import laser_points, sensor_points
-from nlosrender.scene.build import BuiltScene
+
+if TYPE_CHECKING:
+    from nlosrender.capture.bounces import BounceAxis
+    from nlosrender.capture.grids import Capture
+    from nlosrender.capture.plan import Batch
+    from nlosrender.capture.time_axis import TimeAxis
+    from nlosrender.engine.launch.pilot_points import Pilot
+    from nlosrender.scene.build import BuiltScene
 
 
 @dataclass(frozen=True)

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import drjit as dr
 import mitsuba as mi
 
-from nlosrender.engine.launch.surface_sampler import SurfaceSampler
-from nlosrender.engine.launch.time_gate import TimeGate
-from nlosrender.engine.launch.wall_points import WallPoints
-from nlosrender.scene.build import BuiltScene
+if TYPE_CHECKING:
+    from nlosrender.engine.launch.surface_sampler import SurfaceSampler
+    from nlosrender.engine.launch.time_gate import TimeGate
+    from nlosrender.engine.launch.wall_points import WallPoints
+    from nlosrender.scene.build import BuiltScene
 
 MAX_SURVIVAL = 0.95  # of Russian roulette by the albedo: paths end in a white closed room, after 20 bounces on average
 

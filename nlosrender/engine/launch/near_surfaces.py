@@ -4,17 +4,20 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
+from typing import TYPE_CHECKING
 
 import mitsuba as mi
 import numpy as np
 
 from nlosrender.capture.arrivals import sampled_indices
-from nlosrender.capture.grids import PointGrid
-from nlosrender.engine.launch.device_capture import DeviceCapture
 from nlosrender.engine.launch.ray_offsets import WALL_OFFSET, ray_offset
 from nlosrender.scene.build import BuiltScene, wall_box
 from nlosrender.scene.loading.round_surfaces import curvature
-from nlosrender.scene.pose import Float64
+
+if TYPE_CHECKING:
+    from nlosrender.capture.grids import PointGrid
+    from nlosrender.engine.launch.device_capture import DeviceCapture
+    from nlosrender.scene.pose import Float64
 
 OFFSETS_LOST = 2.0  # ray offsets from a curved wall within which light is lost: one at either end of a shadow ray
 MIN_P_HIDDEN = 1e-3  # of hidden geometry sampling where there is none: BSDF sampling finds even less

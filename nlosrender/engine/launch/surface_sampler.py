@@ -12,13 +12,12 @@ from functools import cached_property
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-from numpy.typing import NDArray
 
 from nlosrender.engine.launch.device_arrays import on_device
+from nlosrender.engine.launch.facing_triangles import facing_triangles, is_one_sided
 from nlosrender.engine.launch.morton import morton_order
-from nlosrender.scene.build import BuiltScene, wall_box
+from nlosrender.scene.build import BuiltScene
 from nlosrender.scene.loading.mitsuba_shapes import WALL_ID
-from nlosrender.scene.pose import Float64
 from nlosrender.scene.triangle_point import triangle_weights
 
 SAMPLEABLE_PLUGINS = ("Rectangle", "Disk", "Sphere", "Cylinder")
@@ -57,7 +56,7 @@ class SurfaceSampler:
         self.covers_everything = all(shape.is_mesh() or shape.class_name() in SAMPLEABLE_PLUGINS for shape in hidden)
         # No surface reflects at points whose geometric normal points away. Shading normals may light a little there.
         self.dark_behind = all(
-            _is_one_sided(shape) and not (shape.is_mesh() and shape.has_vertex_normals()) for shape in hidden
+            is_one_sided(shape) and not (shape.is_mesh() and shape.has_vertex_normals()) for shape in hidden
         )
 
     @cached_property
@@ -254,43 +253,3 @@ class _Table:
         )
         dr.eval(table.edges, table.row_of_lane)
         return table
-
-
-def triangles_of(mesh: mi.Mesh) -> Float64:
-    """Return the corners (n, 3, 3) of a mesh's triangles [engine units]."""
-    parameters = mi.traverse(mesh)
-    vertices = np.asarray(parameters["vertex_positions"], dtype=np.float64).reshape(-1, 3)
-    return vertices[np.asarray(parameters["faces"]).reshape(-1, 3)]
-
-
-def _is_one_sided(shape: mi.Shape) -> bool:
-    return not bool(shape.bsdf().flags() & mi.BSDFFlags.BackSide)
-
-
-def _visible_from(
-    wall_corners: Float64, triangles: Float64, one_sided: bool, wall_is_planar: bool
-) -> NDArray[np.bool_]:
-    """Return which triangles some point of the box ``wall_corners`` (8, 3) may see on a side that reflects."""
-    normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
-    visible = np.linalg.norm(normals, axis=-1) > 0
-    if wall_is_planar:
-        visible &= triangles[:, :, 2].max(axis=1) > 0  # nothing behind the wall's plane is lit or seen
-    if not one_sided:
-        return visible
-    # A plane has the whole box behind it when it has the box's corner farthest along its normal behind it.
-    low, high = wall_corners.min(axis=0), wall_corners.max(axis=0)
-    farthest = np.where(normals > 0, high, low) - triangles[:, 0]
-    return visible & (np.einsum("nx,nx->n", farthest, normals) > 0)
-
-
-def facing_triangles(built: BuiltScene, mesh: mi.Mesh) -> tuple[Float64, NDArray[np.uint32]]:
-    """Return the corners (n, 3, 3) [engine units] of the triangles that the wall may see lit, and their numbers (n,).
-
-    Those are left out that turn their dark side to all of the wall. Occlusion by other surfaces is not looked at.
-    """
-    triangles = triangles_of(mesh)
-    corners = wall_box(built.wall) / built.metres_per_engine_unit
-    # Shading normals may light a little of a geometric back side.
-    one_sided = _is_one_sided(mesh) and not mesh.has_vertex_normals()
-    saved = np.flatnonzero(_visible_from(corners, triangles, one_sided, built.wall.is_planar))
-    return triangles[saved], saved.astype(np.uint32)

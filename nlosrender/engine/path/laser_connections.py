@@ -7,14 +7,17 @@ also be found by chance: the two ways are weighted by the balance heuristic (Vea
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import drjit as dr
 import mitsuba as mi
 
-from nlosrender.engine.launch.histogram import DeviceHistogram
 from nlosrender.engine.launch.ray_offsets import connection_segment
-from nlosrender.engine.path.settings import PathParams, PathSettings
-from nlosrender.engine.path.vertex_steps import Arrival, Departure
+
+if TYPE_CHECKING:
+    from nlosrender.engine.launch.histogram import DeviceHistogram
+    from nlosrender.engine.path.settings import PathParams, PathSettings
+    from nlosrender.engine.path.vertex_steps import Arrival, Departure
 
 
 @dataclass(frozen=True, eq=False)

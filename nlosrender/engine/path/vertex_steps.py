@@ -8,15 +8,18 @@ that the ray really reached.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import drjit as dr
 import mitsuba as mi
 
 from nlosrender.engine.launch.launch_params import MAX_SURVIVAL
 from nlosrender.engine.launch.ray_offsets import leg_to_tangent_plane, offset_origin
-from nlosrender.engine.launch.surface_sampler import SurfaceSample
-from nlosrender.engine.path.settings import PathParams, PathSettings
-from nlosrender.scene.build import BuiltScene
+
+if TYPE_CHECKING:
+    from nlosrender.engine.launch.surface_sampler import SurfaceSample
+    from nlosrender.engine.path.settings import PathParams, PathSettings
+    from nlosrender.scene.build import BuiltScene
 
 
 @dataclass(eq=False)

@@ -14,8 +14,9 @@ from nlosrender.capture.bounces import THIRD_BOUNCE
 from nlosrender.capture.grids import Capture, PointGrid
 from nlosrender.capture.time_axis import TimeAxis
 from nlosrender.engine.interface import Engine
+from nlosrender.engine.launch.facing_triangles import facing_triangles
 from nlosrender.engine.launch.near_surfaces import points_above_wall
-from nlosrender.engine.launch.surface_sampler import SAMPLEABLE_PLUGINS, facing_triangles
+from nlosrender.engine.launch.surface_sampler import SAMPLEABLE_PLUGINS
 from nlosrender.engine.preflight.near_wall_warnings import near_wall_warnings
 from nlosrender.scene.build import BuiltScene, wall_box
 from nlosrender.scene.pose import Float64

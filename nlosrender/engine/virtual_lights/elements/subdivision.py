@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from nlosrender.capture.grids import Capture, PointGrid
-from nlosrender.engine.launch.surface_sampler import facing_triangles
+from nlosrender.engine.launch.facing_triangles import facing_triangles
 from nlosrender.engine.virtual_lights.elements.struct_of_arrays import StructOfArrays
 from nlosrender.scene.build import BuiltScene
 from nlosrender.scene.pose import Float64

@@ -11,8 +11,8 @@ import mitsuba as mi
 import numpy as np
 
 from nlosrender.engine.launch.device_arrays import on_device
+from nlosrender.engine.launch.facing_triangles import triangles_of
 from nlosrender.engine.launch.morton import morton_order
-from nlosrender.engine.launch.surface_sampler import triangles_of
 from nlosrender.engine.virtual_lights.elements.subdivision import centroids, normals_and_areas
 from nlosrender.scene.pose import Float64
 
