@@ -37,8 +37,8 @@ class Accumulation:
     seed
         Of the render.
     launch
-        Traces so many more samples per lane into a histogram, numbers of a range of samples that will be complete, and
-        returns the advanced random state.
+        Adds samples to a histogram; called with the histogram, the random state, the number of samples per lane and the
+        block of samples that they belong to. Returns the advanced random state.
     scale
         What sums are multiplied by.
     slots
@@ -84,7 +84,7 @@ class Accumulation:
             dr.sync_thread()
             seconds = time.perf_counter() - launched
             if is_first:
-                self.compile_seconds += seconds  # the first launch is small: nearly all of it is compilation
+                self.compile_seconds += seconds  # the first launch is small: mostly compilation
             else:
                 schedule.speed = more / max(seconds, 1e-6)
             done, is_first = done + more, False

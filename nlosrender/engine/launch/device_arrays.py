@@ -14,15 +14,15 @@ KINDS = {
     "UInt64": np.uint64,
     "Int": np.int32,
     "Float64": np.float64,
-}  # by Dr.Jit's names
-ALIGNMENT = 64  # bytes, the widest vectors there are
+}  # by Dr.Jit's type names
+ALIGNMENT = 64  # bytes of an AVX-512 vector
 
 
 def on_device(kind: Any, values: NDArray[np.generic]) -> Any:
-    """Bring numbers (n,) to the device as an array of type ``kind``.
+    """Copy numbers (n,) to the device as an array of type ``kind``, aligned to ``ALIGNMENT``.
 
-    Dr.Jit takes numpy's memory as it is, and a kernel knows how its arrays are aligned: numpy aligns by chance, and
-    each pattern of chance would be a kernel to compile.
+    Dr.Jit uses numpy's memory in place, and the alignment of arrays is part of a kernel: numpy's varies, so every
+    pattern of alignments would be compiled anew.
     """
     source = np.ascontiguousarray(values, dtype=KINDS[kind.__name__])
     room = np.empty(source.nbytes + ALIGNMENT, np.uint8)
@@ -33,8 +33,8 @@ def on_device(kind: Any, values: NDArray[np.generic]) -> Any:
 
 
 def columns(values: NDArray[np.floating]) -> list[mi.Float]:
-    """Bring the columns of ``values`` (n, k) to the device, each as an array of its own.
+    """Copy the columns of ``values`` (n, k) to the device, one array each.
 
-    A vector made of the whole would be taken apart by a kernel that has n in it, compiled anew for every n.
+    Made from the whole array, a vector would be split by a kernel that contains n and is compiled anew for every n.
     """
     return [on_device(mi.Float, column) for column in np.asarray(values).T]

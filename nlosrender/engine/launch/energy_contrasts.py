@@ -1,12 +1,11 @@
-"""Contrasts: sums over a capture with random signs, from which the error of its energy follows.
+"""Energy contrasts: balanced half-samples (McCarthy 1969), from which the standard error of a capture's energy follows.
 
-The variance of a sum over sensor points is not the sum of their variances where they share walks, and an exhaustive
-capture's lasers share paths. What is independent are replicas: of every sensor point apart where paths are traced, of
-all of them together where walks are shared, and there the rounds, too. A contrast adds up the energies of replicas
-with signs that cancel the energy itself, two replicas against each other (balanced half-samples, McCarthy 1969). It is
-linear in H: contrasts of the parts of a capture add up to that of the whole, whatever correlates between them. The mean
-square of ``CONTRASTS`` of them estimates the variance of the energy, with as many degrees of freedom as there are
-contrasts, or independent pairs where these are fewer.
+The variance of the energy is not the sum of the variances of bins: sensor points share VPL subpaths, and the lasers of
+an exhaustive capture share paths. Replicas are independent: those of each sensor point where paths are traced, those of
+all sensor points together, and rounds, where VPL subpaths are shared. A contrast is the sum of the energies of replicas
+with random signs, opposite within a pair, so that the energy itself cancels. Contrasts are linear in H: those of the
+parts of a capture add up to that of the whole, whatever the correlations. The mean square of ``CONTRASTS`` contrasts
+estimates the variance of the energy, with as many degrees of freedom as contrasts, or as independent pairs if fewer.
 """
 
 from __future__ import annotations
@@ -19,12 +18,12 @@ from numpy.typing import NDArray
 from nlosrender.engine.launch.histogram import DeviceHistogram
 
 CONTRASTS = 32  # a standard error of the energy's error of 1 / sqrt(2 * 32) = 13 %
-FEW_PAIRS = 8  # of replicas: with fewer, places of the wall have weights in the contrasts
+FEW_PAIRS = 8  # independent pairs below which contrasts weight places of the wall (``_slow_weights``)
 Contrasts = NDArray[np.float64]  # (contrast, channel, slot) [J m^-2 sr^-1]
 
 
 def no_contrasts(channels: int, slots: int) -> Contrasts:
-    """Return the contrasts of what is exact."""
+    """Return the contrasts of an exact result: zero."""
     return np.zeros((CONTRASTS, channels, slots))
 
 
@@ -54,7 +53,7 @@ def contrasts_of_points(
 
 
 class RoundContrasts:
-    """Contrasts of sensor points that share walks: every replica of a group of rounds has a sign for all of them.
+    """Contrasts of sensor points that share VPL subpaths: one sign per replica and group of rounds, for all points.
 
     Parameters
     ----------
@@ -73,11 +72,11 @@ class RoundContrasts:
         self.sums = np.zeros((2, CONTRASTS, shape.channels, shape.slots))
 
     def restore(self, sums: NDArray[np.float64], grouped: NDArray[np.float64], groups: int) -> None:
-        """Go on from the values that these attributes had."""
+        """Continue from saved values of these attributes."""
         self.sums[:], self.grouped[:], self.groups = sums, grouped, groups
 
     def add(self, done: int, is_last: bool) -> None:
-        """Take what has been added since the last group, now that so many rounds are done; not after every round."""
+        """Close a group of rounds, after ``done`` rounds, when the group is complete or ``is_last``."""
         every = 2 ** max(0, math.floor(math.log2(done / self._wanted)))
         if not (is_last or done % every == 0):
             return
@@ -116,8 +115,8 @@ def contrasts_of_deviation(
 def _slow_weights(sensors: NDArray[np.integer], grid: tuple[int, int]) -> NDArray[np.float64]:
     """Return weights (contrast, sensor) about 1 that change slowly from place to place.
 
-    Of one sample of a difference the sum may be small by chance while sensor points here and there have much. Added
-    to it with such weights they show; what is the same everywhere counts once, and no error more than sqrt(3) times.
+    With few samples of a difference its sum may be small by chance while parts of the wall deviate much. Weights that
+    vary slowly over the wall reveal them; a constant deviation counts once, and no error more than sqrt(3) times.
     """
     index = np.asarray(sensors, dtype=np.int64)
     place = np.stack([index % grid[0] / grid[0], index // grid[0] / grid[1]])
@@ -137,7 +136,7 @@ def random_signs(keys: NDArray[np.int64]) -> NDArray[np.float64]:
 
 
 def _unpaired(replicas: int) -> float:
-    """Return what contrasts are multiplied by where an odd replica is left without a partner."""
+    """Return the factor that makes up for an odd replica, which has no partner."""
     return math.sqrt(replicas / max(replicas // 2 * 2, 1))
 
 

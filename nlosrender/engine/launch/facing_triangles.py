@@ -32,7 +32,7 @@ def _visible_from(
         visible &= triangles[:, :, 2].max(axis=1) > 0  # nothing behind the wall's plane is lit or seen
     if not one_sided:
         return visible
-    # A plane has the whole box behind it when it has the box's corner farthest along its normal behind it.
+    # The whole box is behind a plane when its corner farthest along the plane's normal is.
     low, high = wall_corners.min(axis=0), wall_corners.max(axis=0)
     farthest = np.where(normals > 0, high, low) - triangles[:, 0]
     return visible & (np.einsum("nx,nx->n", farthest, normals) > 0)
@@ -41,11 +41,11 @@ def _visible_from(
 def facing_triangles(built: BuiltScene, mesh: mi.Mesh) -> tuple[Float64, NDArray[np.uint32]]:
     """Return the corners (n, 3, 3) [engine units] of the triangles that the wall may see lit, and their numbers (n,).
 
-    Those are left out that turn their dark side to all of the wall. Occlusion by other surfaces is not looked at.
+    Left out are triangles that turn a black side to the whole wall. Occlusion by other surfaces is not considered.
     """
     triangles = triangles_of(mesh)
     corners = wall_box(built.wall) / built.metres_per_engine_unit
-    # Shading normals may light a little of a geometric back side.
+    # Shading normals may light part of a geometric back side.
     one_sided = is_one_sided(mesh) and not mesh.has_vertex_normals()
-    saved = np.flatnonzero(_visible_from(corners, triangles, one_sided, built.wall.is_planar))
-    return triangles[saved], saved.astype(np.uint32)
+    visible = np.flatnonzero(_visible_from(corners, triangles, one_sided, built.wall.is_planar))
+    return triangles[visible], visible.astype(np.uint32)

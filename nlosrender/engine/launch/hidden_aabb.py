@@ -1,4 +1,4 @@
-"""The box around all hidden geometry: rays from a planar wall that miss it meet nothing."""
+"""Axis-aligned bounding box of the hidden geometry: rays from a planar wall that miss it meet nothing."""
 
 from __future__ import annotations
 
@@ -12,22 +12,22 @@ from nlosrender.scene.pose import Float64
 
 @dataclass(frozen=True, eq=False)
 class HiddenAabb:
-    """A box [engine units], opaque: its place is no part of a kernel."""
+    """Corners of the box [engine units]; opaque, so that kernels do not depend on their values."""
 
-    least: mi.Point3f
-    most: mi.Point3f
+    low: mi.Point3f
+    high: mi.Point3f
 
     @classmethod
-    def of(cls, least: Float64, most: Float64) -> HiddenAabb:
+    def of(cls, low: Float64, high: Float64) -> HiddenAabb:
         """Return the box with corners (3,)."""
-        ends = (mi.Point3f(*(dr.opaque(mi.Float, float(x)) for x in corner)) for corner in (least, most))
+        ends = (mi.Point3f(*(dr.opaque(mi.Float, float(x)) for x in corner)) for corner in (low, high))
         return cls(*ends)
 
     def is_missed(self, ray: mi.Ray3f) -> mi.Bool:
-        """Return which rays miss it, wherever on them it would be (Kay & Kajiya 1986).
+        """Return which rays, extended to both sides, miss it: slab test (Kay & Kajiya 1986).
 
-        One that runs in the plane of a side counts as meeting it: its distances are no numbers.
+        A ray in the plane of a side counts as meeting it: its distances are NaN.
         """
         inverse = dr.rcp(ray.d)
-        one, other = (self.least - ray.o) * inverse, (self.most - ray.o) * inverse
+        one, other = (self.low - ray.o) * inverse, (self.high - ray.o) * inverse
         return dr.max(dr.minimum(one, other)) > dr.min(dr.maximum(one, other))

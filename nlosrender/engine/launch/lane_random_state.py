@@ -15,12 +15,12 @@ from nlosrender.engine.launch.sequences import SystematicSequence
 
 @dataclass(frozen=True, eq=False)
 class LaneRandomness:
-    """Random state of every lane; carried from launch to launch, so that splitting a render changes no bit."""
+    """Generator and low-discrepancy state of every lane, one lane per sensor point and replica."""
 
     generator: mi.PCG32
     sequence: list[mi.UInt32]  # low-discrepancy state, three dimensions
-    phase: mi.UInt32 | None = None  # paths until the next one that goes on beyond the third bounce
-    systematic: SystematicSequence | None = None  # of the stage of paths that is under way
+    phase: mi.UInt32 | None = None  # paths until the next one that continues after bounce 3 (Russian roulette)
+    systematic: SystematicSequence | None = None  # position in the block of paths under way
 
     def snapshot(self) -> Snapshot:
         """Return the state as arrays on the host."""
@@ -51,7 +51,7 @@ class LaneRandomness:
 
     @classmethod
     def seeded(cls, seed: int, lane_key: mi.UInt32) -> LaneRandomness:
-        """Seed every lane from the render's seed and the lane's identity, never from its place in a batch."""
+        """Seed every lane from the render's seed and ``lane_key``, its identity in the capture: batches do not show."""
         state_high, state_low = mi.sample_tea_32(mi.UInt32(seed), lane_key, 8)
         key_high, key_low = mi.sample_tea_32(lane_key, mi.UInt32(seed ^ 0x9E3779B9), 8)
         wide = mi.UInt64(2**32)

@@ -1,4 +1,4 @@
-"""Scenes whose surfaces look the same in every frame around their normal: frames need not be computed from textures."""
+"""Flat surfaces with a uniform diffuse BSDF: any shading frame around the normal serves, no texture is looked up."""
 
 from __future__ import annotations
 

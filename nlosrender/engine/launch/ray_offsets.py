@@ -1,4 +1,4 @@
-"""Ray offsets: where rays start and shadow rays end, a little off the surfaces that they belong to.
+"""Ray offsets against self-intersection: origins of rays and both ends of shadow rays are moved off their surfaces.
 
 Both ends of a shadow ray are moved along the normals, not along the ray: a surface in front of either end is met
 however oblique the ray, as long as the gap is wider than the offset. A planar wall is z = 0 exactly and needs none.
@@ -25,10 +25,10 @@ HEIGHT_SHARE = 0.25  # of a surface's height over a planar wall: the ray offset 
 
 
 def offset_origin(built: BuiltScene, si: mi.SurfaceInteraction3f, direction: mi.Vector3f) -> mi.Point3f:
-    """Return where a ray that leaves a surface in ``direction`` starts: a little off the surface, on the ray's side.
+    """Return the origin of a ray that leaves a surface in ``direction``: moved along the normal, to the ray's side.
 
-    Points of a planar wall need no offset, and surfaces close to it one that stays before it: nothing is too near to
-    the wall to be met, or to be lit.
+    Points of a planar wall need no offset; that of surfaces close to it is limited so that it does not cross the wall:
+    no surface is too near to the wall to be met or lit.
     """
     scale = ray_offset_at(built, si.p, si.shape)
     side = dr.dot(si.n, direction)
@@ -69,7 +69,7 @@ def off_the_surface(built: BuiltScene, positions: Float64, normals: Float64, sha
 
 
 def off_the_wall(built: BuiltScene, wall_point: mi.SurfaceInteraction3f) -> mi.Point3f:
-    """Return where a ray starts that leaves a laser or sensor point on the lit side."""
+    """Return the origin of a ray that leaves a laser or sensor point on the lit side."""
     if built.wall.is_planar:
         offset = mi.Float(WALL_OFFSET)
     else:
@@ -80,10 +80,10 @@ def off_the_wall(built: BuiltScene, wall_point: mi.SurfaceInteraction3f) -> mi.P
 def leg_to_tangent_plane(
     built: BuiltScene, si: mi.SurfaceInteraction3f, origin: mi.Point3f, direction: mi.Vector3f
 ) -> mi.Vector3f:
-    """Return the way from ``origin`` to the surface that a ray found which started at the ray offset from it.
+    """Return the vector from ``origin``, without ray offset, to the tangent plane of the surface that its ray met.
 
-    The offset shortens the way to a surface close by: 4e-5 m of a 2 m wall are 4 % of H 1 mm in front of it. Where
-    the ray grazes the surface, or the surface is curved or lies within the offset, the point that was found has to do.
+    The ray offset shortens the leg to a surface close by: 4e-5 m of a 2 m wall are 4 % of H 1 mm in front of it. Where
+    the ray grazes, or the surface is curved or lies within the offset, it is the vector to the point that was met.
     """
     along = dr.dot(si.n, direction)
     found = si.p - origin
@@ -99,8 +99,7 @@ def connection_segment(
 ) -> mi.Ray3f:
     """Shadow ray from a point of the wall to a surface, from which the wall point lies in ``direction``.
 
-    Both ends are moved off their surfaces along the normals by the ray offset, not along the ray: a surface in front
-    of either end is met however oblique the ray, if the gap is wider than the offset.
+    Both ends are moved along the normals, see the module.
     """
     # aimed at the offset end: a parallel ray would pass beside the point, behind the wall at oblique incidence
     start, end = off_the_wall(built, wall_point), offset_origin(built, si, direction)

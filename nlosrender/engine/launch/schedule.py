@@ -1,4 +1,4 @@
-"""The schedule of a sampling engine: how many samples each launch takes until a budget is met."""
+"""Schedule of a sampling engine: the number of samples of each launch, until a budget is met."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from typing import Any
 from nlosrender.engine.interface import Budget
 from nlosrender.engine.launch.passes import PASS_SECONDS, Passes
 
-DEFAULT_TARGET = 0.01  # where neither an error nor samples are asked for
-PILOT_LANES = 512  # four vector units of 16 lanes on each of 8 threads: a pilot of few points still fills a machine
+DEFAULT_TARGET = 0.01  # relative error aimed at if neither an error nor samples are given
+PILOT_LANES = 512  # 4 vectors of 16 lanes on each of 8 threads: replicas are added until a pilot has as many
 
 
 @dataclass(frozen=True)
@@ -21,24 +21,26 @@ class ScheduleTuning:
     """Numbers of the schedule; none changes what an estimate converges to."""
 
     pass_seconds: float = PASS_SECONDS
-    # Samples per lane before the first look at the error. The variance over two replicas of n samples has a relative
-    # error of sqrt(2); over all bins of a capture it averages out, but not below about 32 samples, where most bins
-    # that will hold light are still empty: captures of few points stated 1.3 to 1.5 times the error asked for with 4
-    # to 16 (pytest tests/statistical/test_honest_errors.py).
+    # Samples per lane before the error is first estimated. The variance over two replicas has a relative error of
+    # sqrt(2), which averages out over the bins of a capture, but not below about 32 samples, where most bins that will
+    # hold light are still empty: with 4 to 16, captures of few points stated 1.3 to 1.5 times the error asked for
+    # (tests/statistical/test_honest_errors.py).
     first_samples: int = 32
-    # Pairs of a path and a laser point in the first launch, whose speed is not known: 1 s at the 8e6 pairs per second
-    # of the slowest scene of the benchmark (room.yaml on 2 cores).
+    # Pairs of a path and a laser point in the first launch, whose speed is not known yet. Measured pairs per CPU second
+    # of bench scenes: closed room, all bounces 5e6, letters 4e7, 12 x 12 lasers 5e7, plate 7e7; so at most 1.6 s.
     max_first_pairs: int = 2**23
     # The same of the gathers: a patch (1 s at 30 ns) or a contribution of a VPL (1 s at 15 ns), sensor and laser point.
     first_gather_pairs: int = 2**25
     first_vpl_pairs: int = 2**26
-    # Share of the target error aimed at: the pilot's own estimate scatters by 5 to 10 % (256 points, 2 replicas).
+    # Share of the target error aimed at, because the pilot's points are not the whole capture; its own scatter between
+    # seeds is small, 0.2 to 0.8 % in error (bench scenes plate, letters, room). Renders with the calibrated samples
+    # state 0.73 to 0.82 of the target (those, 5 bounces, 8 x 8 lasers): extrapolation by 1 / sqrt(n) is conservative.
     aim: float = 0.9
-    # Times the aim: error at which a pilot has seen enough. Low-discrepancy points beat 1 / sqrt(n), and more so the
-    # further one extrapolates; by 1.5 in error the extrapolation is off by at most 1.5^(2 - 1 / 0.8) = 1.36 in samples.
+    # Error over the aim at which a pilot stops. Low-discrepancy points converge faster than the 1 / sqrt(n) it is
+    # extrapolated by: from 1.5 the samples are at most 1.5^(2 - 1 / 0.8) = 1.36 times too many, at power 0.8 below.
     pilot_error: float = 1.5
-    # Exponent of the error's fall with samples that extrapolations trust at most (1 / sqrt(n): 0.5; the rank-1 lattice
-    # of smooth integrands reaches 1), and the factor in samples over which they do.
+    # Largest power p of error ~ n^-p that extrapolation assumes (Monte Carlo: 0.5; a rank-1 lattice on a smooth
+    # integrand: 1), and the factor in samples over which it does; beyond it the power is 0.5.
     max_power: float = 0.8
     max_extrapolation: float = 16.0
 
@@ -47,11 +49,11 @@ DEFAULT_SCHEDULE = ScheduleTuning()
 
 
 class _PilotEndedError(Exception):
-    """The time for a pilot is over."""
+    """The pilot has used its time."""
 
 
 def pilot_replicas(replicas: int, n_sensors: int) -> int:
-    """Return how many replicas a pilot of ``n_sensors`` points takes: enough of them to keep any machine busy."""
+    """Return the replicas of a pilot of ``n_sensors`` points: at least the render's, up to ``PILOT_LANES`` lanes."""
     return max(replicas, PILOT_LANES // n_sensors // 2 * 2)
 
 
@@ -70,14 +72,13 @@ def calibrated_by_pilot(
     budget
         With a target error.
     replicas
-        Of the render, whose lanes take ``first_samples`` each at least, and of the pilot.
+        Of the render, whose lanes take at least ``first_samples`` each, and of the pilot.
     look
-        Runs the pilot with a schedule.
+        Runs the pilot with a schedule and passes.
     known_squares, tuning
         As for ``Schedule``.
     seconds
-        After which the pilot ends: what it has seen is extrapolated, and ``spp`` is None where that is nothing but
-        noise.
+        After which the pilot ends and its error is extrapolated; ``spp`` stays None if it is infinite: no signal yet.
     """
     goal = tuning.aim * (budget.target_error or DEFAULT_TARGET)
     enough = tuning.pilot_error * goal
@@ -93,14 +94,14 @@ def calibrated_by_pilot(
     per_lane, error = schedule.errors[-1]
     if math.isinf(error):
         return budget
-    if error > enough:  # it ended before it had seen enough
+    if error > enough:  # the pilot ran out of time
         per_lane, error = schedule.samples_at(enough), enough
-    fewest = tuning.first_samples * replicas[0]
-    return replace(budget, spp=max(fewest, math.ceil(per_lane * replicas[1] * (error / goal) ** 2)))
+    min_spp = tuning.first_samples * replicas[0]
+    return replace(budget, spp=max(min_spp, math.ceil(per_lane * replicas[1] * (error / goal) ** 2)))
 
 
 class Schedule:
-    """How many samples each launch takes. Only the last launches depend on time, and only with a time limit.
+    """The number of samples of each launch; sample counts depend on time only with a time limit.
 
     Parameters
     ----------
@@ -127,18 +128,18 @@ class Schedule:
         self.limit = math.ceil(budget.spp / replicas) if budget.spp is not None else None
         self.errors: list[tuple[int, float]] = []  # (samples per lane, relative L2 error)
         self.speed = math.inf  # samples per lane and second
-        self.block = range(0)  # samples that are going to be complete, whatever the launches
+        self.block = range(0)  # samples that systematic sampling spreads evenly; complete whatever the launches
         self._next_look = self.tuning.first_samples
 
     def numbers(self) -> dict[str, object]:
-        """Return what has been found out, as JSON can hold it."""
+        """Return the state as JSON can hold it."""
         speed = self.speed if math.isfinite(self.speed) else None
         return {"errors": [list(error) for error in self.errors], "speed": speed, "next_look": self._next_look}
 
     def restore(self, numbers: Mapping[str, Any]) -> None:
-        """Go on where the ``numbers`` of an earlier schedule leave off."""
+        """Restore the state from ``numbers()`` of an earlier schedule."""
         self.errors = [(done, error) for done, error in numbers["errors"]]
-        # of another machine, maybe: the first launch is a small one again
+        # maybe of another machine: the first launch is small again
         self.speed = (numbers["speed"] or 1.0) / 4
         self._next_look = numbers["next_look"]
         if "block" in numbers:
@@ -149,7 +150,7 @@ class Schedule:
         budget = self.budget
         if done == 0:
             first = min(self.tuning.first_samples, self.limit or self.tuning.first_samples)
-            if self.limit is not None or budget.time_limit_s is not None:  # what a launch takes changes no result
+            if self.limit is not None or budget.time_limit_s is not None:  # launch sizes change no result
                 first = max(1, min(first, self.tuning.max_first_pairs // self.lanes))
             self.block = range(first if budget.time_limit_s is not None or self.limit is None else self.limit)
             return first
@@ -167,25 +168,25 @@ class Schedule:
         if budget.time_limit_s is not None:
             launch = min(launch, max(1.0, self.speed * (budget.time_limit_s - seconds)))
         more = int(min(goal - done, launch if math.isfinite(launch) else 4 * done))
-        if budget.time_limit_s is not None:  # there may be no other launch
+        if budget.time_limit_s is not None:  # each launch may be the last
             self.block = range(done, done + more)
         elif done == self.block.stop:
             self.block = range(done, goal)
         return more
 
     def wants_error(self, done: int) -> bool:
-        """Return whether to look at the error now: at sample counts fixed by the errors seen so far."""
+        """Return whether to estimate the error now: at sample counts that follow from the errors so far."""
         return self.budget.target_error is not None and done >= self._next_look
 
     def record_error(self, done: int, error: float) -> None:
-        """Note the error after ``done`` samples and when to look next: it falls at least as 1 / sqrt(samples)."""
+        """Record the error after ``done`` samples, and the sample count of the next estimate, by 1 / sqrt(samples)."""
         self.errors.append((done, error))
         target = self.budget.target_error or error
         needed = done * (error / target) ** 2 if target > 0 else done
         self._next_look = int(min(max(needed * 1.05, done * 1.25), done * 4)) + 1
 
     def samples_at(self, error: float) -> int:
-        """Return the samples per lane for an error below the last one: at first it falls as between the last looks."""
+        """Return the samples per lane for ``error`` below the last one, by the power of the last two estimates."""
         count, seen = self.errors[-1]
         earlier = [(n, e) for n, e in self.errors[:-1] if n <= count / 2 and seen < e < math.inf]
         power = 0.5

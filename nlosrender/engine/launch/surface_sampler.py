@@ -1,7 +1,8 @@
 """Hidden geometry sampling: points uniform by area on the hidden surfaces (Royo et al. 2022, section 4).
 
-Triangles of all meshes lie in one table, analytic shapes are entries beside them; one search in the integer
-cumulative distribution picks an entry and hands its remainder on, so that low-discrepancy numbers stay so.
+Triangles of all meshes lie in one table, analytic shapes follow them. Inversion of the integer cumulative distribution
+by a guide table (Chen & Asau 1974) picks an entry; the remainder is rescaled and serves as coordinate within it, which
+keeps low-discrepancy points low-discrepancy.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from nlosrender.scene.triangle_point import triangle_weights
 
 SAMPLEABLE_PLUGINS = ("Rectangle", "Disk", "Sphere", "Cylinder")
 _FULL = 2.0**32
-MAX_GUIDE_BITS = 22  # 16 MB
+MAX_GUIDE_BITS = 22  # 16 MB; more than two parts per entry up to 2^21 entries, so that a search takes about one step
 ANALYTIC = 0xFFFFFFFF  # primitive of a point that lies on no triangle
 
 
@@ -61,11 +62,11 @@ class SurfaceSampler:
 
     @cached_property
     def _table(self) -> _Table:
-        """Made when it is needed: a gather alone has no use for it, and it takes a second per million triangles."""
+        """Made on first use: a gather alone does not need it, and it takes a second per million triangles."""
         return _Table.of(self._built)
 
     def set_up(self) -> None:
-        """Make the table: what a recorded loop samples has to be there before."""
+        """Make the table: it cannot be made while a loop that samples is recorded."""
         _ = self._table
 
     @property
@@ -101,8 +102,8 @@ class SurfaceSampler:
         u = dr.minimum(
             (mi.Float(bits - low) + 0.5) / dr.maximum(mi.Float(high - low), 1.0), dr.one_minus_epsilon(mi.Float)
         )
-        row_of_lane = dr.gather(mi.UInt32, table.row_of_lane, entry, active)
-        shape = dr.gather(mi.ShapePtr, self._built.scene.shapes_dr(), row_of_lane, active)
+        shape_index = dr.gather(mi.UInt32, table.shape_index, entry, active)
+        shape = dr.gather(mi.ShapePtr, self._built.scene.shapes_dr(), shape_index, active)
         is_triangle = entry < self.n_triangles
         point, normal, primitive = mi.Point3f(0), mi.Normal3f(0), mi.UInt32(ANALYTIC)
         within = mi.Point2f(0)
@@ -121,7 +122,7 @@ class SurfaceSampler:
 
     @dr.syntax
     def _entry(self, bits: mi.UInt32, active: mi.Bool) -> mi.UInt32:
-        """Return the entry that covers the integers ``bits``: few steps, for the guide says where it may be."""
+        """Return the entry that covers the integers ``bits``: binary search between two entries of the guide table."""
         table = self._table
         part = bits >> (32 - table.guide_bits)
         low = dr.gather(mi.UInt32, table.guide, part, active)
@@ -209,8 +210,8 @@ class _Table:
     area: float  # engine units squared
     edges: mi.UInt32  # entry i covers the integers [edges[i], edges[i + 1]); the last one also takes 2^32 - 1
     guide_bits: int
-    guide: mi.UInt32  # entry at the start of each of 2^guide_bits equal parts of the integers (Chen & Asau 1974)
-    row_of_lane: mi.UInt32  # shape of each entry
+    guide: mi.UInt32  # guide table (Chen & Asau 1974): entry at the start of each of 2^guide_bits equal parts
+    shape_index: mi.UInt32  # of each entry, in the scene
     primitive: mi.UInt32  # of each triangle within its shape
     corners: list[mi.Float]  # nine, of the triangles
 
@@ -218,20 +219,20 @@ class _Table:
     def of(cls, built: BuiltScene) -> _Table:
         """Return the table of a scene."""
         corners = [np.zeros((0, 3, 3))]
-        row_points, primitives, analytic_areas = [np.zeros(0, np.uint32)], [np.zeros(0, np.uint32)], [np.zeros(0)]
-        analytic_owners: list[int] = []
+        shape_indices, primitives, analytic_areas = [np.zeros(0, np.uint32)], [np.zeros(0, np.uint32)], [np.zeros(0)]
+        analytic_indices: list[int] = []
         for index, shape in enumerate(built.scene.shapes()):
             if shape.id() == WALL_ID:
                 continue
             if shape.is_mesh():
-                triangles, saved = facing_triangles(built, shape)
+                triangles, numbers = facing_triangles(built, shape)
                 # neighbours in the table are neighbours in space: so are points with near first coordinates
                 order = np.argsort(morton_order(triangles.mean(axis=1)), kind="stable")
                 corners.append(triangles[order])
-                row_points.append(np.full(len(saved), index, np.uint32))
-                primitives.append(saved[order])
+                shape_indices.append(np.full(len(numbers), index, np.uint32))
+                primitives.append(numbers[order])
             elif shape.class_name() in SAMPLEABLE_PLUGINS:
-                analytic_owners.append(index)
+                analytic_indices.append(index)
                 analytic_areas.append(np.ravel(shape.surface_area())[:1].astype(np.float64))
         triangles = np.concatenate(corners)
         areas = np.linalg.norm(np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]), axis=-1)
@@ -247,9 +248,9 @@ class _Table:
             mi.UInt32(np.concatenate([[0], cumulative]).astype(np.uint32)),
             guide_bits,
             on_device(mi.UInt32, guide),
-            mi.UInt32(np.concatenate([*row_points, np.array(analytic_owners, np.uint32)])),
+            mi.UInt32(np.concatenate([*shape_indices, np.array(analytic_indices, np.uint32)])),
             mi.UInt32(np.concatenate(primitives)),
             [mi.Float(triangles[:, i, j].astype(np.float32)) for i in range(3) for j in range(3)],
         )
-        dr.eval(table.edges, table.row_of_lane)
+        dr.eval(table.edges, table.shape_index)
         return table

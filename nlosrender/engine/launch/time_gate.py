@@ -1,9 +1,8 @@
-"""The end of the time window as a deadline: which paths can only bring light that comes too late to be seen.
+"""Time gate: Russian roulette on paths whose light can only arrive after the time window (Arvo & Kirk 1990).
 
-Light after the window is reported as one number, so that a few of these paths, with more weight, do for all (Russian
-roulette, Arvo and Kirk 1990): nothing is biased, neither in the window nor after it. How a path goes on is not known,
-but no way to a laser point is shorter than the straight one, unless through a medium of an index below 1: there the
-roulette may meet light of the window, too, which costs noise and no bias.
+Light after the window is one number per row, for which few paths of larger weight suffice; nothing is biased, neither
+inside the window nor after it. The straight line to the nearest laser point is a lower bound on the rest of a path,
+except through a medium of index below 1: there the roulette may end paths of the window, at the cost of noise.
 """
 
 from __future__ import annotations
@@ -27,18 +26,20 @@ from nlosrender.scene.pose import Float64
 
 @dataclass(frozen=True, eq=False)
 class TimeGate:
-    """What a lane needs to tell that its path is late; lengths in engine units, none of them part of a kernel."""
+    """What decides whether a lane's path is past the gate; lengths in engine units, all opaque or per lane."""
 
-    latest: mi.Float  # per lane: longest way from where its paths begin to a laser point that ends in the window
+    latest: mi.Float  # per lane: longest path from its start to a laser point that arrives in the window
     low: mi.Point3f  # box around the laser points, or around the lane's own
     high: mi.Point3f
-    survival: float  # probability of a path to go on once all its light comes after the window
-    detour: mi.Float  # height to which light leaves a planar wall and comes back to it, there and back
+    survival: float  # probability to continue once all light of a path arrives after the window
+    detour: (
+        mi.Float
+    )  # twice the height of the hidden geometry over a planar wall: light of the wall goes there and back
 
     def is_past(self, opl: mi.Float, point: mi.Point3f, on_wall: mi.Bool) -> mi.Bool:
         """Return whether a path of length ``opl`` up to ``point`` can only bring light after the window.
 
-        From a planar wall light first goes to the hidden geometry: as far as to the laser's mirror image there.
+        Light of a planar wall goes to the hidden geometry first: as far as to a laser mirrored at its lowest height.
         """
         reach = dr.maximum(dr.maximum(self.low - point, point - self.high), 0)
         reach.z = dr.maximum(reach.z, dr.select(on_wall, self.detour, 0))
@@ -55,16 +56,16 @@ def time_gate_roulette(
     on_wall: mi.Bool,
     throughput: mi.Spectrum,
 ) -> tuple[mi.Bool, mi.Bool, mi.Spectrum]:
-    """End most of the paths that have become late, once each; the others carry the light of all.
+    """Russian roulette, once per path, when it passes the gate; survivors are weighted by 1 / survival.
 
     Parameters
     ----------
     time_gate
-        None: no path is late.
+        None: no path passes it.
     generator
-        Drawn from by late paths alone: where there are none, no path's numbers change.
+        Drawn from only for paths that pass the gate: without any, no path's random numbers change.
     alive, is_past_gate, throughput
-        Which paths are under way, which of them have survived this, and what they carry.
+        Paths under way, those among them that have survived this roulette, and throughput.
     opl, point, on_wall
         Length of the path up to its last vertex [engine units], that vertex, and whether it lies on the relay wall.
 
@@ -75,27 +76,28 @@ def time_gate_roulette(
     """
     if time_gate is None:
         return alive, is_past_gate, throughput
-    late = alive & ~is_past_gate & time_gate.is_past(opl, point, on_wall)
-    survives = generator.next_float32(late) < time_gate.survival
-    return alive & (~late | survives), is_past_gate | late, dr.select(late, throughput / time_gate.survival, throughput)
+    passes = alive & ~is_past_gate & time_gate.is_past(opl, point, on_wall)
+    survives = generator.next_float32(passes) < time_gate.survival
+    throughput = dr.select(passes, throughput / time_gate.survival, throughput)
+    return alive & (~passes | survives), is_past_gate | passes, throughput
 
 
 @dataclass(frozen=True, eq=False)
 class CaptureTimeGate:
-    """How far light of a capture may go and still arrive in its time window [engine units].
+    """The time gate of a whole capture [engine units]: path lengths whose light arrives in its time window.
 
-    Points and legs are those of the whole capture: what is late must not depend on how it is cut into batches.
+    Points and legs are those of the whole capture, so that batches and shards do not show.
     """
 
     sensor_box: Bounds
     laser_box: Bounds
     survival: float  # as ``TimeGate.survival``
-    longest: float  # way from a sensor point to a laser point
+    longest: float  # path from a sensor point to a laser point that may arrive in the window
     detour: float
 
     @classmethod
     def of(cls, built: BuiltScene, capture: Capture, time_axis: TimeAxis, survival: float) -> CaptureTimeGate:
-        """Return the horizon of a capture."""
+        """Return the time gate of a capture."""
         lowest = built.hidden_bounds[0][2] if built.wall.is_planar and built.hidden_bounds is not None else 0.0
         sensor_legs, laser_legs = capture.sensor_legs.reshape(-1), capture.laser_legs.reshape(-1)
         confocal = capture.scan_type == "confocal"
@@ -109,12 +111,12 @@ class CaptureTimeGate:
         )
 
     def is_beyond(self, points: Float64) -> NDArray[np.bool_]:
-        """Return which points (n, 3) lie only on ways that end after the window, (n,)."""
+        """Return (n,) which points (n, 3) lie only on paths that arrive after the window."""
         ways = distance_to_box(points, self.sensor_box) + distance_to_box(points, self.laser_box)
         return ways > self.longest
 
     def of_points(self, points: Float64) -> TimeGate:
-        """Return the deadline of walks from ``points`` (n, 3), one lane each, that sensor points look at."""
+        """Return the gate of VPL subpaths from ``points`` (n, 3), one lane each."""
         latest = self.longest - distance_to_box(points, self.sensor_box)
         low, high = (_opaque_point(corner) for corner in self.laser_box)
         return TimeGate(on_device(mi.Float, latest), low, high, self.survival, dr.opaque(mi.Float, self.detour))
@@ -122,7 +124,7 @@ class CaptureTimeGate:
     def of_sensors(
         self, built: BuiltScene, capture: Capture, time_axis: TimeAxis, index: NDArray[np.integer], sensor: mi.UInt32
     ) -> TimeGate:
-        """Return the deadline of paths from the sensor points ``index`` (n,), of which lanes have the ``sensor``-th."""
+        """Return the gate of paths from the sensor points ``index`` (n,); lane i starts at number ``sensor[i]``."""
         own = capture.scan_type == "confocal"
         sensor_legs, laser_legs = capture.sensor_legs.reshape(-1), capture.laser_legs.reshape(-1)
         legs = sensor_legs[index] + (laser_legs[index] if own else laser_legs.min())

@@ -1,4 +1,4 @@
-"""The line-of-sight engine: what a camera sees of a scene that emits one pulse, pixel by pixel."""
+"""Line-of-sight engine: transient path tracing of the pixels of a camera, of a scene that emits one pulse."""
 
 from __future__ import annotations
 
@@ -110,7 +110,7 @@ class LineOfSightEngine:
 
         return Accumulation(shape, pixels, self.options.seed, launch)
 
-    # What ``preflight`` and reports ask
+    # Asked by ``preflight`` and reports
 
     def omitted_work(self) -> Iterator[OmittedWork]:
         """Yield the work that is left out; see ``Engine.omitted_work``."""

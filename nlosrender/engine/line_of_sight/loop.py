@@ -18,7 +18,7 @@ from nlosrender.engine.launch.launch_params import MAX_SURVIVAL
 from nlosrender.engine.launch.sequences import recurrence_steps
 from nlosrender.engine.line_of_sight.view_params import ViewLaunchParams, ViewSettings
 
-ROULETTE_AFTER = 3  # surface interactions: what is brightest is never thinned out
+ROULETTE_AFTER = 3  # surface interactions without Russian roulette: these have most of the light and the variance
 
 
 @dr.syntax
@@ -45,7 +45,7 @@ def trace_view(
     seq_u, seq_v = (mi.UInt32(start) for start in randomness.sequence[:2])
     started = mi.UInt32(0)  # paths begun by this lane
     alive = mi.Bool(False)  # a ray is under way
-    ray = mi.Ray3f(mi.Point3f(0), mi.Vector3f(0, 0, 1))  # not zeros: those end where they start
+    ray = mi.Ray3f(mi.Point3f(0), mi.Vector3f(0, 0, 1))  # not zeros: such a ray has no direction
     bounce = mi.UInt32(0)  # surface interactions so far
     throughput = mi.Spectrum(0)  # of the path up to the last vertex, and the direction under way over its density
     bsdf_density = mi.Float(0)  # of that direction [1/sr]
@@ -98,8 +98,8 @@ def trace_view(
             go_on &= bounce <= max_bounces
         bsdf = si.bsdf(ray)
         connects = go_on & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
-        at = mi.Point2f(generator.next_float32(connects), generator.next_float32(connects))
-        towards, emitted = scene.sample_emitter_direction(si, at, True, connects)
+        square = mi.Point2f(generator.next_float32(connects), generator.next_float32(connects))
+        towards, emitted = scene.sample_emitter_direction(si, square, True, connects)
         connects &= towards.pdf > 0
         wo = si.to_local(towards.d)
         reflected, density = bsdf.eval_pdf(context, si, wo, connects)
@@ -119,8 +119,8 @@ def trace_view(
 
         # ---- Sample the next direction ------------------------------------------------------------------------------
         lobe = generator.next_float32(go_on)
-        at = mi.Point2f(generator.next_float32(go_on), generator.next_float32(go_on))
-        bs, weight = bsdf.sample(context, si, lobe, at, go_on)
+        square = mi.Point2f(generator.next_float32(go_on), generator.next_float32(go_on))
+        bs, weight = bsdf.sample(context, si, lobe, square, go_on)
         weight = si.to_world_mueller(weight, -bs.wo, si.wi)
         throughput = throughput * weight  # Mueller matrices: from the right
         bsdf_density = mi.Float(bs.pdf)
@@ -134,7 +134,7 @@ def trace_view(
         brightness = dr.max(mi.unpolarized_spectrum(throughput))
         alive = go_on & (brightness > 0)
         if dr.hint(settings.russian_roulette, mode="scalar"):
-            # radiance is compressed by the index squared, and is no reason to end
+            # radiance changes with the square of the index, which must not lower the survival probability
             survival = dr.minimum(brightness * dr.square(medium), MAX_SURVIVAL)
             survival = dr.select(bounce < ROULETTE_AFTER, 1, survival)
             alive &= generator.next_float32(alive) < survival
@@ -144,7 +144,7 @@ def trace_view(
 
 
 def _pixel_direction(params: ViewLaunchParams, bits_x: mi.UInt32, bits_y: mi.UInt32) -> mi.Vector3f:
-    """Return the direction from the camera to a place in the lane's pixel: uniform over its area, a box filter."""
+    """Return the direction from the camera to a point of the lane's pixel, uniform over its area (box filter)."""
     x, y = (mi.Float(bits >> 8) * 2.0**-24 - 0.5 for bits in (bits_x, bits_y))
     return dr.normalize(params.pixels + x * params.pixel_x + y * params.pixel_y - params.camera)
 

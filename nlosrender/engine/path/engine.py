@@ -1,4 +1,4 @@
-"""The path engine: unbiased path tracing of a capture, batch by batch, to an error, a sample count or a time."""
+"""Path engine: unbiased transient path tracing of a capture (Royo et al. 2022), batch by batch."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ class PathEngine:
         self.kernel = TemporalKernel(width) if width > 0 else None
         self.compile_seconds = 0.0
 
-    # Made when they are needed: they cast rays, and ``plan`` asks engines that never trace a path.
+    # Cached on first use: they trace rays, which engines made for ``plan`` do not need.
 
     @cached_property
     def p_hidden_sampling(self) -> float:
@@ -199,7 +199,7 @@ class PathEngine:
         return replace(self.device.shape(pilot, self.n_slots), replicas=replicas)
 
     def continuation_period(self, budget: Budget) -> int:
-        """Return n of the roulette after bounce 3: the same however the capture is cut."""
+        """Return n of the roulette after bounce 3; it does not depend on how the capture is cut."""
         if not self.settings.has_continuation_roulette:
             return 1
         if self.options.continuation_period is not None:
@@ -216,7 +216,7 @@ class PathEngine:
         return best_continuation_period(self._pilot_variance, cost, self.options.bounces.split)
 
     def _pilot_variance(self, period: int) -> float:
-        """Return the variance of H, summed, of a few samples at a few points: in arbitrary units."""
+        """Return the variance of H summed over the pilot's points, in arbitrary units."""
         pilot, nx, samples = pilot_of(self.capture), self.capture.sensor_grid.nx, self.tuning.pilot_samples
         shape, order = self._pilot_shape(pilot), self.device.lane_order(pilot)
         params, histogram = self._path_params(pilot, shape, period), DeviceHistogram(shape, self.kernel)
@@ -227,7 +227,7 @@ class PathEngine:
         self.trace(params, histogram, random, systematic, samples)
         return float(histogram.on_host(histogram.statistics(samples)[1])[..., :-1].sum())
 
-    # What ``preflight`` and reports ask
+    # Asked by ``preflight`` and reports
 
     def omitted_work(self) -> Iterator[OmittedWork]:
         """Yield the work that is left out; see ``Engine.omitted_work``."""

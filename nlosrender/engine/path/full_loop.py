@@ -1,8 +1,8 @@
-"""The transient path tracer: one loop that is the whole of Royo et al. 2022, section 4.
+"""Full loop: transient path tracing with hidden geometry and laser sampling (Royo et al. 2022, section 4).
 
 Paths start at sensor points. A lane belongs to one sensor point; when its path ends it starts the next one in the same
-iteration (``PathStarts.begin``), so lanes stay busy whatever the path lengths. Where hidden geometry sampling does
-alone, ``third_bounce_loop`` has a quicker loop.
+iteration (``PathStarts.begin``), so lanes stay busy whatever the path lengths. ``third_bounce_loop`` is
+faster where hidden geometry sampling alone suffices.
 
 The estimator. A path x_0 (sensor point), x_1, ..., x_k is extended from x_k in a direction w of density p(w), and its
 throughput (product of BSDF f, cosines and 1 / p, the wall's f at x_0 included) is
@@ -110,7 +110,7 @@ def trace_paths(
     medium = mi.Float(1)  # refractive index along the ray
     is_past_gate = mi.Bool(False)  # the path can only bring light after the window, and has survived that roulette
 
-    # what a launch reads is no state of the loop
+    # excluded: arrays that the loop reads but does not change
     while dr.hint(
         alive | (starts.count < n_samples),
         exclude=[settings, params, histogram, built, sampler, sensor, time_gate, n_samples, stride],
@@ -194,7 +194,7 @@ def _begin_until_lit(
     sample: SurfaceSample,
     dark: mi.Bool,
 ) -> tuple[PathStarts, SurfaceSample, mi.Bool]:
-    """Begin other paths at once on lanes whose first sampled point shows its dark side; no ray is traced for those."""
+    """Begin further paths on lanes whose first sampled point faces away, until one does not; they take no rays."""
     while dr.hint(dark & start & (starts.count < n_samples), exclude=[params, stride, n_samples, origin, start]):
         starts, numbers, _ = starts.begin(stride, steps)
         sample = params.sampler.sample(numbers.bits_u, numbers.v, dark)
@@ -217,9 +217,9 @@ def _begin_until_near(
     eta: mi.Float,
     misses: mi.Bool,
 ) -> tuple[mi.PCG32, PathStarts, Departure, mi.Float, mi.Float, mi.Bool]:
-    """Begin other paths at once on lanes whose first ray misses the box around the hidden geometry, a few times.
+    """Begin further paths, at most ``max_tries``, on lanes whose first ray misses the box of the hidden geometry.
 
-    Before a planar wall all surfaces lie in the box, so those paths end without a ray.
+    In front of a planar wall all surfaces lie in the box, so those paths end without a ray being traced.
     """
     sensor, nowhere, tries = params.sensors.interaction, mi.Bool(False), mi.UInt32(0)
     while dr.hint(
@@ -236,9 +236,9 @@ def _begin_until_near(
 def _survival(
     settings: PathSettings, params: PathParams, albedo: mi.Float, start: mi.Bool, bounce: mi.UInt32
 ) -> mi.Float:
-    """Return the probability to go on after the connections of a vertex: by the albedo just met, at most.
+    """Return the survival probability of Russian roulette after the connections of a vertex: at most its albedo.
 
-    Never before a vertex could deposit; after bounce 3 one path in ``continuation_period`` goes on besides.
+    1 before the first bounce that is deposited; at bounce 3 also divided by ``continuation_period``.
     """
     survival = albedo
     if settings.first_bounce == THIRD_BOUNCE:

@@ -1,7 +1,6 @@
-"""Laser connections of a path's vertices, and the deposits they make.
+"""Laser sampling: connections of path vertices to the laser points, and deposits (Royo et al. 2022, section 4).
 
-Laser sampling connects every vertex to every laser of the lane (Royo et al. 2022, section 4). A laser with a spot may
-also be found by chance: the two ways are weighted by the balance heuristic (Veach 1997).
+BSDF sampling may also find the laser's spot, if it has one; the balance heuristic weights the two (Veach 1997, 9.2.2).
 """
 
 from __future__ import annotations
@@ -22,10 +21,9 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class PathVertex:
-    """A vertex of a path as its connections see it.
+    """A vertex of a path to be connected.
 
-    It lies at ``origin`` plus ``leg``: closer to a laser point than float32 tells positions apart, only the leg says
-    where it is.
+    It lies at ``origin`` plus ``leg``, whose float32 precision is kept even close to a laser point.
     """
 
     si: mi.SurfaceInteraction3f
@@ -50,7 +48,7 @@ def connect_to_lasers(
 
     ``coherent``: neighbouring lanes are at neighbouring vertices, and trace their rays together.
     """
-    # one place in the spot for all lasers: what a path draws must not depend on how many lasers a batch has
+    # the same point of the spot for all lasers: random numbers must not depend on the lasers of a batch
     in_spot = mi.Vector3f(0)
     if dr.hint(settings.finds_spot, mode="scalar"):
         in_spot = _on_disk(generator, active) * settings.spot_radius
@@ -97,7 +95,7 @@ def _connect(
         share = dr.select(si.shape == mi.ShapePtr(built.wall_shape), 1 - settings.p_hidden_sampling, 1.0)
         cosine = dr.maximum(dr.dot(lit.n, -direction), 0)
         value *= _balance_heuristic(distance2, share * pdf * cosine * dr.pi * settings.spot_radius**2)
-    # not in place: the caller's mask serves the other lasers, too
+    # not in place: the caller's mask is used for the other lasers
     active = active & dr.any(mi.unpolarized_spectrum(value) > 0)
     if settings.needs_visibility:
         segment = connection_segment(built, si, direction, lit)

@@ -1,4 +1,4 @@
-"""Settings of the path tracer's kernels, and what a launch of them reads besides the capture."""
+"""Settings compiled into the path tracer's kernels, and the parameters of their launches."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from nlosrender.engine.path.tuning import PathTuning
 
 @dataclass(frozen=True)
 class PathSettings:
-    """What the integrator computes and how; part of the compiled kernel."""
+    """Switches and numbers that are part of the compiled kernels."""
 
     bounces: BounceAxis
     first_bounce: int  # lowest bounce that is deposited, >= 3
@@ -23,10 +23,10 @@ class PathSettings:
     laser_sampling: bool
     russian_roulette: bool
     spot_radius: float  # of the laser on the wall [engine units]; 0 = a point
-    needs_visibility: bool  # something may lie between a vertex and a laser or sensor point
+    needs_visibility: bool  # something may occlude a vertex from a laser or sensor point
     has_transmission: bool  # some BSDF refracts: the optical path length needs the medium's index
     is_plain_diffuse: bool  # flat surfaces of one reflectance each: only normals matter to their BSDFs
-    max_tries: int = PathTuning.max_tries  # of paths that miss the hidden geometry's box, one after the other
+    max_tries: int = PathTuning.max_tries  # see ``PathTuning``
 
     @property
     def goes_on(self) -> bool:
@@ -41,12 +41,12 @@ class PathSettings:
 
     @property
     def has_time_gate(self) -> bool:
-        """Whether few paths go on that can only bring light after the time window."""
+        """Whether the time gate's roulette applies."""
         return self.goes_on and self.russian_roulette
 
     @property
     def has_continuation_roulette(self) -> bool:
-        """Whether only some of the paths may go on beyond the third bounce, which all of them deposit."""
+        """Whether the roulette after bounce 3 applies: all paths deposit bounce 3, one in n continues."""
         is_first = self.first_bounce == THIRD_BOUNCE and self.laser_sampling
         return self.has_time_gate and is_first and not self.finds_spot
 
@@ -82,4 +82,4 @@ class PathParams(LaunchParams):
     """What a launch of the path tracer reads."""
 
     hidden_aabb: HiddenAabb | None  # None: few rays from the wall miss it
-    continuation_period: mi.UInt32  # n of ``roulette``: one path in n goes on after bounce 3; opaque
+    continuation_period: mi.UInt32  # n of ``roulette``: one path in n continues after bounce 3; opaque

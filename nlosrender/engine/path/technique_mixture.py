@@ -1,4 +1,4 @@
-"""The technique mixture: with which probability a path's vertex on the wall samples the hidden geometry."""
+"""Technique mixture: probability of hidden geometry sampling, instead of BSDF sampling, at vertices of the wall."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from nlosrender.engine.path.tuning import PathTuning
 
 
 def choose_p_hidden_sampling(device: DeviceCapture, tuning: PathTuning) -> float:
-    """Return the mixture on the relay wall; one technique alone where it suffices: cheaper and less noisy."""
+    """Return the probability of hidden geometry sampling: 0 or 1 where one technique suffices, which is cheaper."""
     built, sampler = device.built, device.sampler
     if sampler.is_empty or built.hidden_bounds is None:
         return 0.0
     distance = built.hidden_bounds[0][2] / built.metres_per_engine_unit
-    # All light comes from sampled surfaces, and the wall has no mirror lobe that only its own sampling finds.
+    # All light comes from sampled surfaces, and no delta lobe of the wall needs BSDF sampling.
     only_hidden = built.wall.is_planar and sampler.covers_everything
     only_hidden &= not built.wall_bsdf.flags() & mi.BSDFFlags.Delta
     if only_hidden and distance > 0 and sampler.area < tuning.max_area_ratio * math.pi * distance**2:

@@ -1,15 +1,15 @@
-"""The third-bounce loop: hidden geometry sampling alone, where the third bounce asks for visibility only.
+"""Third-bounce loop: hidden geometry sampling alone, for which any-hit rays suffice.
 
-What ``trace_paths`` finds as the nearest hit of a ray is known beforehand: the sampled point lies on a known triangle.
-Both legs are any-hit queries, and only points that face sensor and laser point take them. Every lane traces one path
+The vertex, which ``trace_paths`` finds as the nearest hit of a ray, is known beforehand: the sampled point. Both legs
+are any-hit queries, made only for points that face the sensor point and the laser point. Every lane traces one path
 per iteration, so the lanes of a packet stay at neighbouring points of the hidden geometry (``SystematicSequence``).
 
 The estimator, with a point x of density 1 / A on the hidden geometry, sensor point s, laser point l:
 
     H_3 = E  f_s cos_s  [V(s, x) cos(x) A / |x - s|^2]  f(x) cos(x)  f_l cos_l  V(x, l) / |x - l|^2
 
-Where further bounces are asked for, one path in n goes on (``follow_paths``) and carries the light of n: see
-``roulette``. The lanes of a packet go on together.
+Higher bounces by Russian roulette: one path in n continues with weight n (``follow_paths``, ``roulette``); the lanes of
+a packet continue together.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from nlosrender.engine.path.vertex_steps import DirectionNumbers, arrive, leave,
 
 
 def is_third_bounce_loop(settings: PathSettings, sampler: SurfaceSampler) -> bool:
-    """Return whether all paths of these settings begin with hidden geometry sampling, as this loop has it."""
+    """Return whether this loop samples all paths of these settings: hidden geometry sampling of triangles alone."""
     only_hidden = settings.p_hidden_sampling == 1 and settings.laser_sampling and not settings.finds_spot
     is_first = settings.first_bounce == THIRD_BOUNCE
     return only_hidden and is_first and not sampler.has_analytic and not mi.is_polarized
@@ -47,7 +47,7 @@ def trace_third_bounce(
 ) -> tuple[LaneRandomness, SystematicSequence]:
     """Trace ``n_samples`` more paths per lane and deposit what they carry; as ``trace_paths``."""
     sampler, sensors, stride = params.sampler, params.sensors, systematic.stride
-    sensor, every = sensors.interaction, params.continuation_period
+    sensor, period = sensors.interaction, params.continuation_period
     own_laser = params.lasers.gather(params.first_laser).interaction.p
     (step,) = recurrence_steps(1)
 
@@ -55,16 +55,16 @@ def trace_third_bounce(
     generator = mi.PCG32(randomness.generator)
     position = mi.UInt64(systematic.position)
     seq_v = mi.UInt32(randomness.sequence[1])
-    phase = mi.UInt32(randomness.phase)  # paths until the next one that goes on
+    phase = mi.UInt32(randomness.phase)  # paths until the next one that continues
     done = mi.UInt32(0)  # paths of this lane
 
-    while dr.hint(done < n_samples, exclude=[settings, params, histogram, sampler, sensors, sensor, own_laser, every]):
+    while dr.hint(done < n_samples, exclude=[settings, params, histogram, sampler, sensors, sensor, own_laser, period]):
         # ---- Sample a point of the hidden geometry ------------------------------------------------------------------
         sample = sampler.sample(first_coordinate(position), unit_interval(seq_v), mi.Bool(True))
         goes_on = mi.Bool(False)
         if dr.hint(settings.goes_on, mode="scalar"):
             goes_on = phase == 0
-            phase = dr.select(goes_on, every, phase) - 1
+            phase = dr.select(goes_on, period, phase) - 1
         active = ~turns_away(params, sample, sensor.p)
         if dr.hint(sampler.dark_behind and params.lasers_per_lane == 1, mode="scalar"):
             active &= goes_on | ~turns_away(params, sample, own_laser)
@@ -89,7 +89,7 @@ def _connect_sample(
     active: mi.Bool,
     goes_on: mi.Bool,
 ) -> mi.PCG32:
-    """Connect a sampled point to its sensor point and to the lasers, and go on; packets in the dark pass by."""
+    """Connect a sampled point to sensor point and lasers, and continue; packets without an active lane skip it."""
     if dr.hint(active, exclude=[settings, params, histogram, sample, goes_on]):
         built, sampler, sensor = params.built, params.sampler, params.sensors.interaction
         leg = sample.p - sensor.p
@@ -118,7 +118,7 @@ def follow_paths(
     first: PathVertex,
     alive: mi.Bool,
 ) -> mi.PCG32:
-    """Follow one path in n beyond its ``first`` hidden vertex, which has been deposited; ``alive``: lanes that go on.
+    """Follow one path in n beyond its ``first`` hidden vertex, which has been deposited; ``alive``: which lanes.
 
     Returns
     -------
@@ -150,7 +150,7 @@ def follow_paths(
         way, survival, eta = leave(settings, params, generator, vertex, on_wall, numbers, sample, by_bsdf, has_target)
         alive = by_bsdf | has_target
         if dr.hint(settings.russian_roulette, mode="scalar"):
-            # by the albedo just met, but not at the third bounce: there few paths go on already
+            # by the albedo of the vertex; not at the third bounce, which has the continuation roulette
             alive &= generator.next_float32(by_bsdf) < survival
             way.value /= dr.maximum(survival, 1e-9)
         alive &= dr.any(way.value != 0)

@@ -1,8 +1,7 @@
-"""The two steps of every path: leave a vertex in a sampled direction, arrive at the next vertex.
+"""Vertex steps of a path: leave a vertex in a sampled direction, arrive at the next vertex.
 
-Directions come from the BSDF or, on the relay wall, lead to a point sampled on the hidden geometry. The two are
-combined as one mixture density (one-sample MIS with the balance heuristic, Veach 1997), with the density of the vertex
-that the ray really reached.
+Directions are sampled from the BSDF or, on the relay wall, towards a point sampled on the hidden geometry. The density
+is that of the mixture at the vertex that the ray reached (one-sample MIS, balance heuristic, Veach 1997, 9.2.4).
 """
 
 from __future__ import annotations
@@ -24,7 +23,7 @@ if TYPE_CHECKING:
 
 @dataclass(eq=False)
 class Departure:
-    """A ray under way, and what the light is worth that comes along it; not frozen, for it is state of a loop."""
+    """A ray from a vertex with its BSDF value and densities; not frozen: state of a loop."""
 
     ray: mi.Ray3f
     origin: mi.Point3f  # the vertex it left, without ray offset
@@ -47,7 +46,7 @@ class Departure:
 
 @dataclass(frozen=True, eq=False)
 class Arrival:
-    """Where a ray got to."""
+    """The vertex that a ray reached."""
 
     si: mi.SurfaceInteraction3f
     is_reached: mi.Bool  # a surface, and that of the sampled point if the ray was sent to one
@@ -60,14 +59,14 @@ class Arrival:
 
 @dataclass(frozen=True, eq=False)
 class DirectionNumbers:
-    """What a direction is sampled with: 32-bit integers for the first coordinate, a number in [0, 1) for the second."""
+    """Random numbers of a direction: 32-bit integers for the first coordinate, [0, 1) for the second."""
 
     bits_u: mi.UInt32
     v: mi.Float
 
     @classmethod
     def drawn(cls, generator: mi.PCG32, active: mi.Bool) -> DirectionNumbers:
-        """Draw them for the lanes that go on: what others drew would depend on how launches are cut."""
+        """Draw them on the active lanes only: on the others, draws would depend on how launches are cut."""
         return cls(generator.next_uint32(active), unit_interval(generator.next_uint32(active)))
 
 
@@ -77,7 +76,7 @@ def unit_interval(bits: mi.UInt32) -> mi.Float:
 
 
 def intersect(settings: PathSettings, built: BuiltScene, ray: mi.Ray3f, active: mi.Bool) -> mi.SurfaceInteraction3f:
-    """Return what a ray meets. Where only normals matter, any frame around them serves, and is quicker to get."""
+    """Return the nearest hit. Plain diffuse surfaces take any shading frame around the normal, which is faster."""
     if not settings.is_plain_diffuse:
         return built.scene.ray_intersect(ray, mi.RayFlags.All, coherent=False, active=active)
     si = built.scene.ray_intersect(ray, mi.RayFlags.Minimal, coherent=False, active=active)
@@ -87,7 +86,7 @@ def intersect(settings: PathSettings, built: BuiltScene, ray: mi.Ray3f, active: 
 
 
 def arrive(settings: PathSettings, params: PathParams, way: Departure, active: mi.Bool) -> Arrival:
-    """Trace a ray to the next vertex and say how dense its direction was sampled."""
+    """Trace a ray to the next vertex and return it with the density of the direction."""
     built, sampler, q = params.built, params.sampler, settings.p_hidden_sampling
     wall = mi.ShapePtr(built.wall_shape)
     si = intersect(settings, built, way.ray, active)
@@ -104,7 +103,7 @@ def arrive(settings: PathSettings, params: PathParams, way: Departure, active: m
         si.p.z = dr.select(on_wall, 0, si.p.z)  # exactly: rays that leave the wall there need no offset
     density = mi.Float(way.bsdf_density)
     if q > 0:
-        # not along the ray: its offset origin matters where hidden geometry comes close to the wall
+        # by the leg, not the ray: the ray's offset origin matters for hidden geometry close to the wall
         cosine = dr.abs(dr.dot(si.n, leg)) / distance
         jacobian = dr.select(sampler.covers(si, wall), distance2 / dr.maximum(cosine, 1e-9), 0)
         density += way.hidden_density * jacobian
@@ -138,8 +137,8 @@ def leave(
     Returns
     -------
     tuple
-        The departure; what the roulette may let a path survive with, the albedo just met, 1 on the way to a target;
-        and what the refractive index along the ray is multiplied by.
+        The departure; the survival probability of the roulette, which is the albedo, 1 towards a target; the factor of
+        the refractive index along the ray.
     """
     built, q = params.built, settings.p_hidden_sampling
     context = mi.BSDFContext()
@@ -180,14 +179,14 @@ def leave(
 
 
 def turns_away(params: PathParams, sample: SurfaceSample, origin: mi.Point3f) -> mi.Bool:
-    """Return whether a sampled point shows its dark side to ``origin``: such a path ends without a ray."""
+    """Return whether a sampled point faces away from ``origin`` with a black side: the path ends without a ray."""
     if not params.sampler.dark_behind:
         return mi.Bool(False)
     return dr.dot(sample.n, sample.p - origin) >= 0
 
 
 def misses_hidden(params: PathParams, ray: mi.Ray3f) -> mi.Bool:
-    """Return whether a ray from a planar wall passes the hidden geometry by: such a path ends without a ray."""
+    """Return whether a ray from a planar wall misses the box of the hidden geometry: the path ends without a ray."""
     if params.hidden_aabb is None:
         return mi.Bool(False)
     return params.hidden_aabb.is_missed(ray)

@@ -1,4 +1,4 @@
-"""What is legal but pointless and only the geometry shows: hidden surfaces no light gets to or comes back from."""
+"""Warnings about a scene: hidden surfaces that no light reaches or leaves, and bins finer than float32 resolves."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ from nlosrender.scene.triangle_point import triangle_weights
 from nlosrender.scene.view import BuiltView
 
 POINTS_PER_SURFACE = 64
-MAX_RAYS = 1_000_000  # of all surfaces together: a warning must not take longer than a small render
-RAY_MARGIN = 2e-5  # share of a ray's length that is left out
+MAX_RAYS = 1_000_000  # of all surfaces together: a fraction of a second, less than a small render takes
+RAY_MARGIN = 2e-5  # share of a ray's length left out at its end, as large as the ray offset of round shapes
 GRAZING = 1e-2  # cosine below which a ray may slip past the limb of a round shape within its margin
 FINEST_BIN = 2e-6  # engine units; float32 path lengths of a scene of size 1 are good to about 5e-7
 
@@ -165,16 +165,16 @@ def _any_visible(built: BuiltScene, surfaces: list[_SurfacePoints], grid: PointG
     """Return for each surface whether any of its points is seen from any of a sample of the grid's points."""
     wall_points = points_above_wall(built, grid)
     step = max(1, len(surfaces) * len(wall_points) * POINTS_PER_SURFACE // MAX_RAYS)
-    origins, targets, row_points = [], [], []
+    origins, targets, surface_of_ray = [], [], []
     seen = np.zeros(len(surfaces), dtype=bool)
-    for row_of_lane, surface in enumerate(surfaces):
+    for index, surface in enumerate(surfaces):
         wall, point = np.nonzero(_turned_to(surface, wall_points, GRAZING))
-        if not len(wall):  # rays that all graze tell nothing, such as those to a plate almost on the wall
-            seen[row_of_lane] = _turned_to(surface, wall_points).any()
+        if not len(wall):  # all rays graze, as to a plate almost on the wall: orientation alone decides
+            seen[index] = _turned_to(surface, wall_points).any()
         wall, point = wall[::step], point[::step]
         origins.append(wall_points[wall])
         targets.append(surface.points[point])
-        row_points.append(np.full(len(wall), row_of_lane))
+        surface_of_ray.append(np.full(len(wall), index))
     start, end = np.concatenate(origins), np.concatenate(targets)
     if len(start):
         ray = mi.Ray3f(
@@ -185,7 +185,7 @@ def _any_visible(built: BuiltScene, surfaces: list[_SurfacePoints], grid: PointG
             [],
         )
         free = ~np.array(built.scene.ray_test(ray), dtype=bool)
-        seen[np.concatenate(row_points)[free]] = True
+        seen[np.concatenate(surface_of_ray)[free]] = True
     return seen
 
 
