@@ -3,6 +3,7 @@
 import ast
 import subprocess
 import sys
+from collections import defaultdict
 from pathlib import Path
 
 import pytest
@@ -10,33 +11,99 @@ import pytest
 import nlosrender
 
 PACKAGE = Path(nlosrender.__file__).parent
-STAGES = ("config", "scene", "capture", "engine", "sensor", "files", "rendering", "analysis", "bench", "cli")
+STAGES = ("config", "scene", "capture", "engine", "files", "rendering", "analysis", "bench", "cli")
 SHARED = ("constants", "errors", "interruption", "readable")
 MODULES = sorted(PACKAGE.rglob("*.py"))
 IN_STAGES = [path for path in MODULES if path.relative_to(PACKAGE).parts[0] in STAGES]
 SCENE = PACKAGE / "scene"
 BUILDERS = (SCENE / "build.py", SCENE / "view.py", *(SCENE / "loading").glob("*.py"))
+ENGINE_FOLDERS = ("path", "virtual_lights", "line_of_sight")
+IN_ENGINE = {  # what each part of engine/ may import of engine/, besides itself
+    "interface": {"launch"},  # for type checking only: histograms and passes cross it
+    "backend": set(),
+    "launch": {"interface"},
+    **{folder: {"interface", "launch"} for folder in ENGINE_FOLDERS},
+    "preflight": {"interface", "launch", "backend"},  # of the backend: the memory of a process
+    "planner": {"interface", "launch", *ENGINE_FOLDERS},
+}
+ENGINE_MODULES = sorted(
+    path for path in (PACKAGE / "engine").rglob("*.py") if path.parent.name != "engine" or path.name != "__init__.py"
+)
+PARALLEL_PARTS = {"engine", "tuning", "cost"}  # module names that every engine folder may have
 MUST_NOT_RENDER = [
     path for path in MODULES if path.relative_to(PACKAGE).parts[0] not in ("engine", "bench") and path not in BUILDERS
 ]
 
 
 def imported(path: Path) -> set[str]:
-    """Return the dotted names of our own modules that a module imports anywhere."""
+    """Return the dotted names of our own modules, or of things in them, that a module imports anywhere in it."""
+    package = (PACKAGE.name, *path.relative_to(PACKAGE).parent.parts)
+    return imported_by(path.read_text(), package)
+
+
+def imported_by(source: str, package: tuple[str, ...]) -> set[str]:
+    """Return the names below ``nlosrender`` that ``source``, a module of ``package``, imports."""
     names = set()
-    for node in ast.walk(ast.parse(path.read_text())):
-        if isinstance(node, ast.ImportFrom) and node.module:
-            names.add(node.module)
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.ImportFrom):
+            base = [*package[: len(package) - node.level + 1]] if node.level else []
+            base += node.module.split(".") if node.module else []
+            names |= {".".join((*base, alias.name)) for alias in node.names}
         elif isinstance(node, ast.Import):
             names |= {alias.name for alias in node.names}
-    return {name for name in names if name.startswith("nlosrender.")}
+    return {name for name in names if name.startswith(f"{PACKAGE.name}.")}
+
+
+@pytest.mark.parametrize(
+    ("source", "name"),
+    [
+        ("from nlosrender import pipeline", "nlosrender.pipeline"),
+        ("import nlosrender.files.layout", "nlosrender.files.layout"),
+        ("from ..path.engine import PathEngine", "nlosrender.engine.path.engine.PathEngine"),
+        ("from . import histogram", "nlosrender.engine.launch.histogram"),
+        ("def f():\n    from nlosrender.files import layout", "nlosrender.files.layout"),
+    ],
+)
+def test_every_form_of_import_is_seen(source, name):
+    """Absolute, relative, of the package itself, and inside functions."""
+    assert imported_by(source, ("nlosrender", "engine", "launch")) == {name}
+
+
+def test_stages_are_the_folders():
+    """The list above is all of the package."""
+    folders = {path.parent.name for path in PACKAGE.glob("*/__init__.py")}
+    modules = {path.stem for path in PACKAGE.glob("*.py")} - {"__init__", "__main__", "pipeline"}
+    assert (folders, modules) == (set(STAGES), set(SHARED))
+
+
+@pytest.mark.parametrize("path", ENGINE_MODULES, ids=lambda path: str(path.relative_to(PACKAGE / "engine")))
+def test_an_engine_knows_no_other_engine(path):
+    """Engine folders import the interface, ``launch/`` and themselves; the planner alone imports all of them."""
+    part = path.relative_to(PACKAGE / "engine").with_suffix("").parts[0]
+    found = {parts[2] for name in imported(path) if (parts := name.split("."))[1] == "engine"}
+    assert found <= IN_ENGINE[part] | {part}
+
+
+def test_module_names_are_unique():
+    """One name, one thing: only parts that every engine has are named alike."""
+    places = defaultdict(list)
+    for path in MODULES:
+        if path.name not in ("__init__.py", "__main__.py"):
+            places[path.stem].append(path.relative_to(PACKAGE))
+    several = {name: found for name, found in places.items() if len(found) > 1}
+    assert set(several) <= PARALLEL_PARTS, several
+    assert all(
+        path.parts[0] == "engine" and path.parts[1] in ENGINE_FOLDERS for found in several.values() for path in found
+    )
 
 
 @pytest.mark.parametrize("path", IN_STAGES, ids=lambda path: str(path.relative_to(PACKAGE)))
 def test_a_stage_imports_only_stages_above_it(path):
-    """Light flows down the listing, and so do the imports; the command line may use the pipeline."""
+    """Light flows down the listing, and so do the imports; benchmarks and the command line use the pipeline."""
     stage = path.relative_to(PACKAGE).parts[0]
-    allowed = {*SHARED, *STAGES[: STAGES.index(stage) + 1]} | ({"pipeline"} if stage == "cli" else set())
+    allowed = {"__version__", *SHARED, *STAGES[: STAGES.index(stage) + 1]} | (
+        {"pipeline"} if stage in ("bench", "cli") else set()
+    )
     found = {name.split(".")[1] for name in imported(path)}
     assert found <= allowed, f"{path.name} imports {sorted(found - allowed)}, below it in the listing"
 
