@@ -1,4 +1,4 @@
-"""What an engine is to the rest of the program: one protocol, and the values that cross it.
+"""Engine interface: the protocol that all engines implement, and the values that cross it.
 
 ``planner`` alone knows which engines there are. Engine folders import ``launch/``, this module and themselves.
 """
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Budget:
-    """When to stop: after ``spp`` samples per sensor point, at ``target_error`` (relative L2 of H), after seconds.
+    """When to stop: at ``spp`` samples per sensor point, ``target_error`` (relative L2 of H) or ``time_limit_s``.
 
     ``Engine.calibrate`` turns a target error into the settings below it, which do not depend on how a capture is cut.
     """
@@ -57,7 +57,7 @@ class PilotSeconds:
 class TimeEstimate:
     """Seconds a render will take."""
 
-    seconds: float | None  # None: the pilot saw too little light to tell
+    seconds: float | None  # None: the pilot found too little light
     basis: str  # what was measured and how it was extrapolated
     lit_shares: tuple[float | None, ...] | None = None  # per bounce slot: bins with light in the pilot; None: no pilot
 
@@ -109,7 +109,7 @@ class Engine(Protocol):
         """Seconds spent compiling kernels so far."""
 
     def set_up(self) -> None:
-        """Make what all batches share, else made when it is first needed: a benchmark times it apart."""
+        """Make what all batches share, otherwise made on first use; benchmarks time it separately."""
 
     def calibrate(self, budget: Budget, seconds: float = math.inf) -> Budget:
         """Turn a target error into settings for the whole capture, found by a pilot on a few of its points.
@@ -130,7 +130,7 @@ class Engine(Protocol):
         batch, budget
             What to render, when to stop.
         passes
-            Who is told the progress between two launches, may end the render, and may hold a state to go on from.
+            Callbacks between launches for progress, interruption and saved states; the state to resume from.
 
         Returns
         -------
@@ -161,7 +161,7 @@ class Engine(Protocol):
         """
 
     def warnings(self) -> Iterator[str]:
-        """Yield what this engine does not get right in this scene, a sentence each."""
+        """Yield warnings about what this engine does not get right in this scene, a sentence each."""
 
     def cost_estimate(self, plan: Plan, budget: Budget, lanes: int, pilot: PilotSeconds) -> TimeEstimate:
         """Estimate the seconds of a render from a pilot on part of the capture.

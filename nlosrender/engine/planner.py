@@ -1,4 +1,4 @@
-"""The planner: which engine renders a scene, and why. The one place that knows which engines there are."""
+"""Planner: chooses the engine of a scene, with the reason. The one place that knows which engines there are."""
 
 from __future__ import annotations
 
@@ -30,10 +30,10 @@ def choose_engine(
     options: RenderOptions,
     lanes: int,
 ) -> Engine:
-    """Return the engine for a scene (backend started), which knows the reason in plain words.
+    """Return the engine for a scene, with its reason in plain words (backend started).
 
-    ``auto`` takes the virtual lights where they are known to be right; asked for by name, they also take rough
-    non-Lambertian surfaces. What they cannot do goes to the path engine.
+    ``auto`` chooses virtual lights for Lambertian scenes that they support; asked for by name, they also render rough
+    surfaces. The path engine renders all others.
 
     Parameters
     ----------
@@ -68,7 +68,7 @@ def choose_engine(
 
 
 def _obstacle_close_by(engine: VirtualLightEngine, capture: Capture) -> str | None:
-    """Return why paths are better before surfaces almost on the wall; None where they are not.
+    """Return why paths are better for surfaces almost on the wall; None where they are not.
 
     Paths from the sensor points find what is close to these, but not what is close to a laser point elsewhere.
     """
@@ -77,8 +77,8 @@ def _obstacle_close_by(engine: VirtualLightEngine, capture: Capture) -> str | No
         return None
     if capture.scan_type == "confocal":
         return "hidden geometry touches a laser or sensor point"
-    most = tessellator.tuning.max_patches if tessellator.nearest_to_laser < TOUCHING else MAX_NEAR_PATCHES
-    if tessellator.count(tessellator.tuning.coarsest_scale) > most:
+    max_patches = tessellator.tuning.max_patches if tessellator.nearest_to_laser < TOUCHING else MAX_NEAR_PATCHES
+    if tessellator.count(tessellator.tuning.coarsest_scale) > max_patches:
         return "hidden geometry touches so many points that paths cost less"
     return None
 

@@ -38,3 +38,9 @@ def columns(values: NDArray[np.floating]) -> list[mi.Float]:
     Made from the whole array, a vector would be split by a kernel that contains n and is compiled anew for every n.
     """
     return [on_device(mi.Float, column) for column in np.asarray(values).T]
+
+
+def rays_on_device(origins: NDArray[np.floating], directions: NDArray[np.floating], length: float) -> mi.Ray3f:
+    """Copy rays (n, 3) to the device; they end after ``length`` times their direction, of any norm."""
+    origin, direction = mi.Point3f(*columns(origins)), mi.Vector3f(*columns(directions))
+    return mi.Ray3f(origin, direction, mi.Float(length), mi.Float(0), [])

@@ -1,4 +1,4 @@
-"""Surfaces close to laser and sensor points: how near the nearest is, and the light that few paths find there."""
+"""Surfaces close to laser and sensor points: height of the nearest, and light there that paths sample rarely."""
 
 from __future__ import annotations
 
@@ -6,10 +6,10 @@ import math
 from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING
 
-import mitsuba as mi
 import numpy as np
 
 from nlosrender.capture.arrivals import sampled_indices
+from nlosrender.engine.launch.device_arrays import rays_on_device
 from nlosrender.engine.launch.ray_offsets import WALL_OFFSET, ray_offset
 from nlosrender.scene.build import BuiltScene, wall_box
 from nlosrender.scene.loading.round_surfaces import curvature
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 OFFSETS_LOST = 2.0  # ray offsets from a curved wall within which light is lost: one at either end of a shadow ray
 MIN_P_HIDDEN = 1e-3  # of hidden geometry sampling where there is none: BSDF sampling finds even less
-RARE_SHARE = 1e-4  # of paths: of the 1e5 to 1e6 per point that renders take, about a hundred find such light
+RARE_SHARE = 1e-4  # of paths: of the 1e5 to 1e6 per point of a render, 10 to 100 find such light
 
 
 def points_above_wall(built: BuiltScene, grid: PointGrid) -> Float64:
@@ -43,7 +43,7 @@ def nearest_above(built: BuiltScene, grid: PointGrid) -> tuple[float, Float64]:
     """Return the least height [engine units] of anything straight above a sample of points, and the point (3,) [m]."""
     starts, normals = points_above_wall(built, grid), grid.normals.reshape(-1, 3)[sampled_indices(grid)]
     heights = _first_hits(built, starts, normals, math.inf)
-    if not built.wall.is_planar:  # what lies below the ray offset is met by a ray that comes back to the wall
+    if not built.wall.is_planar:  # surfaces below the ray offset are met by rays back to the wall
         offset = wall_offset(built)
         top = OFFSETS_LOST * offset
         down = _first_hits(built, starts + (top - offset) * normals, -normals, top - offset / 16)
@@ -54,13 +54,12 @@ def nearest_above(built: BuiltScene, grid: PointGrid) -> tuple[float, Float64]:
 
 def _first_hits(built: BuiltScene, starts: Float64, directions: Float64, farthest: float) -> Float64:
     """Return the distance (n,) to what a ray meets first, inf where that is nothing [engine units]."""
-    start, direction = (mi.Point3f(values.T.astype(np.float32)) for values in (starts, directions))
-    ray = mi.Ray3f(start, mi.Vector3f(direction), mi.Float(farthest), mi.Float(0), [])
+    ray = rays_on_device(starts, directions, farthest)
     return np.array(built.scene.ray_intersect_preliminary(ray).t, dtype=np.float64)
 
 
 def rare_light_warnings(device: DeviceCapture, p_hidden_sampling: Callable[[], float]) -> Iterator[str]:
-    """Yield that paths hardly find the light between a laser point and a surface close to it.
+    """Yield a warning where paths rarely sample the light between a laser point and a surface close to it.
 
     It comes from an area of about pi h^2 with h the height, and paths get there by sampling all of the hidden area.
     ``p_hidden_sampling`` is asked for where there is anything to sample.

@@ -22,8 +22,10 @@ class PathTuning:
     # mixture. The density of a direction is r^2 / (A cos) at distance r: on a disk of that area, of radius 2 d at
     # distance d, it grows by (1 + 2^2)^(3/2) = 11 from the centre to the rim.
     max_area_ratio: float = 4.0
-    # Cosine-weighted share of the hemisphere that meets hidden geometry above which BSDF sampling does alone: it then
-    # loses 1 / 0.75 of its paths, less than the mixture loses by its second density.
+    # Cosine-weighted share of the hemisphere that meets hidden geometry above which BSDF sampling is used alone: it
+    # then loses a quarter of its paths. Variance x CPU time of the mixture over BSDF sampling's (a sheet at 0.5 m):
+    # 3.9 at a share of 0.68, 4.9 at 0.93, 5.3 at 1; with 5 bounces 2.8 to 3.8. At 0.21 hidden geometry sampling has
+    # 1 / 8 of BSDF sampling's, with 5 bounces half.
     surrounded_share: float = 0.75
     # Share of rays from the wall that miss the box of the hidden geometry above which the box is tested before a ray is
     # traced. CPU time with the box over that without (square sheet at 0.5 m, 16 x 16 sensor points, BSDF sampling):

@@ -1,4 +1,4 @@
-"""What the batches of a plan take in memory, and whether the limit for it makes sense."""
+"""Memory of the batches of a plan, and warnings about render.memory_limit."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from nlosrender.readable import readable_size
 
 
 def memory_warnings(engine: Engine, plan: Plan, memory_limit: int | None, lanes: int) -> Iterator[str]:
-    """Yield what is surprising about the memory of a render.
+    """Yield warnings about the memory of a render.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""What goes wrong close to the wall: heights that float32 does not know, light that no path finds, edges of meshes."""
+"""Warnings about surfaces close to the wall (float32 heights, light that no path finds) and edges of mesh walls."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from nlosrender.engine.launch.near_surfaces import OFFSETS_LOST, nearest_above, 
 from nlosrender.scene.build import BuiltScene
 from nlosrender.scene.walls.mesh_wall import MeshWall
 
-NEAREST_KNOWN = 1e-6  # engine units; nearer surfaces that are tilted or round lie some per cent nearer or farther
+MIN_HEIGHT = 1e-6  # engine units: ten float32 roundings (1e-7); below, the height of a tilted surface is off by 10 %
 
 
 def near_wall_warnings(built: BuiltScene, capture: Capture) -> Iterator[str]:
-    """Yield one sentence for each thing close to the wall that a render does not get right.
+    """Yield the warnings about what a render does not get right close to the wall.
 
     Parameters
     ----------
@@ -25,7 +25,7 @@ def near_wall_warnings(built: BuiltScene, capture: Capture) -> Iterator[str]:
 
 
 def _near_warnings(built: BuiltScene, capture: Capture) -> Iterator[str]:
-    """Yield which surface is so near to a laser or sensor point that float32 does not know how near."""
+    """Yield a warning about a surface whose height above a laser or sensor point float32 does not resolve."""
     grids = {id(grid): grid for grid in (capture.laser_grid, capture.sensor_grid)}.values()
     height, (x, y, z) = min((nearest_above(built, grid) for grid in grids), key=lambda found: found[0])
     to_m = built.metres_per_engine_unit
@@ -36,10 +36,10 @@ def _near_warnings(built: BuiltScene, capture: Capture) -> Iterator[str]:
                 f"{z:.4g}) m of its frame: on a curved wall, light within "
                 f"{OFFSETS_LOST * wall_offset(built) * to_m:.0g} m of it is not found."
             )
-    elif height < NEAREST_KNOWN:
+    elif height < MIN_HEIGHT:
         yield (
             f"a hidden surface lies {height * to_m:.1g} m before the wall at ({x:.4g}, {y:.4g}, "
-            f"{z:.4g}) m of its frame, where float32 knows heights to about {NEAREST_KNOWN / 10 * to_m:.0g} m: "
+            f"{z:.4g}) m of its frame, where float32 knows heights to about {MIN_HEIGHT / 10 * to_m:.0g} m: "
             "H there is not exact unless the surface is parallel to the wall."
         )
 

@@ -1,4 +1,4 @@
-"""What a render leaves out because the scene does not need it, and why (backend started)."""
+"""Omitted work: what a render leaves out because the scene does not need it, and why (backend started)."""
 
 from __future__ import annotations
 

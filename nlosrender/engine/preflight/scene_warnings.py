@@ -14,6 +14,7 @@ from nlosrender.capture.bounces import THIRD_BOUNCE
 from nlosrender.capture.grids import Capture, PointGrid
 from nlosrender.capture.time_axis import TimeAxis
 from nlosrender.engine.interface import Engine
+from nlosrender.engine.launch.device_arrays import rays_on_device
 from nlosrender.engine.launch.facing_triangles import facing_triangles
 from nlosrender.engine.launch.near_surfaces import points_above_wall
 from nlosrender.engine.launch.surface_sampler import SAMPLEABLE_PLUGINS
@@ -24,11 +25,11 @@ from nlosrender.scene.surfaces import Surface
 from nlosrender.scene.triangle_point import triangle_weights
 from nlosrender.scene.view import BuiltView
 
-POINTS_PER_SURFACE = 64
+POINTS_PER_SURFACE = 64  # a visible share of a surface below about 1/64 may be missed
 MAX_RAYS = 1_000_000  # of all surfaces together: a fraction of a second, less than a small render takes
 RAY_MARGIN = 2e-5  # share of a ray's length left out at its end, as large as the ray offset of round shapes
 GRAZING = 1e-2  # cosine below which a ray may slip past the limb of a round shape within its margin
-FINEST_BIN = 2e-6  # engine units; float32 path lengths of a scene of size 1 are good to about 5e-7
+MIN_BIN = 2e-6  # engine units; float32 path lengths of a scene of size 1 are good to about 5e-7
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,7 +41,7 @@ class _SurfacePoints:
 
 
 def scene_warnings(engine: Engine) -> tuple[str, ...]:
-    """Return one sentence for each thing in a scene that is pointless or surprising.
+    """Return the warnings about a scene, its time axis and its engine, a sentence each.
 
     Parameters
     ----------
@@ -79,7 +80,7 @@ def dark_surface_warnings(built: BuiltScene, capture: Capture, max_bounces: int 
         Highest bounce that is rendered; None for no limit.
     """
     facing: list[tuple[Surface, _SurfacePoints]] = []
-    n_lit_by_nature = 0  # kinds of shape that cannot be sampled here: taken for visible
+    n_unsampled = 0  # shapes of kinds that cannot be sampled: assumed visible
     wall_corners = wall_box(built.wall) / built.metres_per_engine_unit
     for surface, shape in zip(built.surfaces, built.hidden_shapes, strict=True):
         name = f"{surface.key} ({surface.name})"
@@ -87,7 +88,7 @@ def dark_surface_warnings(built: BuiltScene, capture: Capture, max_bounces: int 
             yield f"{name} lies behind the relay wall, where no light gets to."
             continue
         if not (shape.is_mesh() or shape.class_name() in SAMPLEABLE_PLUGINS):
-            n_lit_by_nature += 1
+            n_unsampled += 1
             continue
         points = _surface_points(built, shape)
         if not _turned_to(points, wall_corners).any():
@@ -98,14 +99,14 @@ def dark_surface_warnings(built: BuiltScene, capture: Capture, max_bounces: int 
             continue
         facing.append((surface, points))
     if not facing:
-        if built.hidden_shapes and not n_lit_by_nature:
+        if built.hidden_shapes and not n_unsampled:
             yield "no hidden surface faces the relay wall: nothing comes back from the hidden scene."
         return
     surfaces = [points for _, points in facing]
     lit = _any_visible(built, surfaces, capture.laser_grid)
     seen = lit if capture.scan_type == "confocal" else _any_visible(built, surfaces, capture.sensor_grid)
     yield from _occlusion_warnings([surface for surface, _ in facing], lit, seen, max_bounces)
-    if not lit.any() and not n_lit_by_nature and built.wall.is_planar:
+    if not lit.any() and not n_unsampled and built.wall.is_planar:
         yield "no laser point sees any of the hidden geometry: H is zero."
 
 
@@ -177,22 +178,16 @@ def _any_visible(built: BuiltScene, surfaces: list[_SurfacePoints], grid: PointG
         surface_of_ray.append(np.full(len(wall), index))
     start, end = np.concatenate(origins), np.concatenate(targets)
     if len(start):
-        ray = mi.Ray3f(
-            mi.Point3f(start.T.astype(np.float32)),
-            mi.Vector3f((end - start).T.astype(np.float32)),
-            mi.Float(1 - RAY_MARGIN),
-            mi.Float(0),
-            [],
-        )
-        free = ~np.array(built.scene.ray_test(ray), dtype=bool)
+        free = ~np.array(built.scene.ray_test(rays_on_device(start, end - start, 1 - RAY_MARGIN)), dtype=bool)
         seen[np.concatenate(surface_of_ray)[free]] = True
     return seen
 
 
 def _bin_warnings(built: BuiltScene | BuiltView, time_axis: TimeAxis) -> Iterator[str]:
-    finest = FINEST_BIN * built.metres_per_engine_unit
+    finest = MIN_BIN * built.metres_per_engine_unit
     if time_axis.bin_width_opl < finest:
         yield (
-            f"time_axis.bin_width_opl: bins of {time_axis.bin_width_opl:.3g} m are finer than path lengths in a scene "
-            f"of this size are known (float32, about {finest / 4:.1g} m): light is spread over several bins."
+            f"time_axis.bin_width_opl: bins of {time_axis.bin_width_opl:.3g} m are finer than path "
+            f"lengths are resolved in a scene of this size (float32, about {finest / 4:.1g} m): light is spread over "
+            "several bins. Use wider bins."
         )

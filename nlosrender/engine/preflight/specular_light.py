@@ -1,8 +1,7 @@
-"""Where light gets to that leaves the laser, or a lamp, by way of mirrors, glass and masks: a small trial with rays.
+"""Specular light: trial rays from the laser or lamps through delta lobes (mirrors, glass, masks).
 
-Rays that meet a delta lobe (S) first are followed, from surface to surface, until the sensor sees where they are
-scattered. Nothing of this is rendered: it tells which of the paths that a render does not sample carry light, see
-``unsampled_paths``.
+Rays whose first hit has a delta lobe (S) are followed until they scatter at a vertex that a sensor point sees. Nothing
+is rendered: the result is which surfaces send light along paths that no technique samples, see ``unsampled_paths``.
 """
 
 from __future__ import annotations
@@ -26,16 +25,16 @@ from nlosrender.scene.build import BuiltScene
 from nlosrender.scene.pose import Float64
 from nlosrender.scene.view import BuiltView
 
-RAYS = 2**16  # in all, shared by surfaces and laser points: light of less than about 1e-4 of a mirror is not noticed
+RAYS = 2**16  # in all, shared by surfaces and laser points: light from less than about 1e-4 of a mirror is missed
 MIN_RAYS = 256  # of one surface and one laser point
-MAX_EVENTS = 16  # specular events that are followed
+MAX_EVENTS = 16  # hits that a ray is followed for
 RAY_MARGIN = 1e-4  # share of a ray's length that is left out before its end
 WALL_NAME = "scene.relay_wall"
 
 
 @dataclass(frozen=True)
 class SpecularLight:
-    """Light that one surface sends on along single directions, and that ends up somewhere in the capture."""
+    """Light that a delta lobe of one surface sends to a vertex that the capture measures."""
 
     item: str  # "scene.hidden_geometry.0 (front)"
     is_reflected: bool  # else let through
@@ -44,9 +43,9 @@ class SpecularLight:
 
 @dataclass(frozen=True, eq=False)
 class _Rays:
-    """Light under way; one lane per ray."""
+    """Trial rays, one lane each."""
 
-    ray: mi.Ray3f  # without length where nothing is sent
+    ray: mi.Ray3f  # of length 0 where nothing is sent
     is_specular: bool  # whether an S lies behind it already
 
 
@@ -122,10 +121,10 @@ def _followed(
     max_bounces: int | None,
     interactions: int,
 ) -> Iterator[SpecularLight]:
-    """Follow rays, which had so many surface interactions, and yield what the first surface they meet sends on.
+    """Follow rays that had ``interactions`` surface interactions; yield the specular light of the surfaces met first.
 
-    Yields the lowest bounce that each surface was seen to add to: a ray came to the wall where sensor points are, or
-    scattered where one of them sees it.
+    The bounce is the lowest that a surface was seen to add to: a ray met the wall among the sensor points, or scattered
+    where one of them sees it.
     """
     ray, opl = start.ray, mi.Float(0)  # a lower bound on the optical path length so far [engine units]
     alive, n_rays = mi.Bool(ray.maxt > 0), dr.width(ray.d)
@@ -133,7 +132,7 @@ def _followed(
         time_axis.end_opl - float(capture.laser_legs.min() + capture.sensor_legs.min())
     ) / built.metres_per_engine_unit
     first = np.zeros(n_rays, dtype=np.int64)  # twice the number of the first surface, plus 1 if it reflected the ray
-    least: dict[int, int] = {}
+    lowest: dict[int, int] = {}  # bounce by ``first``
     for event in range(MAX_EVENTS):
         count = interactions + event + 1  # interactions up to the surface that is met now
         if max_bounces is not None and count > max_bounces:
@@ -152,13 +151,13 @@ def _followed(
             scattered = mi.Bool(hit & ~is_delta)
             for more, measured in enumerate(_measured(built, capture, si, scattered, event)):
                 for sent in np.unique(first[measured]).tolist():
-                    least.setdefault(sent, count + more)
-        if set(np.unique(first[hit]).tolist()) <= set(least):
+                    lowest.setdefault(sent, count + more)
+        if set(np.unique(first[hit]).tolist()) <= set(lowest):
             break
         ray, alive = si.spawn_ray(si.to_world(bs.wo)), mi.Bool(hit)
         dr.eval(ray, opl, alive)
     names = _names(built)
-    for sent, bounce in least.items():
+    for sent, bounce in lowest.items():
         if max_bounces is None or bounce <= max_bounces:
             yield SpecularLight(names.get(sent // 2, "the scene"), bool(sent % 2), bounce)
 
@@ -166,10 +165,10 @@ def _followed(
 def _measured(
     built: BuiltScene | BuiltView, capture: Capture, si: mi.SurfaceInteraction3f, scattered: mi.Bool, seed: int
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Return (rays,) whether a surface that scatters light is a place that is measured, and whether one sees it.
+    """Return (rays,) whether a scattering vertex is measured itself, and whether it is seen from a sensor point.
 
-    The first are places of the wall among the sensor points, or any before a camera; the others are surfaces that a
-    sensor point drawn at random sees.
+    Measured are vertices on the wall among the sensor points, or any before a camera; for the other, one sensor point
+    is drawn at random.
     """
     active = np.array(scattered, dtype=bool)
     if isinstance(built, BuiltView):

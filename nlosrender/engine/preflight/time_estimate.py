@@ -1,4 +1,4 @@
-"""How long a render will take: the estimate of its engine, and its time limit."""
+"""Time estimate of a render: its engine's estimate, bounded by render.time_limit_s."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ DEFAULT_PILOT = PilotSeconds()
 def estimate_render_time(
     engine: Engine, plan: Plan, budget: Budget, lanes: int, pilot: PilotSeconds = DEFAULT_PILOT
 ) -> TimeEstimate:
-    """Return the seconds of rendering, and of settling the target error: no start, no compilation, no writing.
+    """Return the seconds of calibration and rendering, without start, compilation and writing.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Why a capture is zero everywhere, looked for after its render: a dark file says so itself."""
+"""Reasons why a capture is zero everywhere, found after its render and kept in the file."""
 
 from __future__ import annotations
 
@@ -18,18 +18,18 @@ from nlosrender.engine.preflight.unsampled_paths import UnsampledPaths
 from nlosrender.scene.build import BuiltScene
 from nlosrender.scene.view import BuiltView
 
-TRIED = 256  # directions at each of a sample of laser or sensor points
+DIRECTIONS = 256  # tried at each of a sample of laser or sensor points
 
 
 def zero_reasons(engine: Engine, unsampled: Sequence[UnsampledPaths], outside: float) -> tuple[str, ...]:
-    """Return all reasons found why H is zero; a sentence that none was found where that is so.
+    """Return the reasons found why H is zero, or a sentence that none was found.
 
     Parameters
     ----------
     engine
         As set up for the capture.
     unsampled
-        What its techniques do not sample.
+        Paths that its techniques do not sample.
     outside
         H outside the time window, summed [J m^-2 sr^-1].
     """
@@ -67,14 +67,14 @@ def _dark(engine: Engine) -> Iterator[str]:
 
 
 def _black_surfaces(engine: Engine, built: BuiltScene) -> Iterator[str]:
-    """Yield which BSDFs were met by light from the wall and reflected nothing."""
+    """Yield which BSDFs are black where rays from laser or sensor points meet them."""
     capture, time_axis = engine.capture, engine.time_axis
     context = mi.BSDFContext()
     for name, points, grid in (
         ("laser", laser_points, capture.laser_grid),
         ("sensor", sensor_points, capture.sensor_grid),
     ):
-        index = np.repeat(sampled_indices(grid), TRIED).astype(np.uint32)
+        index = np.repeat(sampled_indices(grid), DIRECTIONS).astype(np.uint32)
         start = points(built, capture, time_axis, index).interaction
         draw = np.random.default_rng(0).random((6, len(index))).astype(np.float32)
         direction = start.to_world(mi.warp.square_to_cosine_hemisphere(mi.Point2f(draw[0], draw[1])))
