@@ -128,7 +128,7 @@ def test_all_turns_are_equally_likely_and_taken_together() -> None:
     import mitsuba as mi
     from scipy import stats
 
-    from nlosrender.engine.path.roulette import PHASE_TILE, first_phases
+    from nlosrender.engine.path.continuation_period import PHASE_TILE, first_phases
 
     nx, ny, replicas, every = 50, 42, 3, 5
     points = np.arange(nx * ny, dtype=np.uint32)
@@ -150,7 +150,7 @@ def test_all_turns_are_equally_likely_and_taken_together() -> None:
 )
 def test_time_and_variance_are_balanced(third: float, further: float, expected: int) -> None:
     """The share has the least product of variance A + n B and time 1 + 2 / n: n = sqrt(2 A / B), from 1 to 8."""
-    from nlosrender.engine.path.roulette import LoopCost, best_continuation_period
+    from nlosrender.engine.path.continuation_period import LoopCost, best_continuation_period
 
     cost = LoopCost(2.0, 8, 3)
     assert best_continuation_period(lambda n: third + n * further, cost, split=False) == expected

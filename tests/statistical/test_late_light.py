@@ -274,7 +274,7 @@ def test_sites_that_only_late_light_reaches_are_few() -> None:
         vpls = sampler.sample(2**15, np.random.default_rng(5))
         heights = vpls.positions[:, 2] * unit
         far = heights > 1.999
-        assert stage.engine.device.capture_gate.is_beyond(vpls.positions[far]).all()
+        assert stage.engine.device.capture_gate.is_past(vpls.positions[far]).all()
         ratios.append(far.mean() / (heights < 0.5).mean())
         areas.append(vpls.areas[far].sum() * unit**2)
     # 5 sigma of the fewest VPLs; they are stratified, which makes it less

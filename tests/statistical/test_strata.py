@@ -112,7 +112,7 @@ def test_direct_paths_agree_with_traced_ones(scan: str, hidden: tuple, monkeypat
     ids=["plate", "room"],
 )
 def test_rays_that_nothing_can_stop_are_left_out(max_bounces: int, hidden: dict) -> None:
-    """One convex object alone, or a convex room: the same numbers with and without visibility rays."""
+    """One convex object alone, or a convex room: the same numbers with and without shadow rays."""
     from nlosrender.engine.interface import Budget
 
     plan, engine = path_engine(flat_wall(hidden, max_bounces=max_bounces, spp=512))

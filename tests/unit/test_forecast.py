@@ -174,8 +174,8 @@ TUBE = {"type": "cylinder", "center": [0, 0, 0], "axis": [0, 1, 0], "radius": 1.
     [
         ("second bounce", ((PLATE,), {}), ((PLATE,), {"wall": TUBE})),
         ("bounces above 4", ((PLATE,), {"max_bounces": 4}), ((PLATE,), {"max_bounces": None})),
-        ("visibility rays", ((PLATE,), {}), ((PLATE, BALL), {})),
-        ("visibility rays", ((PLATE,), {"engine": "path"}), ((PLATE, BALL), {"engine": "path"})),
+        ("shadow rays", ((PLATE,), {}), ((PLATE, BALL), {})),
+        ("shadow rays", ((PLATE,), {"engine": "path"}), ((PLATE, BALL), {"engine": "path"})),
         (
             "half of the pairs of laser and sensor points",
             ((PLATE,), {"scan": "exhaustive", "capture": {"laser_grid": {"nx": 5, "ny": 3}}}),

@@ -1,4 +1,4 @@
-"""Scenes in which nothing can lie between the wall and what faces it: no visibility rays are needed there."""
+"""Scenes in which nothing can lie between the wall and what faces it: no shadow rays are needed there."""
 
 from __future__ import annotations
 

@@ -9,8 +9,8 @@ from nlosrender.engine.launch.device_capture import DeviceCapture
 
 
 def omitted_visibility() -> OmittedWork:
-    """Return that no visibility ray is traced."""
-    return OmittedWork("visibility rays", "one convex object stands alone before a planar wall: nothing lies between")
+    """Return that no shadow ray is traced."""
+    return OmittedWork("shadow rays", "one convex object stands alone before a planar wall: nothing lies between")
 
 
 def omitted_triangles(device: DeviceCapture) -> Iterator[OmittedWork]:

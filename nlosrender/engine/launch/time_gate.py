@@ -32,9 +32,8 @@ class TimeGate:
     low: mi.Point3f  # box around the laser points, or around the lane's own
     high: mi.Point3f
     survival: float  # probability to continue once all light of a path arrives after the window
-    detour: (
-        mi.Float
-    )  # twice the height of the hidden geometry over a planar wall: light of the wall goes there and back
+    # twice the height of the hidden geometry over a planar wall: light of the wall goes there and back
+    detour: mi.Float
 
     def is_past(self, opl: mi.Float, point: mi.Point3f, on_wall: mi.Bool) -> mi.Bool:
         """Return whether a path of length ``opl`` up to ``point`` can only bring light after the window.
@@ -110,7 +109,7 @@ class CaptureTimeGate:
             2 * max(float(lowest), 0.0) / built.metres_per_engine_unit,
         )
 
-    def is_beyond(self, points: Float64) -> NDArray[np.bool_]:
+    def is_past(self, points: Float64) -> NDArray[np.bool_]:
         """Return (n,) which points (n, 3) lie only on paths that arrive after the window."""
         ways = distance_to_box(points, self.sensor_box) + distance_to_box(points, self.laser_box)
         return ways > self.longest

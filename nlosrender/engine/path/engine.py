@@ -28,8 +28,8 @@ from nlosrender.engine.launch.plain_diffuse import is_plain_diffuse
 from nlosrender.engine.launch.schedule import Schedule, calibrated_by_pilot, pilot_replicas
 from nlosrender.engine.launch.sequences import SystematicSequence
 from nlosrender.engine.launch.temporal_kernel import TemporalKernel
+from nlosrender.engine.path.continuation_period import best_continuation_period, first_phases
 from nlosrender.engine.path.full_loop import trace_paths
-from nlosrender.engine.path.roulette import best_continuation_period, first_phases
 from nlosrender.engine.path.settings import PathParams, PathSettings
 from nlosrender.engine.path.technique_mixture import box_often_missed, choose_p_hidden_sampling, omitted_techniques
 from nlosrender.engine.path.third_bounce_loop import is_third_bounce_loop, trace_third_bounce

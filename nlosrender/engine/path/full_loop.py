@@ -19,8 +19,9 @@ energy E with f_l; V is visibility. With bounce index b = k + 2 the deposit, in 
 
     H_b += E  T_k  f(x_k) cos  f_l cos_l  V / |x_k - l|^2                     [``laser_connections``]
 
-Russian roulette divides T by the survival probability: by the albedo after bounce 3, by the continuation period at
-bounce 3 (``roulette``), once by the time gate where a path can only bring light after the time window.
+Russian roulette divides T by the survival probability (``_survival``): at every bounce from the first deposited one on
+the albedo, at bounce 3 over the period n (``continuation_period``); and, once, that of the time gate where a path can
+only bring light after the time window.
 """
 
 from __future__ import annotations
@@ -236,9 +237,13 @@ def _begin_until_near(
 def _survival(
     settings: PathSettings, params: PathParams, albedo: mi.Float, start: mi.Bool, bounce: mi.UInt32
 ) -> mi.Float:
-    """Return the survival probability of Russian roulette after the connections of a vertex: at most its albedo.
+    """Return the survival probability of Russian roulette after the connections of a vertex:
 
-    1 before the first bounce that is deposited; at bounce 3 also divided by ``continuation_period``.
+        1                               at a sensor point (``start``) and where bounce < ``first_bounce``
+        albedo / continuation_period    at bounce 3, where that is ``first_bounce``
+        albedo                          at every other bounce
+
+    ``albedo`` is the largest component of the BSDF sample's weight, at most ``MAX_SURVIVAL``; 1 towards a target.
     """
     survival = albedo
     if settings.first_bounce == THIRD_BOUNCE:

@@ -82,4 +82,4 @@ class PathParams(LaunchParams):
     """What a launch of the path tracer reads."""
 
     hidden_aabb: HiddenAabb | None  # None: few rays from the wall miss it
-    continuation_period: mi.UInt32  # n of ``roulette``: one path in n continues after bounce 3; opaque
+    continuation_period: mi.UInt32  # n: one path in n continues after bounce 3; opaque

@@ -8,8 +8,8 @@ The estimator, with a point x of density 1 / A on the hidden geometry, sensor po
 
     H_3 = E  f_s cos_s  [V(s, x) cos(x) A / |x - s|^2]  f(x) cos(x)  f_l cos_l  V(x, l) / |x - l|^2
 
-Higher bounces by Russian roulette: one path in n continues with weight n (``follow_paths``, ``roulette``); the lanes of
-a packet continue together.
+Higher bounces by Russian roulette: one path in n continues with weight n (``follow_paths``; n:
+``continuation_period``); the lanes of a packet continue together.
 """
 
 from __future__ import annotations
@@ -89,7 +89,7 @@ def _connect_sample(
     active: mi.Bool,
     goes_on: mi.Bool,
 ) -> mi.PCG32:
-    """Connect a sampled point to sensor point and lasers, and continue; packets without an active lane skip it."""
+    """Connect a sampled point to sensor point and lasers, and continue; packets with no active lane skip the block."""
     if dr.hint(active, exclude=[settings, params, histogram, sample, goes_on]):
         built, sampler, sensor = params.built, params.sampler, params.sensors.interaction
         leg = sample.p - sensor.p
@@ -150,7 +150,8 @@ def follow_paths(
         way, survival, eta = leave(settings, params, generator, vertex, on_wall, numbers, sample, by_bsdf, has_target)
         alive = by_bsdf | has_target
         if dr.hint(settings.russian_roulette, mode="scalar"):
-            # by the albedo of the vertex; not at the third bounce, which has the continuation roulette
+            # by the albedo of hidden vertices, that of bounce 3 included, which the period n has thinned out already;
+            # 1 towards a target
             alive &= generator.next_float32(by_bsdf) < survival
             way.value /= dr.maximum(survival, 1e-9)
         alive &= dr.any(way.value != 0)

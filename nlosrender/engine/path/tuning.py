@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class LoopCost:
-    """What the bounces after the third cost in a loop, and how rare they may become (``roulette``)."""
+    """What the bounces after the third cost in a loop, and how rare they may become (``continuation_period``)."""
 
     relative: float  # b / a: seconds of a path's higher bounces over those of its third bounce
     max_period: int  # bound, because a short pilot misses rare bright paths and would choose too large a period

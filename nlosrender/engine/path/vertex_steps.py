@@ -27,7 +27,9 @@ class Departure:
 
     ray: mi.Ray3f
     origin: mi.Point3f  # the vertex it left, without ray offset
-    value: mi.Spectrum  # BSDF times cosine of its direction, undivided by a density
+    # BSDF times cosine of the direction, not divided by its density (delta lobes: weight of the sample); divided by the
+    # survival probability once Russian roulette has been survived
+    value: mi.Spectrum
     bsdf_density: mi.Float  # share of BSDF sampling in the direction's density [1/sr]; 1 for delta lobes
     hidden_density: mi.Float  # share of hidden geometry sampling, before the Jacobian [1/area]
     is_delta: mi.Bool  # the direction comes from a delta lobe

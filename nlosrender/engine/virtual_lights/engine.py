@@ -190,7 +190,7 @@ class VirtualLightEngine:
             yield omitted_visibility()
         elif self.has_masks:
             why = "where nothing can lie between a patch and a part of the wall"
-            yield OmittedWork("visibility rays that nothing can stop", why)
+            yield OmittedWork("shadow rays that nothing can stop", why)
         yield from omitted_triangles(self.device)
         if self.third.is_reciprocal:
             why = "laser and sensor points are the same and everything is Lambertian: H(l, s) = H(s, l)"

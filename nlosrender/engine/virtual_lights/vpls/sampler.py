@@ -64,7 +64,7 @@ class VplSampler:
     def _late_shares(self, capture_gate: CaptureTimeGate) -> Float64:
         """Return the part of each element beyond ``capture_gate``, by a few of its points: any value is unbiased."""
         points = (np.einsum("k,nkx->nx", weights, self._corners) for weights in GATE_POINTS)
-        return np.mean([capture_gate.is_beyond(point) for point in points], axis=0)
+        return np.mean([capture_gate.is_past(point) for point in points], axis=0)
 
     def sample(self, count: int, generator: np.random.Generator) -> Vpls:
         """Draw ``count`` VPLs, stratified: one in each of as many equal parts of the elements' measure.

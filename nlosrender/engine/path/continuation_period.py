@@ -1,4 +1,4 @@
-"""Russian roulette after bounce 3: one path in n continues, with weight n; n minimises variance x time.
+"""Continuation period n: Russian roulette after bounce 3 lets one path in n continue, with weight n.
 
 The third bounce has most of the variance, the higher ones most of the cost. With period n the variance is A + n B and
 the time a + b / n; their product is least at n = sqrt(A b / (B a)) (efficiency-optimised roulette, Veach 1997, section
@@ -22,7 +22,7 @@ from nlosrender.engine.path.tuning import PHASE_TILE, LoopCost
 
 
 def best_continuation_period(variance: Callable[[int], float], cost: LoopCost, split: bool) -> int:
-    """Return the period n: one path in n continues after bounce 3.
+    """Return the continuation period n.
 
     Parameters
     ----------
