@@ -1,4 +1,4 @@
-"""Work that several engines leave out, in words."""
+"""Reports of work that several engines omit: shadow rays, triangles, paths past the time gate."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from nlosrender.engine.launch.device_capture import DeviceCapture
 
 
 def omitted_visibility() -> OmittedWork:
-    """Return that no shadow ray is traced."""
+    """Return the report that no shadow ray is traced."""
     return OmittedWork("shadow rays", "one convex object stands alone before a planar wall: nothing lies between")
 
 
 def omitted_triangles(device: DeviceCapture) -> Iterator[OmittedWork]:
-    """Yield how many triangles are not sampled."""
+    """Yield the number of triangles that are not sampled, if any."""
     total = device.built.n_triangles
     if dark := total - device.sampler.n_triangles:
         why = "they face away from the whole wall or lie behind it: no ray is sent to them"
@@ -22,7 +22,7 @@ def omitted_triangles(device: DeviceCapture) -> Iterator[OmittedWork]:
 
 
 def omitted_by_time_gate(device: DeviceCapture) -> Iterator[OmittedWork]:
-    """Yield that few paths go on beyond the time window, where light can arrive after it."""
+    """Yield the report of the time gate's roulette, where light can arrive after the window."""
     if device.capture_gate is not None:
         many = round(1 / device.options.gate_survival)
         why = f"one in {many} goes on, with {many} times the weight: the light outside the window is not biased"

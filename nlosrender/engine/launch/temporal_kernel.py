@@ -1,9 +1,9 @@
 """Kernel density estimation in time (Jarabo et al. 2014, *A framework for transient rendering*, section 5).
 
-A histogram gives each path to the bin it falls into: no bias beyond the bin's width, and much noise where few paths
-arrive. A kernel spreads each path over its neighbourhood: less noise, and a bias that grows with the kernel's width.
-The kernel is applied to the sums of each replica instead of to each path: linear, so the same estimate, the place of
-a path within its bin aside; and the variance over replicas stays honest.
+A histogram adds each path to its bin: no bias beyond the bin width, and much noise where few paths arrive. A kernel
+spreads each path over neighbouring bins: less noise, and a bias that grows with the kernel's width. It is applied to
+the sums of each replica instead of to each path. That is linear, so the estimate is the same up to the position of a
+path within its bin, and the spread of replicas still estimates the variance.
 """
 
 from __future__ import annotations
@@ -27,18 +27,18 @@ class TemporalKernel:
 
     def __init__(self, width: float):
         self.width = width
-        self.reach = math.floor(width / 2) + 1  # bins to either side that light may get to
+        self.reach = math.floor(width / 2) + 1  # bins to either side that light may be moved by
         self.shares = kernel_shares(width, self.reach)
 
     @dr.syntax
     def smoothed(self, values: mi.Float64, row: int) -> mi.Float64:
-        """Return histograms with their light spread.
+        """Return histograms convolved with the kernel.
 
         Parameters
         ----------
         values
-            Rows of ``row`` entries one after the other, the last entry of each what lies outside the window. What the
-            kernel takes over the window's ends is added to it: no light is lost. What it would bring in is not known.
+            Rows of ``row`` entries, the last of each for light outside the window. Light that the kernel moves over the
+            ends of the window is added to that entry; light that it would move into the window is unknown.
         row
             Entries of a row, >= 2.
         """
@@ -51,13 +51,13 @@ class TemporalKernel:
         result = dr.select(inside, 0, values)
 
         # ---- State ---------------------------------------------------------------------------------------------------
-        step = mi.Int32(-reach)  # how far the light moves
+        step = mi.Int32(-reach)  # bins that light is moved by
         while dr.hint(step <= reach, exclude=[values, shares, entry, start, inside]):
             source = entry - step
             share = dr.gather(mi.Float64, shares, step + reach)
             arrives = inside & (source >= 0) & (source < n_bins)
             result += dr.select(arrives, share * dr.gather(mi.Float64, values, start + source, arrives), 0)
-            # what leaves, seen from the entry for it: of the bins that a step takes over an end
+            # the outside entry gathers the bins that this step moves over an end of the window
             first = dr.select(step > 0, n_bins - step, 0)
             last = dr.select(step > 0, n_bins, -step)
             first, last = dr.maximum(first, 0), dr.minimum(last, n_bins)

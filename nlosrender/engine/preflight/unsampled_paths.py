@@ -1,4 +1,4 @@
-"""Classes of light paths that no technique of a render samples: their light is missing, and no error estimate sees it.
+"""Unsampled paths: classes of light paths that no technique of a render samples and no error estimate includes.
 
 Notation of Heckbert (1990): L laser (or lamp), D a surface that scatters, S one that reflects or transmits along one
 direction only (mirrors, glass, smooth coats, masks), E sensor (or camera). The laser point and the sensor point are the
@@ -61,7 +61,7 @@ class UnsampledPaths:
 
     @property
     def warning(self) -> str:
-        """Return what a user is told."""
+        """Return the warning."""
         return (
             f"{self.what} is missing, and the stated error unknown: no technique of this render samples the paths "
             f"{self.notation}, bounce {self.first_bounce} and above ({_listed(self.items)}). {self.advice}."
