@@ -18,7 +18,7 @@ from nlosrender.engine.launch.launch_params import MAX_SURVIVAL
 from nlosrender.engine.launch.sequences import recurrence_steps
 from nlosrender.engine.line_of_sight.view_params import ViewLaunchParams, ViewSettings
 
-ROULETTE_AFTER = 3  # surface interactions without Russian roulette: these have most of the light and the variance
+ROULETTE_AFTER = 3  # surface interactions without Russian roulette; chosen, not measured
 
 
 @dr.syntax

@@ -27,7 +27,7 @@ from nlosrender.scene.view import BuiltView
 
 POINTS_PER_SURFACE = 64  # a visible share of a surface below about 1/64 may be missed
 MAX_RAYS = 1_000_000  # of all surfaces together: a fraction of a second, less than a small render takes
-RAY_MARGIN = 2e-5  # share of a ray's length left out at its end, as large as the ray offset of round shapes
+RAY_MARGIN = 2e-5  # share of a ray's length left out at its end; chosen, not measured
 GRAZING = 1e-2  # cosine below which a ray may slip past the limb of a round shape within its margin
 MIN_BIN = 2e-6  # engine units; float32 path lengths of a scene of size 1 are good to about 5e-7
 
