@@ -119,8 +119,7 @@ class ThirdBounce:
         """Gather from every two points once: the one with the higher index stands for the sensor point.
 
         Whatever the batch, so that how a capture is cut does not show. A batch of other lasers than sensor points is
-        gathered in two parts, the second with their roles exchanged. The kernel for a single laser does not ask how
-        many a sensor point gathers: where it is none, what it gathered is dropped.
+        gathered in two parts, the second with their roles exchanged.
         """
         sensors, lasers = self.device.sensor_indices(batch), self.device.laser_indices(batch)
         is_symmetric = np.array_equal(sensors, lasers)
@@ -128,19 +127,15 @@ class ThirdBounce:
         if (earlier := one.resumed("values")) is not None:
             values = earlier.arrays["values"]
         else:
-            gathered = np.searchsorted(lasers, sensors, side="right")
-            sums = self._sums(batch, patch_scale, patches, one, gathered)
+            sums = self._sums(batch, patch_scale, patches, one, np.searchsorted(lasers, sensors, side="right"))
             if is_symmetric:
                 return sums.on_host(is_symmetric=True)
             values = sums.on_host()
-            values[..., gathered == 0, :] = 0
         one.finish(Snapshot({"values": values}))
         exchanged = Batch(sensors=batch.lasers, lasers=batch.sensors)
         other = passes.stage("other way", 0.5, 1)
-        gathered = np.searchsorted(sensors, lasers)
-        others = self._sums(exchanged, patch_scale, patches, other, gathered).on_host()
-        others[..., gathered == 0, :] = 0
-        values += others.swapaxes(2, 3)
+        others = self._sums(exchanged, patch_scale, patches, other, np.searchsorted(sensors, lasers))
+        values += others.on_host().swapaxes(2, 3)
         return values
 
     def _sums(

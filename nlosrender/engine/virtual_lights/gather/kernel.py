@@ -119,7 +119,7 @@ def gather_third_bounce(
 
     # ---- State ------------------------------------------------------------------------------------------------------
     patch = dr.gather(mi.UInt32, packed.first, slice_index) + skipped
-    end = dr.minimum(end, patch + most)
+    end = dr.select(n_lasers > 0, dr.minimum(end, patch + most), patch)  # by reciprocity a lane may have no laser
 
     while dr.hint(
         patch < end,
