@@ -51,7 +51,7 @@ from nlosrender.files.partial.work_item_log import (
     items_of,
     stored_chunks,
 )
-from nlosrender.files.partial.work_item_state import NEW, ItemState, states_in
+from nlosrender.files.partial.work_item_state import NEW, STATE_FORMAT, ItemState, states_in
 from nlosrender.files.sums import Sums
 from nlosrender.interruption import uninterrupted
 
@@ -190,7 +190,7 @@ class PartialCapture:
 
     def item_state(self, item: WorkItemKey, budget: Mapping[str, Any]) -> ItemState:
         """Return where the state of a work item with a budget (plain JSON values) is kept while it is in flight."""
-        tag = tree_hash({"identity": self._identity, "budget": dict(budget)})
+        tag = tree_hash({"format": STATE_FORMAT, "identity": self._identity, "budget": dict(budget)})
         return ItemState.of(self.folder, item, tag)
 
     def publish(self, attributes: Mapping[str, object]) -> None:

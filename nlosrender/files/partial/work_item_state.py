@@ -23,6 +23,7 @@ from nlosrender.files.partial.journal import line_of, record_of
 from nlosrender.files.partial.work_item_log import WorkItemKey
 
 PREFIX, NEW = "unit.", ".new"
+STATE_FORMAT = 2  # part of the tag: a state of other names of arrays is not read; 2: phase, position, block
 MAX_HEADER_BYTES = 2**24
 
 
