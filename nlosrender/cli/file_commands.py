@@ -9,7 +9,7 @@ import typer
 
 from nlosrender.cli.capture_table import printable, summary_rows
 from nlosrender.cli.json_output import OUTPUT
-from nlosrender.cli.options import AsJson, CaptureFile, beside, two_numbers
+from nlosrender.cli.options import AsJson, CameraFile, CaptureFile, beside, two_numbers
 from nlosrender.cli.tables import print_table
 
 
@@ -92,7 +92,7 @@ def plot(
 
 
 def frames(
-    file: CaptureFile,
+    file: CameraFile,
     output: Annotated[
         Path | None,
         typer.Option(

@@ -13,6 +13,7 @@ import typer
 CaptureFile = Annotated[
     Path, typer.Argument(metavar="FILE", help="Capture in Z-NLOS HDF5, by any writer.", readable=False)
 ]
+CameraFile = Annotated[Path, typer.Argument(metavar="FILE", help="Capture of scan type line_of_sight.", readable=False)]
 ConfigFile = Annotated[
     Path, typer.Argument(metavar="CONFIG", help="The YAML file that describes the capture.", readable=False)
 ]

@@ -71,6 +71,11 @@ class Section(BaseModel):
                 raise WrongValueRead(name)
             return super().__getattr__(name)
 
+    @property
+    def has_unknown_keys(self) -> bool:
+        """Whether keys stand here that are none of this section's: what seems missing may be misspelt."""
+        return any(key not in type(self).model_fields for key in self._wrong or {})
+
     def issues(self, path: KeyPath, root: type[Section]) -> Iterator[ValidationIssue]:
         """Yield what is wrong in this section and those in it; a method ``rule_...`` ends where it reads a wrong value.
 

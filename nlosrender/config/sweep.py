@@ -154,7 +154,7 @@ class SweepConfig(Section):
 
     def rule_something_is_swept(self) -> Iterator[ValidationIssue]:
         """There are values, or draws."""
-        if self.random is None and not self.keys:
+        if self.random is None and not self.keys and not self.has_unknown_keys:
             yield ValidationIssue((), "sweeps nothing, need values in keys, or draws in random.keys.", "key")
         if self.random is not None and not self.random.keys:
             yield ValidationIssue(("random", "keys"), "draws nothing, need at least one key.", "key")

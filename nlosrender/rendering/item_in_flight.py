@@ -66,8 +66,8 @@ class ItemInFlight:
         kept = self._state.read() or {}
         if not kept and self._state.path.exists():
             warn(
-                f"{partial.path}: what was kept of the work item in flight is damaged, or of another target; "
-                "it begins anew."
+                f"{partial.path}: the saved state of the work item in flight is damaged, or of another target "
+                "or version; it begins anew."
             )
         self.earlier_seconds = float(kept[OF_ITEM].numbers["seconds"]) if OF_ITEM in kept else 0.0
         self.passes = Passes(progress, self._look, kept)

@@ -245,6 +245,12 @@ def _matches(pattern: str, problem: str) -> bool:
     return problem.replace("?", "").startswith(parts[0]) and all(part in problem for part in parts[1:])
 
 
+def test_a_misspelt_key_is_the_only_mistake() -> None:
+    """Where a key is unknown, what it may have been is not missed as well."""
+    (problem,) = problems_of("sweep:\n  render.spp: [1, 2]\n")
+    assert "sweep.render.spp: unknown key" in problem
+
+
 def test_all_mistakes_at_once() -> None:
     """Mistakes of the base and of single captures come together, each once, with how many captures have it."""
     base = BASE.replace("ny: 3", "ny: 0")
