@@ -8,13 +8,16 @@ from __future__ import annotations
 import math
 import time
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 from nlosrender.engine.interface import Budget
 from nlosrender.engine.launch.pilot_points import Pilot, pilot_of
 from nlosrender.engine.launch.schedule import DEFAULT_TARGET
 from nlosrender.engine.virtual_lights.refinement import Gathered, estimated_error, finer_scale, refined_to
-from nlosrender.engine.virtual_lights.third_bounce import ThirdBounce
-from nlosrender.engine.virtual_lights.vpls.rounds import VplBounces
+
+if TYPE_CHECKING:
+    from nlosrender.engine.virtual_lights.third_bounce import ThirdBounce
+    from nlosrender.engine.virtual_lights.vpls.rounds import VplBounces
 
 
 def calibrated_lights(third: ThirdBounce, further: VplBounces | None, budget: Budget, *, is_alone: bool) -> Budget:

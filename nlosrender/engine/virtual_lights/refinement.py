@@ -8,12 +8,15 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from nlosrender.capture.relative_error import relative_l2_error
-from nlosrender.engine.virtual_lights.elements.tessellator import Tessellator
+
+if TYPE_CHECKING:
+    from nlosrender.engine.virtual_lights.elements.tessellator import Tessellator
 
 
 @dataclass(frozen=True, eq=False)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import drjit as dr
 import mitsuba as mi
@@ -18,7 +19,6 @@ from nlosrender.engine.launch.launch_params import LaunchParams
 from nlosrender.engine.launch.passes import Passes, Snapshot
 from nlosrender.engine.launch.pilot_points import Pilot
 from nlosrender.engine.virtual_lights.elements.patches import Patches
-from nlosrender.engine.virtual_lights.elements.tessellator import Tessellator
 from nlosrender.engine.virtual_lights.gather.block_histogram import BlockHistogram
 from nlosrender.engine.virtual_lights.gather.device_patches import PatchRegions, upload_patches
 from nlosrender.engine.virtual_lights.gather.kernel import GatherPasses
@@ -34,6 +34,9 @@ from nlosrender.engine.virtual_lights.gather.lighting import (
 from nlosrender.engine.virtual_lights.refinement import Gathered, coarser_scale
 from nlosrender.engine.virtual_lights.tuning import VirtualLightTuning
 from nlosrender.engine.virtual_lights.visibility.masks import VisibilityMasks, WallTiles, count_sensors
+
+if TYPE_CHECKING:
+    from nlosrender.engine.virtual_lights.elements.tessellator import Tessellator
 
 
 @dataclass(frozen=True, eq=False)

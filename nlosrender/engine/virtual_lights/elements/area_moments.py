@@ -6,16 +6,19 @@ docs/virtual-lights.md, 4.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import coo_matrix, csr_matrix
 
 from nlosrender.engine.virtual_lights.elements.struct_of_arrays import StructOfArrays
-from nlosrender.engine.virtual_lights.elements.subdivision import Elements, centroids
+from nlosrender.engine.virtual_lights.elements.triangles import centroids
 from nlosrender.engine.virtual_lights.tuning import VirtualLightTuning
 from nlosrender.scene.pose import Float64
+
+if TYPE_CHECKING:
+    from nlosrender.engine.virtual_lights.elements.subdivision import Elements
 
 RIDGE = 1e-6  # of the squared extent, ridge regression: keeps planes through points on a line defined
 PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))  # axes of the second moments

@@ -15,15 +15,19 @@ difference of two resolutions shows the noise of the draw.
 from __future__ import annotations
 
 import math
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from nlosrender.engine.virtual_lights.elements.area_moments import AreaMoments, BoxPlane
 from nlosrender.engine.virtual_lights.elements.patches import Patches
-from nlosrender.engine.virtual_lights.elements.subdivision import Elements, centroids, unit_vectors
+from nlosrender.engine.virtual_lights.elements.triangles import centroids, unit_vectors
 from nlosrender.engine.virtual_lights.tuning import VirtualLightTuning
 from nlosrender.scene.pose import Float64
+
+if TYPE_CHECKING:
+    from nlosrender.engine.virtual_lights.elements.subdivision import Elements
 
 
 class Merger:

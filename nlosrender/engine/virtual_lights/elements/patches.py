@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from nlosrender.engine.virtual_lights.elements.struct_of_arrays import StructOfArrays
-from nlosrender.engine.virtual_lights.elements.subdivision import Elements, normals_and_areas
+from nlosrender.engine.virtual_lights.elements.triangles import normals_and_areas
 from nlosrender.scene.pose import Float64
+
+if TYPE_CHECKING:
+    from nlosrender.engine.virtual_lights.elements.subdivision import Elements
 
 
 @dataclass(frozen=True, eq=False)

@@ -4,14 +4,17 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from itertools import combinations
+from typing import TYPE_CHECKING
 
 import mitsuba as mi
 import numpy as np
 
 from nlosrender.engine.virtual_lights.elements.patches import Patches, split_weights
-from nlosrender.engine.virtual_lights.elements.subdivision import WallDistance
 from nlosrender.scene.loading.round_surfaces import RoundSurface
 from nlosrender.scene.pose import Float64
+
+if TYPE_CHECKING:
+    from nlosrender.engine.virtual_lights.elements.subdivision import WallDistance
 
 ICOSAHEDRON_EDGE = 1.052  # in the unit sphere: 4 / sqrt(10 + 2 sqrt(5)), rounded up
 # Of a cylinder's circumference. With fewer, the normals over one patch differ by more than 60 degrees.

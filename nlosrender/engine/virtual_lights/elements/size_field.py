@@ -8,15 +8,19 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from nlosrender.engine.virtual_lights.elements.area_moments import covered_boxes
 from nlosrender.engine.virtual_lights.elements.clusters import Merger
 from nlosrender.engine.virtual_lights.elements.patches import Patches, split_elements
-from nlosrender.engine.virtual_lights.elements.subdivision import Elements, normals_and_areas
+from nlosrender.engine.virtual_lights.elements.triangles import normals_and_areas
 from nlosrender.engine.virtual_lights.tuning import DEFAULT_TUNING, VirtualLightTuning
 from nlosrender.scene.pose import Float64
+
+if TYPE_CHECKING:
+    from nlosrender.engine.virtual_lights.elements.subdivision import Elements
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import partial
+from typing import TYPE_CHECKING
 
 import drjit as dr
 import mitsuba as mi
@@ -19,7 +20,6 @@ from nlosrender.engine.launch.device_arrays import on_device
 from nlosrender.engine.launch.launch_params import LaunchParams
 from nlosrender.engine.launch.passes import Passes, PassSize, Snapshot
 from nlosrender.engine.launch.wall_points import WallPoints
-from nlosrender.engine.virtual_lights.gather.block_histogram import BlockHistogram
 from nlosrender.engine.virtual_lights.gather.delay_distribution import Delays, deposit_patch
 from nlosrender.engine.virtual_lights.gather.lighting import (
     ROWS,
@@ -28,6 +28,9 @@ from nlosrender.engine.virtual_lights.gather.lighting import (
     four_corners,
 )
 from nlosrender.engine.virtual_lights.visibility.shadow_rays import is_visible
+
+if TYPE_CHECKING:
+    from nlosrender.engine.virtual_lights.gather.block_histogram import BlockHistogram
 
 
 class GatherPasses:

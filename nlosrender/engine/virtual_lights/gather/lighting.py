@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import drjit as dr
 import mitsuba as mi
@@ -10,11 +11,14 @@ import numpy as np
 
 from nlosrender.engine.launch.device_arrays import on_device
 from nlosrender.engine.launch.launch_params import LaunchParams
-from nlosrender.engine.virtual_lights.gather.device_patches import DevicePatches
+from nlosrender.engine.launch.wall_points import WallPoints
 from nlosrender.engine.virtual_lights.tuning import DEFAULT_TUNING
-from nlosrender.engine.virtual_lights.visibility.masks import VisibilityMasks, WallTiles
 from nlosrender.engine.virtual_lights.visibility.shadow_rays import is_visible
 from nlosrender.scene.build import BuiltScene
+
+if TYPE_CHECKING:
+    from nlosrender.engine.virtual_lights.gather.device_patches import DevicePatches
+    from nlosrender.engine.virtual_lights.visibility.masks import VisibilityMasks, WallTiles
 
 ROWS = 6  # of four numbers each, aligned loads: what the gather reads of a patch
 
@@ -240,3 +244,12 @@ def four_corners(a: mi.Point3f, b: mi.Point3f, c: mi.Point3f) -> tuple[mi.Point3
 def _corners(patches: DevicePatches, index: mi.UInt32) -> list[mi.Point3f]:
     centre = dr.gather(mi.Point3f, patches.interaction.p, index)
     return [centre + dr.gather(mi.Vector3f, corner, index) for corner in patches.corners]
+
+
+def irradiance(built: BuiltScene, laser: WallPoints, point: mi.Point3f, shading: mi.Normal3f) -> mi.Spectrum:
+    """Return the irradiance at a point from a laser point that it sees [1 / (engine unit)^2 per J]."""
+    to_point = point - laser.interaction.p
+    distance2 = dr.squared_norm(to_point)
+    direction = to_point * dr.rsqrt(distance2)
+    emitted = built.wall_bsdf.eval(mi.BSDFContext(), laser.interaction, laser.interaction.to_local(direction))
+    return emitted * (dr.maximum(-dr.dot(shading, direction), 0) / distance2)

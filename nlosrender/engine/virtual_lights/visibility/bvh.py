@@ -13,7 +13,7 @@ import numpy as np
 from nlosrender.engine.launch.device_arrays import on_device
 from nlosrender.engine.launch.facing_triangles import triangles_of
 from nlosrender.engine.launch.morton import morton_order
-from nlosrender.engine.virtual_lights.elements.subdivision import centroids, normals_and_areas
+from nlosrender.engine.virtual_lights.elements.triangles import centroids, normals_and_areas
 from nlosrender.scene.pose import Float64
 
 LEAF = 8  # triangles; 2, 4 and 16 were slower

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import drjit as dr
 import mitsuba as mi
@@ -14,11 +15,14 @@ from nlosrender.engine.launch.histogram import DeviceHistogram, HistogramShape
 from nlosrender.engine.launch.launch_params import LaunchParams
 from nlosrender.engine.launch.ray_offsets import off_the_surface
 from nlosrender.engine.virtual_lights.gather.device_patches import to_points
+from nlosrender.engine.virtual_lights.gather.lighting import irradiance
 from nlosrender.engine.virtual_lights.visibility.masks import Surface, VisibilityMasks, WallTiles
 from nlosrender.engine.virtual_lights.visibility.shadow_rays import is_visible
-from nlosrender.engine.virtual_lights.vpls.sampler import Vpls
-from nlosrender.engine.virtual_lights.vpls.subpaths import VplContributions, irradiance
 from nlosrender.scene.build import BuiltScene
+
+if TYPE_CHECKING:
+    from nlosrender.engine.virtual_lights.vpls.sampler import Vpls
+    from nlosrender.engine.virtual_lights.vpls.subpaths import VplContributions
 
 
 @dataclass(frozen=True, eq=False)

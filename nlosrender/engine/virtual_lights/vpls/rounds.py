@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import drjit as dr
 import mitsuba as mi
@@ -22,11 +23,13 @@ from nlosrender.engine.launch.histogram import DeviceHistogram, Histogram
 from nlosrender.engine.launch.passes import Passes, PassSize, Snapshot
 from nlosrender.engine.launch.pilot_points import Pilot, spread
 from nlosrender.engine.launch.wall_points import laser_points
-from nlosrender.engine.virtual_lights.elements.tessellator import Tessellator
 from nlosrender.engine.virtual_lights.visibility.masks import VisibilityMasks, WallTiles
 from nlosrender.engine.virtual_lights.vpls.gather import VplTable, gather_contributions
 from nlosrender.engine.virtual_lights.vpls.sampler import Vpls, VplSampler
 from nlosrender.engine.virtual_lights.vpls.subpaths import ProposalLasers, SubpathPlan, vpl_contributions
+
+if TYPE_CHECKING:
+    from nlosrender.engine.virtual_lights.elements.tessellator import Tessellator
 
 
 class VplBounces:

@@ -9,6 +9,7 @@ docs/virtual-lights.md, 7.2 and 7.3.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -17,10 +18,12 @@ from nlosrender.engine.launch.sequences import recurrence_steps
 from nlosrender.engine.launch.time_gate import CaptureTimeGate
 from nlosrender.engine.virtual_lights.elements.patches import SurfacePoints
 from nlosrender.engine.virtual_lights.elements.round_shapes import onto_round_shapes
-from nlosrender.engine.virtual_lights.elements.subdivision import longest_edges, normals_and_areas
-from nlosrender.engine.virtual_lights.elements.tessellator import Tessellator
+from nlosrender.engine.virtual_lights.elements.triangles import longest_edges, normals_and_areas
 from nlosrender.scene.pose import Float64
 from nlosrender.scene.triangle_point import triangle_weights
+
+if TYPE_CHECKING:
+    from nlosrender.engine.virtual_lights.elements.tessellator import Tessellator
 
 # Barycentric coordinates of a triangle's centroid, and of the points between it and the corners.
 GATE_POINTS = np.concatenate([np.full((1, 3), 1 / 3), np.full((3, 3), 1 / 6) + np.eye(3) / 2])

@@ -11,6 +11,7 @@ docs/virtual-lights.md, 7.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import drjit as dr
 import mitsuba as mi
@@ -25,10 +26,13 @@ from nlosrender.engine.launch.ray_offsets import connection_segment, offset_orig
 from nlosrender.engine.launch.time_gate import CaptureTimeGate, TimeGate, time_gate_roulette
 from nlosrender.engine.launch.wall_points import WallPoints
 from nlosrender.engine.virtual_lights.gather.device_patches import normal_reflectance, surface_at
+from nlosrender.engine.virtual_lights.gather.lighting import irradiance
 from nlosrender.engine.virtual_lights.tuning import DEFAULT_TUNING
-from nlosrender.engine.virtual_lights.vpls.sampler import Vpls
 from nlosrender.scene.build import BuiltScene
 from nlosrender.scene.pose import Float64
+
+if TYPE_CHECKING:
+    from nlosrender.engine.virtual_lights.vpls.sampler import Vpls
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,15 +160,6 @@ def trace_subpaths(
         ray = mi.Ray3f(offset_origin(built, si, direction), direction)
 
     return vertex, total
-
-
-def irradiance(built: BuiltScene, laser: WallPoints, point: mi.Point3f, shading: mi.Normal3f) -> mi.Spectrum:
-    """Return the irradiance at a point from a laser point that it sees [1 / (engine unit)^2 per J]."""
-    to_point = point - laser.interaction.p
-    distance2 = dr.squared_norm(to_point)
-    direction = to_point * dr.rsqrt(distance2)
-    emitted = built.wall_bsdf.eval(mi.BSDFContext(), laser.interaction, laser.interaction.to_local(direction))
-    return emitted * (dr.maximum(-dr.dot(shading, direction), 0) / distance2)
 
 
 @dataclass(frozen=True, eq=False)
