@@ -27,7 +27,7 @@ from nlosrender.cli.paper_command import paper
 from nlosrender.cli.plan_command import plan
 from nlosrender.cli.reconstruct_command import reconstruct
 from nlosrender.cli.render_command import render
-from nlosrender.cli.streams import open_closed_streams, print_any_name
+from nlosrender.cli.streams import give_up_stderr, open_closed_streams, print_any_name
 from nlosrender.errors import EXIT_FAILURE, EXIT_INTERRUPTED, ConfigError, NlosError, ValidationIssue
 
 app = typer.Typer(
@@ -93,9 +93,11 @@ def main() -> None:
 
 
 def _end(message: str | None, exit_code: int, parts: Iterable[str], issues: Iterable[ValidationIssue] = ()) -> NoReturn:
-    with suppress(OSError):  # nobody reads the stream any more: the exit code still tells
+    try:
         if message is not None:
             typer.echo(message, err=True)
+    except OSError:  # nobody reads the stream any more: the exit code still tells
+        give_up_stderr()
     with suppress(OSError):
         OUTPUT.print_failure(parts, exit_code, issues)
     sys.exit(exit_code)

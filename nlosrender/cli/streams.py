@@ -6,6 +6,7 @@ import codecs
 import io
 import os
 import sys
+from contextlib import suppress
 
 ERROR_HANDLER = "nlosrender.names"  # what Python's codecs call the handler
 
@@ -15,6 +16,12 @@ def open_closed_streams() -> None:
     for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):  # each takes the lowest number that is free
         if getattr(sys, name) is None:
             setattr(sys, name, open(os.devnull, mode, encoding="utf-8"))  # noqa: SIM115  # for as long as we run
+
+
+def give_up_stderr() -> None:
+    """Send what standard error has buffered, and all after it, nowhere: else Python ends with 120 for it."""
+    with suppress(OSError):
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 2)
 
 
 def print_any_name() -> None:

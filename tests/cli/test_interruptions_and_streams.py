@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import os
 import signal
 import subprocess
 import sys
@@ -31,7 +32,8 @@ def run_process(code: str, *arguments: object, **streams: object) -> subprocess.
     """Run Python code in a process of its own."""
     command = [sys.executable, "-c", MAIN + code, *map(str, arguments)]
     captured = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True} | streams
-    return subprocess.run(command, timeout=60, check=False, **captured)  # type: ignore[call-overload]
+    environment = {name: value for name, value in os.environ.items() if name != "PYTHONUNBUFFERED"}  # as users have it
+    return subprocess.run(command, timeout=60, check=False, env=environment, **captured)  # type: ignore[call-overload]
 
 
 @pytest.mark.parametrize(
