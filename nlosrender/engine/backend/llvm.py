@@ -23,7 +23,7 @@ OLDEST_MAJOR = 16  # 15 aborts on AVX-512 machines, 14 is refused by Dr.Jit
 WHEEL = "karellen-llvm-core"
 WHEEL_RUNTIME = ("libunwind.so.1", "libc++abi.so.1", "libc++.so.1")  # in the order they need one another
 ENVIRONMENT_VARIABLE = "DRJIT_LIBLLVM_PATH"
-PROBE_SECONDS = 60.0
+PROBE_SECONDS = 60.0  # chosen: the probe renders 5 x 3 points twice, seconds where its LLVM works at all
 ADVICE = (
     f"Install one: 'pip install {WHEEL}' into this Python environment (no root needed), or your system's LLVM 19 "
     f"(Debian, Ubuntu: 'apt-get install libllvm19'); or name a library in {ENVIRONMENT_VARIABLE}."

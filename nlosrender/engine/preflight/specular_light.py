@@ -26,9 +26,9 @@ from nlosrender.scene.pose import Float64
 from nlosrender.scene.view import BuiltView
 
 RAYS = 2**16  # in all, shared by surfaces and laser points: light from less than about 1e-4 of a mirror is missed
-MIN_RAYS = 256  # of one surface and one laser point
-MAX_EVENTS = 16  # hits that a ray is followed for
-RAY_MARGIN = 1e-4  # share of a ray's length that is left out before its end
+MIN_RAYS = 256  # of one surface and one laser point: light from less than about 1 % of a mirror is missed
+MAX_EVENTS = 16  # hits that a ray is followed for; chosen: 15 mirrors of reflectance 0.9 leave 20 % of the light
+RAY_MARGIN = 1e-4  # share of a ray's length that is left out before its end; chosen, not measured
 WALL_NAME = "scene.relay_wall"
 
 
