@@ -5,7 +5,7 @@ A reflectance is a number (grey), ``[r, g, b]``, or a texture/spectrum dictionar
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import Annotated, Any
 
 from nlosrender.config.bsdf_table import (
@@ -22,9 +22,9 @@ from nlosrender.config.bsdf_table import (
     TRANSMITTING,
     Kind,
 )
-from nlosrender.config.fields import as_finite
+from nlosrender.config.fields import as_finite, finite_numbers
 from nlosrender.config.frozen import FrozenDict
-from nlosrender.config.issues import did_you_mean
+from nlosrender.config.issues import did_you_mean, shown
 from nlosrender.config.plugin_check import TRANSFORM_KEYS, PluginCheck, plugin_mapping
 from nlosrender.errors import KeyPath
 
@@ -41,17 +41,26 @@ _NUMBER_RANGES = {  # lowest and highest number allowed
     Kind.SPECTRUM: (0.0, float("inf")),
     Kind.IOR: (1e-6, float("inf")),
     Kind.IOR_NUMBER: (1e-6, float("inf")),
+    Kind.WIDTH: (0.01, 60.0),  # float32 has 1e-3 of the lobe's peak at the lowest; at the highest it is no lobe
 }
 
+SHARES_ROUNDING = 1e-9  # 0.7 + 0.2 + 0.1 > 1
 
 WHITE_DIFFUSE = FrozenDict(type="diffuse", reflectance=1.0)
 
 
-def check_parameter(check: PluginCheck, kind: str, key: str, value: Any) -> None:
-    """Note what is wrong with the value of one parameter of a BSDF; of parameters not in the table nothing is said."""
+def check_parameters(check: PluginCheck, kind: str, values: Mapping[str, Any], names: Collection[str]) -> None:
+    """Note what is wrong with the parameters of a BSDF; of those not in the table nothing is said.
+
+    ``names`` are all that it has, of which ``values`` are known.
+    """
     known = BSDF_PARAMETERS.get(kind, {})
-    if key in known:
-        _parameter(check, value, (key,), known[key])
+    _check_required(check, kind, names, ())
+    for key, value in values.items():
+        if key in known:
+            _parameter(check, value, (key,), known[key])
+    if kind == "retroreflector":
+        _check_shares(check, values, ())
 
 
 def is_colored(value: object) -> bool:
@@ -109,9 +118,7 @@ def _unknown_parameter(check: PluginCheck, kind: str, key: str, path: KeyPath) -
 def _check_combination(
     check: PluginCheck, kind: str, value: Mapping[str, Any], nested: list[str], path: KeyPath
 ) -> None:
-    for key in BSDF_REQUIRED.get(kind, ()):
-        if key not in value:
-            check.note((*path, key), f"missing, the {kind} BSDF needs it.")
+    _check_required(check, kind, value, path)
     fewest, most = NESTED_BSDFS.get(kind, (0, 0))
     if not fewest <= len(nested) <= most and kind in NESTED_BSDFS:
         count = str(fewest) if fewest == most else f"{fewest} to {most}"
@@ -127,8 +134,26 @@ def _check_combination(
         check.note((*path, "alpha"), "alpha and alpha_u, alpha_v exclude each other; keep one.", at_key=True)
     if value.get("material", NO_METAL) != NO_METAL and ("eta" in value or "k" in value):
         check.note((*path, "material"), "material and eta, k exclude each other; keep one.", at_key=True)
+    if kind == "retroreflector":
+        _check_shares(check, value, path)
     if kind == "principled" and "eta" in value and "specular" in value:
         check.note((*path, "specular"), "eta and specular exclude each other; keep one.", at_key=True)
+
+
+def _check_required(check: PluginCheck, kind: str, names: Collection[str], path: KeyPath) -> None:
+    for key in BSDF_REQUIRED.get(kind, ()):
+        if key not in names:
+            check.note((*path, key), f"missing, the {kind} BSDF needs it.")
+
+
+def _check_shares(check: PluginCheck, value: Mapping[str, Any], path: KeyPath) -> None:
+    """Refuse a retroreflector that reflects more light than it gets; where textures do, the diffuse share gives way."""
+    pair = value.get("albedo"), value.get("diffuse")
+    albedo, diffuse = (finite_numbers(item if isinstance(item, (list, tuple)) else [item] * 3, 3) for item in pair)
+    together = zip(albedo or [], diffuse or [], strict=False)  # nothing where one of them is no colour
+    if any(a + b > 1 + SHARES_ROUNDING and max(a, b) <= 1 for a, b in together):
+        message = f"got {shown(pair[1])} beside albedo {shown(pair[0])}, need a sum of at most 1."
+        check.note((*path, "diffuse"), message)
 
 
 def _parameter(check: PluginCheck, value: Any, path: KeyPath, kind: Kind) -> Any:

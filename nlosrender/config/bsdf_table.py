@@ -1,4 +1,4 @@
-"""The BSDF and texture plugins of Mitsuba 3.9 and the parameters of the common ones, as data.
+"""The BSDF and texture plugins of Mitsuba 3.9, and our retroreflector, with the parameters of the common ones, as data.
 
 Static, so that validating a config does not start Mitsuba; checked against the plugins by hand (each parameter was
 loaded once with Mitsuba 3.9.1).
@@ -18,6 +18,7 @@ class Kind(Enum):
     SPECTRUM = "a number >= 0, [r, g, b] with each >= 0, or a spectrum"
     IOR = "a number > 0 or the name of a medium, such as bk7 or water"
     IOR_NUMBER = "a number > 0"
+    WIDTH = "a number of degrees from 0.01 to 60"
     MATERIAL = "the name of a metal, such as Au, Ag, Cu or none"
     DISTRIBUTION = "beckmann or ggx"
     FLAG = "true or false"
@@ -29,8 +30,8 @@ def _names(words: str) -> tuple[str, ...]:
 
 BSDF_TYPES = _names(
     "blendbsdf bumpmap circular conductor dielectric diffuse hair mask measured measured_polarized normalmap null "
-    "plastic polarizer pplastic principled principledthin retarder roughconductor roughdielectric roughplastic "
-    "thindielectric twosided"
+    "plastic polarizer pplastic principled principledthin retarder retroreflector roughconductor roughdielectric "
+    "roughplastic thindielectric twosided"
 )
 # Without blackbody, regular and irregular, which need a spectral variant, and volume, which needs a plugin that is no
 # texture: without it Mitsuba ends the process.
@@ -113,11 +114,16 @@ BSDF_PARAMETERS: dict[str, dict[str, Kind]] = {
         "specular": Kind.UNIT_NUMBER,
         **dict.fromkeys(_PRINCIPLED_RATES, Kind.UNIT_NUMBER),
     },
+    "retroreflector": {"width": Kind.WIDTH, "albedo": Kind.REFLECTANCE, "diffuse": Kind.REFLECTANCE},
     "twosided": {},
     "mask": {"opacity": Kind.UNIT},
     "blendbsdf": {"weight": Kind.UNIT},
 }
-BSDF_REQUIRED: dict[str, tuple[str, ...]] = {"blendbsdf": ("weight",), "measured": ("filename",)}
+BSDF_REQUIRED: dict[str, tuple[str, ...]] = {
+    "blendbsdf": ("weight",),
+    "measured": ("filename",),
+    "retroreflector": ("width", "albedo"),
+}
 NESTED_BSDFS: dict[str, tuple[int, int]] = {  # how few and how many BSDFs it holds, under any key
     "twosided": (1, 2),
     "mask": (1, 1),

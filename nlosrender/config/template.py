@@ -80,6 +80,7 @@ scene:
       bsdf: {{type: diffuse, reflectance: 0.7}}  # default reflectance 1.0
     # A picture has its first row at the item's up side, its first column at the left as seen from the front:
     # bsdf: {{type: diffuse, reflectance: {{type: bitmap, filename: wood.png, raw: true}}}}  # see docs/textures.md
+    # bsdf: {{type: retroreflector, width: 0.5, albedo: 0.3, diffuse: 0.2}}  # degrees; see docs/retroreflectors.md
     # Further items, one example of each type. rotate_deg: degrees about x, then y, then z.
     # - {{type: mesh, filename: bunny.ply, scale: 1, rotate_deg: [0, 90, 0], translate: [0, 0, 1], normals: auto}}
     #   # scale: a number or [x, y, z], negative mirrors; normals: auto, file, flat or smooth, or face_normals: true

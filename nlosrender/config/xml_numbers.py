@@ -36,7 +36,7 @@ def check_numbers(element: Element) -> None:
     """
     name = element.get("name", "")
     is_light = element.tag in _LIGHT or name in ("radiance", "intensity", "irradiance")
-    is_share = name == "reflectance" or name.endswith(("_reflectance", "_transmittance"))
+    is_share = name in ("reflectance", "albedo", "diffuse") or name.endswith(("_reflectance", "_transmittance"))
     for key in _NUMERIC.get(element.tag, ()):
         for text in _SEPARATOR.split(element.get(key, "").strip()):
             try:

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 from xml.etree.ElementTree import Element
 
-from nlosrender.config.bsdf import check_parameter
+from nlosrender.config.bsdf import check_parameters
 from nlosrender.config.plugin_check import PluginCheck
 from nlosrender.config.shape_check import check_shape
 from nlosrender.config.xml_transforms import numbers_of, transform_steps, vector_of
@@ -60,8 +60,7 @@ def check_xml_bsdf(bsdf: Element, folder: Path) -> None:
         Says which BSDF, what is wrong and what is needed.
     """
     check = PluginCheck(folder)
-    for key, value in _values(bsdf):
-        check_parameter(check, bsdf.get("type", ""), key, value)
+    check_parameters(check, bsdf.get("type", ""), dict(_values(bsdf)), [item.get("name", "") for item in bsdf])
     _raise_first(check, bsdf)
 
 

@@ -211,6 +211,14 @@ MISTAKES = [
     ),
     (*bsdf("{type: roughconductor, §alpha_u: 0.1}"), "scene.relay_wall.bsdf.alpha_u", r"needs alpha_v beside it"),
     (*bsdf("{type: plastic, int_ior: §0}"), "scene.relay_wall.bsdf.int_ior", r"got 0, need a number > 0 or the name"),
+    (*bsdf("{type: retroreflector, width: §-1, albedo: 1}"), "scene.relay_wall.bsdf.width", r"need .* 0\.01 to 60"),
+    (*bsdf("{type: retroreflector, width: 1}"), "scene.relay_wall.bsdf.albedo", r"missing"),
+    (*bsdf("{type: retroreflector, width: 1, albedo: §1.2}"), "scene.relay_wall.bsdf.albedo", r"got 1\.2, need"),
+    (
+        *bsdf("{type: retroreflector, width: 1, albedo: [0, 0.8, 0], diffuse: §0.3}"),
+        "scene.relay_wall.bsdf.diffuse",
+        r"got 0\.3 beside albedo \[0, 0\.8, 0\], need a sum of at most 1",
+    ),
     (*bsdf("{type: conductor, §material: Au, k: 1}"), "scene.relay_wall.bsdf.material", r"exclude each other"),
     # rules over several keys
     ("  laser_grid: {nx: 2, ny: 7}\n", "", "capture.laser_grid", r"missing, an exhaustive scan needs it"),

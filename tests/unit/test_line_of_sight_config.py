@@ -123,6 +123,15 @@ def test_a_relay_wall_is_missing() -> None:
             "<scene><bsdf type='diffuse'><rgb name='reflectance' value='0.5 1.5 0'/></bsdf></scene>",
             "holds 1.5, need numbers from 0 to 1 for reflectance",
         ),
+        (
+            "<scene>\n<bsdf type='retroreflector'><float name='width' value='1'/></bsdf></scene>",
+            "line 2: <bsdf type='retroreflector'>: albedo: missing, the retroreflector BSDF needs it",
+        ),
+        (
+            "<scene><bsdf type='retroreflector'><float name='width' value='0'/><float name='albedo' value='1'/></bsdf>"
+            "</scene>",
+            "width: got 0, need a number of degrees from 0.01 to 60",
+        ),
         ("<scene><emitter type='point'><rgb name='intensity' value='-1'/></emitter></scene>", "need numbers >= 0"),
         ("<!DOCTYPE scene [<!ENTITY a 'b'>]><scene/>", "document type or entities"),
         ("<shape/>", "its root is <shape>"),

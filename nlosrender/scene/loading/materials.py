@@ -188,7 +188,7 @@ def _check_texels(values: NDArray[Any], name: str, key: str) -> None:
     """Refuse images with values no reflectance has; numbers in the configuration have been checked before."""
     if values.dtype.kind == "u":
         return  # 8-bit images stand for 0 to 1
-    most = 1.0 if "reflectance" in name or "color" in name else float("inf")
+    most = 1.0 if any(word in name for word in ("reflectance", "color", "albedo", "diffuse")) else float("inf")
     wrong = ~((values >= 0) & (values <= most * (1 + TEXEL_ROUNDING)) & np.isfinite(values))
     if wrong.any():
         need = "from 0 to 1" if most == 1 else "finite and not negative"
