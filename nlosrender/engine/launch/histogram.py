@@ -1,7 +1,9 @@
 """The time-resolved histogram on the device: one block of rows per lane, float64, and the statistics over replicas.
 
 A lane owns its rows, so a deposit is an unguarded add: no atomics, and the same bits whatever the thread count.
-Sums are float64: float32 stops growing when a deposit is below 6e-8 of what is there already.
+Sums are float64: float32 stops growing when a deposit is below 6e-8 of what is there already. They are added in pairs,
+one of the two plus zero: Dr.Jit adds single values lane by lane and looks for lanes that meet in one place, for every
+deposit 4.3 ns of CPU time; a pair is one load, addition and store, 1.7 ns.
 """
 
 from __future__ import annotations
@@ -16,6 +18,8 @@ from numpy.typing import NDArray
 from nlosrender.capture.relative_error import relative_l2_error
 from nlosrender.engine.launch.temporal_kernel import TemporalKernel
 from nlosrender.errors import RenderError
+
+PAIR = 2  # sums that are added at once; 4 and 8 take 1.9 and 2.5 ns
 
 
 @dataclass(frozen=True)
@@ -43,9 +47,14 @@ class HistogramShape:
         return self.n_bins + 1
 
     @property
+    def rows_per_lane(self) -> int:
+        """Rows a lane owns."""
+        return self.lasers * self.slots * self.channels
+
+    @property
     def entries_per_lane(self) -> int:
-        """Entries a lane owns."""
-        return self.lasers * self.slots * self.channels * self.row
+        """Entries a lane owns: its rows, and whole pairs."""
+        return -(-self.rows_per_lane * self.row // PAIR) * PAIR
 
     @property
     def size(self) -> int:
@@ -82,12 +91,13 @@ class DeviceHistogram:
         shape = self.shape
         inside = (bins >= 0) & (bins < shape.n_bins)
         entry = dr.select(inside, mi.UInt32(bins), mi.UInt32(shape.n_bins))
-        row = (lane * shape.lasers + laser) * shape.slots + slot
+        row = laser * shape.slots + slot
         for channel in range(shape.channels):
             # a Mueller matrix meets unpolarised light: its first column is a Stokes vector
-            carried = value[channel, 0][0] if mi.is_polarized else value[channel]
-            index = (row * shape.channels + channel) * shape.row + entry
-            dr.scatter_add(self.sums, mi.Float64(carried), index, active, dr.ReduceMode.NoConflicts)
+            carried = mi.Float64(value[channel, 0][0] if mi.is_polarized else value[channel])
+            index = lane * shape.entries_per_lane + (row * shape.channels + channel) * shape.row + entry
+            pair = mi.ArrayXf64([dr.select(index % PAIR == k, carried, 0) for k in range(PAIR)])
+            dr.scatter_add(self.sums, pair, index // PAIR, active, dr.ReduceMode.NoConflicts)
 
     def statistics(
         self, samples_per_lane: int, scale: float = 1.0, slots: range | None = None
@@ -115,7 +125,8 @@ class DeviceHistogram:
     def energies(self) -> NDArray[np.float64]:
         """Return the sums over the time window (replica, sensor, laser, slot, channel)."""
         shape = self.shape
-        rows = np.asarray(self.sums.numpy()).reshape(-1, shape.row)[:, :-1].sum(axis=-1)
+        lanes = np.asarray(self.sums.numpy()).reshape(shape.lanes, -1)[:, : shape.rows_per_lane * shape.row]
+        rows = lanes.reshape(-1, shape.row)[:, :-1].sum(axis=-1)
         return rows.reshape(shape.replicas, shape.sensors, shape.lasers, shape.slots, shape.channels)
 
     def total(self, scale: float = 1.0) -> mi.Float64:
@@ -133,14 +144,14 @@ class DeviceHistogram:
         shape = self.shape
         slots = range(shape.slots) if slots is None else slots
         size = shape.size // shape.replicas
-        index = dr.arange(mi.UInt32, size // shape.slots * len(slots))
+        index = dr.arange(mi.UInt32, shape.sensors * shape.rows_per_lane * shape.row // shape.slots * len(slots))
         entry, rest = index % shape.row, index // shape.row
         sensor, rest = rest % shape.sensors, rest // shape.sensors
         laser, rest = rest % shape.lasers, rest // shape.lasers
         slot, channel = mi.Int32(rest % len(slots)) + slots.start, rest // len(slots)
         own = (slot >= 0) & (slot < shape.slots)
-        row = ((sensor * shape.lasers + laser) * shape.slots + mi.UInt32(slot)) * shape.channels + channel
-        start = row * shape.row + entry
+        row = (laser * shape.slots + mi.UInt32(slot)) * shape.channels + channel
+        start = sensor * shape.entries_per_lane + row * shape.row + entry
         replicas = [dr.gather(mi.Float64, self.sums, start + r * size, own) * scale for r in range(shape.replicas)]
         if self.kernel is not None:
             dr.eval(replicas)

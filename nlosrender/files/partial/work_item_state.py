@@ -23,7 +23,7 @@ from nlosrender.files.partial.journal import line_of, record_of
 from nlosrender.files.partial.work_item_log import WorkItemKey
 
 PREFIX, NEW = "unit.", ".new"
-STATE_FORMAT = 2  # part of the tag: a state of other names of arrays is not read; 2: phase, position, block
+STATE_FORMAT = 3  # part of the tag: states of other arrays are not read; 2: phase, position, block, 3: sums in pairs
 MAX_HEADER_BYTES = 2**24
 
 
