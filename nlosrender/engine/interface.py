@@ -191,7 +191,7 @@ class SupplementaryEngine(Engine, Protocol):
         """Render as ``Engine.render``.
 
         ``known_squares``: sum of the squares of the other engine's H, which ``target_error`` counts in
-        [(engine unit)^-4], without those of the second bounce.
+        [(engine unit)^-4], without those of exact light (``DeviceCapture.exact_light``).
         """
 
     def omitted_path_work(self) -> Iterator[OmittedWork]:

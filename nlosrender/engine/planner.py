@@ -103,9 +103,9 @@ def _obstacle(render: RenderConfig, capture: Capture, built: BuiltScene) -> str 
         return "a hidden shape is neither a mesh nor a sphere or cylinder"
     if bool(built.wall_bsdf.flags() & mi.BSDFFlags.Delta):
         return "the relay wall has a mirror lobe"
-    hard = mi.BSDFFlags.Delta | mi.BSDFFlags.Transmission | mi.BSDFFlags.Null
+    hard = mi.BSDFFlags.Transmission | mi.BSDFFlags.Null
     if any(bool(shape.bsdf().flags() & hard) for shape in built.hidden_shapes):
-        return "some hidden surfaces are mirrors or let light through"
+        return "some hidden surfaces let light through"
     if built.n_triangles > MAX_TRIANGLES:
         return f"{built.n_triangles} triangles are more than the gather takes"
     return None

@@ -85,11 +85,13 @@ def test_three_techniques_agree_on_a_plate(tmp_path):
 
 
 def test_what_no_technique_samples_is_said(tmp_path):
-    """Two techniques that both miss the light of a mirror agree, and the command says what that is worth."""
-    (tmp_path / "mirror.yaml").write_text(PLATE.replace("HIDDEN", ", bsdf: {type: conductor, material: none}"))
+    """Two techniques that both miss the light of a mirror with holes agree, and the command says what that is worth."""
+    (tmp_path / "mirror.yaml").write_text(
+        PLATE.replace("HIDDEN", ", bsdf: {type: mask, opacity: 0.9, bsdf: {type: conductor}}")
+    )
     done = run(tmp_path, "check-engines", "mirror.yaml", "--points", 2, "--seconds", 0.5)
     assert done.returncode == EXIT_OK
-    assert "virtual lights: not rendered, some hidden surfaces are mirrors" in done.stdout
+    assert "virtual lights: not rendered, some hidden surfaces let light through" in done.stdout
     assert "no difference would have been seen" in done.stdout
     assert "agreement says nothing about this light" in done.stderr
 

@@ -42,7 +42,7 @@ def test_the_second_bounce_counts_for_the_target(tmp_path: Path, engine: str) ->
     from nlosrender.engine.interface import Budget
 
     engines = [stages.set_up_engine(config, backend)[1] for _ in range(2)]
-    engines[1].device.second_squares = lambda batch: 0.0  # as if the third bounce were all
+    engines[1].device.exact_squares = lambda batch: 0.0  # as if the third bounce were all
     fine = [each.calibrate(Budget(target_error=TARGET)).patch_scale for each in engines]
     assert fine[0] > 1.2 * fine[1]
 

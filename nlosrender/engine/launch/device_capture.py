@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -11,10 +12,13 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from nlosrender.capture.bounces import FIRST_BOUNCE, THIRD_BOUNCE
 from nlosrender.engine.launch.device_arrays import on_device
 from nlosrender.engine.launch.energy_contrasts import no_contrasts
+from nlosrender.engine.launch.flat_mirrors import FlatMirrors, has_flat_mirrors
 from nlosrender.engine.launch.histogram import DeviceHistogram, Histogram, HistogramShape
 from nlosrender.engine.launch.launch_params import LaunchParams
+from nlosrender.engine.launch.mirrored_bounce import deposit_mirrored_bounce
 from nlosrender.engine.launch.morton import morton_order
 from nlosrender.engine.launch.schedule import DEFAULT_SCHEDULE, ScheduleTuning
 from nlosrender.engine.launch.second_bounce import deposit_second_bounce
@@ -140,31 +144,48 @@ class DeviceCapture:
             row_of_lane=row_of_lane,
         )
 
-    def second_bounce(self, batch: Batch | Pilot) -> NDArray[np.float64]:
-        """Return the second bounce (channel, 1, laser, sensor, row): exact, so one replica computes it."""
-        shape = replace(self.shape(batch, 1), replicas=1)
-        histogram = DeviceHistogram(shape)
-        deposit_second_bounce(self.launch_params(batch, shape), histogram)
-        return histogram.on_host(histogram.total(self.scale))
+    @cached_property
+    def mirrors(self) -> FlatMirrors | None:
+        """Flat mirrors that send light of the laser points to sensor points, bounce 3; None: none are asked for.
 
-    def second_squares(self, batch: Batch | Pilot) -> float:
-        """Return the sum of the squares of the second bounce, which a target error counts in [(engine unit)^-4]."""
-        if self.built.wall.is_planar:
-            return 0.0
-        return float(np.square(self.second_bounce(batch)[..., :-1] / self.scale).sum())
+        A laser's spot is found by chance.
+        """
+        highest = self.options.bounces.max_bounces
+        if self.capture.laser_spot_radius > 0 or (highest is not None and highest < THIRD_BOUNCE):
+            return None
+        return FlatMirrors.of(self.built) if any(map(has_flat_mirrors, self.built.scene.shapes())) else None
+
+    def exact_light(self, batch: Batch | Pilot) -> Iterator[tuple[int, NDArray[np.float64]]]:
+        """Yield bounces and their light (channel, 1, laser, sensor, row) that is exact: one replica computes it.
+
+        The second bounce, of which a planar wall has none, and the third by way of flat mirrors.
+        """
+        shape = replace(self.shape(batch, 1), replicas=1)
+        if not self.built.wall.is_planar:
+            histogram = DeviceHistogram(shape)
+            deposit_second_bounce(self.launch_params(batch, shape), histogram)
+            yield FIRST_BOUNCE, histogram.on_host(histogram.total(self.scale))
+        if self.mirrors is not None:
+            histogram = DeviceHistogram(shape)
+            deposit_mirrored_bounce(self.launch_params(batch, shape), self.mirrors, histogram)
+            yield THIRD_BOUNCE, histogram.on_host(histogram.total(self.scale))
+
+    def exact_squares(self, batch: Batch | Pilot) -> float:
+        """Return the sum of the squares of exact light, which a target error counts in [(engine unit)^-4]."""
+        return sum(float(np.square(light[..., :-1] / self.scale).sum()) for _, light in self.exact_light(batch))
 
     def histogram_without_samples(self, batch: Batch) -> Histogram:
-        """Return the histogram of a batch of which nothing is sampled: the second bounce, all others zero."""
+        """Return the histogram of a batch of which nothing is sampled: exact light, all else zero."""
         shape, slots = self.shape(batch, 1), self.options.bounces.n_slots
         axes = (shape.channels, slots, shape.lasers, shape.sensors, shape.row)
         result = Histogram.of_rows(np.zeros(axes), np.zeros(axes), 0, no_contrasts(shape.channels, slots))
-        self.add_second_bounce(batch, result)
+        self.add_exact_light(batch, result)
         return result
 
-    def add_second_bounce(self, batch: Batch, histogram: Histogram) -> None:
-        """Add the second bounce to a batch's histogram in place; a planar wall has none."""
-        if not self.built.wall.is_planar:
-            second = self.second_bounce(batch)
-            histogram.mean[:, :1] += second[..., :-1]
-            histogram.outside[:, :1] += second[..., -1]
+    def add_exact_light(self, batch: Batch, histogram: Histogram) -> None:
+        """Add ``exact_light`` to a batch's histogram in place."""
+        for bounce, light in self.exact_light(batch):
+            slot = self.options.bounces.slot(bounce)
+            histogram.mean[:, slot : slot + 1] += light[..., :-1]
+            histogram.outside[:, slot : slot + 1] += light[..., -1]
             histogram.refuse_not_finite()

@@ -122,19 +122,19 @@ class PathEngine:
         """Render one batch; see ``Engine.render``.
 
         ``known_squares``: sum of the squares of H known from elsewhere, which ``target_error`` counts in
-        [(engine unit)^-4], without those of the second bounce.
+        [(engine unit)^-4], without those of exact light (``DeviceCapture.exact_light``).
         """
         if not self.traces_paths:
             return self.device.histogram_without_samples(batch)
         accumulation = self._accumulation(batch, self.device.shape(batch, self.n_slots), budget)
         shape = accumulation.shape
         if budget.target_error is not None:
-            known_squares += self.device.second_squares(batch)
+            known_squares += self.device.exact_squares(batch)
         lanes, tuning = shape.lanes * shape.lasers, self.options.schedule
         schedule = Schedule(budget, shape.replicas, known_squares, lanes, tuning)
         result = accumulation.run(schedule, passes or Passes())
         self.compile_seconds += accumulation.compile_seconds
-        self.device.add_second_bounce(batch, result)
+        self.device.add_exact_light(batch, result)
         return result
 
     def calibrate(self, budget: Budget, seconds: float = math.inf, known_squares: float = 0.0) -> Budget:
@@ -144,7 +144,7 @@ class PathEngine:
         pilot, options = pilot_of(self.capture), self.options
         shape = self._pilot_shape(pilot)
         accumulation = self._accumulation(pilot, shape, budget)
-        known_squares += self.device.second_squares(pilot)
+        known_squares += self.device.exact_squares(pilot)
         replicas = options.replicas, shape.replicas
         calibrated = calibrated_by_pilot(budget, replicas, accumulation.run, known_squares, seconds, options.schedule)
         self.compile_seconds += accumulation.compile_seconds

@@ -2,6 +2,7 @@
 
 Rays whose first hit has a delta lobe (S) are followed until they scatter at a vertex that a sensor point sees. Nothing
 is rendered: the result is which surfaces send light along paths that no technique samples, see ``unsampled_paths``.
+What flat mirrors send from the laser to sensor points, bounce 3, is none of it: it is computed (``FlatMirrors``).
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from nlosrender.capture.arrivals import sampled_indices
 from nlosrender.capture.grids import Capture
 from nlosrender.capture.time_axis import TimeAxis
 from nlosrender.engine.launch.device_arrays import columns
+from nlosrender.engine.launch.flat_mirrors import NONE, FlatMirrors
 from nlosrender.engine.launch.ray_offsets import offset_origin
 from nlosrender.engine.launch.surface_sampler import SAMPLEABLE_PLUGINS
 from nlosrender.engine.launch.wall_points import laser_points
@@ -74,7 +76,7 @@ def light_after_laser(
     emitted = built.wall_bsdf.eval(mi.BSDFContext(), lit, lit.to_local(direction))
     sent = dr.any(mi.unpolarized_spectrum(emitted) > 0)
     rays = _Rays(_ray(built, lit, direction, sent), False)
-    return list(_followed(built, capture, time_axis, rays, max_bounces, 1))
+    return list(_followed(built, capture, time_axis, rays, max_bounces, 1, FlatMirrors.of(built)))
 
 
 def light_mirrored_by_wall(
@@ -120,8 +122,11 @@ def _followed(
     start: _Rays,
     max_bounces: int | None,
     interactions: int,
+    mirrors: FlatMirrors | None = None,
 ) -> Iterator[SpecularLight]:
     """Follow rays that had ``interactions`` surface interactions; yield the specular light of the surfaces met first.
+
+    What ``mirrors`` send straight to sensor points is left out.
 
     The bounce is the lowest that a surface was seen to add to: a ray met the wall among the sensor points, or scattered
     where one of them sees it.
@@ -133,6 +138,7 @@ def _followed(
     ) / built.metres_per_engine_unit
     first = np.zeros(n_rays, dtype=np.int64)  # twice the number of the first surface, plus 1 if it reflected the ray
     lowest: dict[int, int] = {}  # bounce by ``first``
+    is_imaged = np.zeros(n_rays, dtype=bool)  # the first surface is a flat mirror that reflected the ray
     for event in range(MAX_EVENTS):
         count = interactions + event + 1  # interactions up to the surface that is met now
         if max_bounces is not None and count > max_bounces:
@@ -147,9 +153,13 @@ def _followed(
             crossing = mi.Frame3f.cos_theta(si.wi) * mi.Frame3f.cos_theta(bs.wo)
             first = 2 * np.array(dr.reinterpret_array(mi.UInt32, si.shape), dtype=np.int64) + np.array(crossing > 0)
             hit &= is_delta | start.is_specular
+            if mirrors is not None:
+                is_imaged = np.array((mirrors.number_at(si, mi.Bool(hit)) != NONE) & (crossing > 0), dtype=bool)
         if event > 0 or start.is_specular:
             scattered = mi.Bool(hit & ~is_delta)
             for more, measured in enumerate(_measured(built, capture, si, scattered, event)):
+                if event == 1 and more == 0:
+                    measured &= ~is_imaged  # in place: an array of its own
                 for sent in np.unique(first[measured]).tolist():
                     lowest.setdefault(sent, count + more)
         if set(np.unique(first[hit]).tolist()) <= set(lowest):

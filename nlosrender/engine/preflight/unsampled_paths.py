@@ -7,14 +7,14 @@ wall's own D. What the techniques sample:
 - Paths start at the sensor. BSDF sampling follows every S and D, hidden geometry sampling every D of the wall.
 - Laser sampling connects a vertex straight to the laser point. The BSDF of the connection is evaluated at both of its
   ends, and what lies between stops it: an S at either end, or a pane or mask between, is never found.
+- Flat mirrors show an image of a laser point, which sensor points are connected to: ``L D S D E``.
 - A laser spot (``capture.laser_spot_radius``) is an area which BSDF sampling finds by chance, through any S.
-- Virtual lights take no scene with an S (``planner``).
 - Before a camera, emitters with an area are found by BSDF sampling; points, spots and suns by connections alone.
 
-So ``L D S+ ...`` is missing with a laser point, ``L S ...`` (the wall mirrors the beam) always, and the lamps'
-``L S+ D ...`` before a camera. Whether a class carries energy is tried by ``specular_light``: mirrors that the laser
-does not light, or whose light leaves the scene, needs more than ``max_bounces`` or comes after the time window, are
-none.
+So ``L D S+ ...`` is missing with a laser point but for that image, ``L S ...`` (the wall mirrors the beam) always, and
+the lamps' ``L S+ D ...`` before a camera. Whether a class carries energy is tried by ``specular_light``: mirrors that
+the laser does not light, or whose light leaves the scene, needs more than ``max_bounces`` or comes after the time
+window, are none.
 """
 
 from __future__ import annotations

@@ -38,7 +38,7 @@ def calibrated_lights(third: ThirdBounce, further: VplBounces | None, budget: Bu
     if further is None:
         return replace(budget, patch_scale=patch_scale)
     goal, squares = tuning.rest_share_of_many * target, gathered.squares * (pilot.sensors.size / few.sensors.size)
-    squares += device.second_squares(pilot)
+    squares += device.exact_squares(pilot)
     histogram = further.histogram(pilot, max(2, tuning.pilot_lanes // pilot.sensors.size // 2 * 2))
     done, error = 0, math.inf
     while done < tuning.max_pilot_rounds and error > tuning.max_pilot_error * goal:
@@ -53,7 +53,7 @@ def calibrated_lights(third: ThirdBounce, further: VplBounces | None, budget: Bu
 
 
 def _refined(third: ThirdBounce, pilot: Pilot, target: float) -> tuple[float, Gathered]:
-    known_squares = third.device.second_squares(pilot)
+    known_squares = third.device.exact_squares(pilot)
     return refined_to(target, third.tessellator, lambda scale: third.gather(pilot, scale), known_squares)
 
 
@@ -77,13 +77,13 @@ def _patch_scale_in_time(third: ThirdBounce, time_limit_s: float, target: float)
     pairs = capture.n_sensors * (capture.n_lasers if third.device.is_exhaustive else 1)
     more = pairs / (pilot.sensors.size * (pilot.lasers.size if third.device.is_exhaustive else 1))
     patch_scale = third.tuning.coarsest_scale
-    coarse, second = third.gather(pilot, patch_scale), third.device.second_squares(pilot)
+    coarse, known_squares = third.gather(pilot, patch_scale), third.device.exact_squares(pilot)
     while True:
         finer = finer_scale(third.tessellator, patch_scale, third.tuning.refinement)
         begun = time.perf_counter()
         fine = third.gather(pilot, finer)
         predicted = (time.perf_counter() - begun) * more * 4
-        error = estimated_error(coarse, fine, second)
+        error = estimated_error(coarse, fine, known_squares)
         if error <= target or predicted > time_limit_s / 2:
             return finer if error <= target else patch_scale
         patch_scale, coarse = finer, fine

@@ -39,8 +39,7 @@ class VirtualLightEngine:
     Parameters
     ----------
     device
-        The capture on the device. The hidden geometry has to be meshes, spheres and cylinders, none of them a mirror,
-        and no more than the wall may be.
+        The capture on the device. Its hidden geometry has to be meshes, spheres and cylinders, all of them opaque.
     paths
         Engine of the bounces above the third where surfaces are not Lambertian.
     lanes

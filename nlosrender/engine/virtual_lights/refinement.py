@@ -94,7 +94,7 @@ def refined_to(
     tessellator, gather
         Count the patches of a scale, and gather them on a few points of the capture.
     known_squares
-        Sum of the squares of the second bounce at these points [(engine unit)^-4].
+        Sum of the squares of exact light at these points [(engine unit)^-4].
     """
     tuning = tessellator.tuning
     levels = [(gather(tuning.coarsest_scale), math.inf)]  # and its error, coarse to fine

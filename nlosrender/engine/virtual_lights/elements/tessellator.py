@@ -13,6 +13,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import cached_property, lru_cache
 
+import mitsuba as mi
 import numpy as np
 
 from nlosrender.capture.grids import Capture
@@ -69,6 +70,8 @@ class Tessellator:
                 if not wall_sees_itself(built):
                     continue
                 self.wall_index = index
+            if not bool(shape.bsdf().flags() & mi.BSDFFlags.Smooth):  # a mirror alone: connections find nothing there
+                continue
             if shape.is_mesh():
                 triangles.append(elements_of_mesh(built, index, shape))
             else:

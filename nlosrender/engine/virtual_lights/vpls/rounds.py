@@ -124,7 +124,7 @@ class VplBounces:
 
     def render(self, batch: Batch, budget: Budget, passes: Passes, known_squares: float = 0.0) -> Histogram:
         """Render bounces 2 and 4 and up of a batch; see ``SupplementaryEngine.render``."""
-        known_squares += self.device.second_squares(batch)
+        known_squares += self.device.exact_squares(batch)
         histogram = self.histogram(batch, self.options.replicas)
         grid = self.device.capture.sensor_grid
         contrasts = RoundContrasts(histogram, self.device.sensor_indices(batch), (grid.nx, grid.ny))
@@ -166,7 +166,7 @@ class VplBounces:
         errors = contrasts.result(scale / (done * self.options.replicas), slots)
         mean, variance = (histogram.on_host(values) for values in statistics)
         result = Histogram.of_rows(mean, variance, done * self.contributions_per_round, errors)
-        self.device.add_second_bounce(batch, result)
+        self.device.add_exact_light(batch, result)
         return result
 
     def accumulate(

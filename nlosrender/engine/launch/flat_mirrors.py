@@ -1,0 +1,276 @@
+"""Flat mirrors: facets with a delta reflection lobe send the light of a laser point on as if it came from its image.
+
+Facets that lie in one plane and share edges are one mirror. For a mirror, a point s and a laser point l the point of
+reflection is where the segment from s to the image of l meets the plane; a ray decides whether a facet of the mirror
+is there and seen, so that an edge counts once (docs/virtual-lights.md, 11).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+
+from nlosrender.engine.launch.device_arrays import on_device
+from nlosrender.engine.launch.facing_triangles import facing_triangles
+from nlosrender.engine.launch.ray_offsets import connection_segment, offset_origin
+from nlosrender.scene.build import BuiltScene
+from nlosrender.scene.pose import Float64
+
+NONE = 0xFFFFFFFF
+FLAT_PLUGINS = ("Rectangle", "Disk")
+COPLANAR = 1e-5  # radians between neighbouring facets of one mirror: what float32 vertices leave of a plane's facets
+# What float32 rounds a point of reflection by, over 1 + the largest coordinate [engine units]: the quick test goes so
+# far beyond a mirror's edges. Points so near to an edge between two mirrors may count for both, or for none.
+ROUNDING = 3e-7
+MIN_HEIGHT = 1e-7  # engine units: points nearer to a mirror's plane lie in it as far as float32 knows
+NUDGE = 5e-7  # as ROUNDING: how far beside a point on an edge a ray is sent; a plate's edges are met at a tenth of it
+TRIES = 6  # rays at most: about the point at angles of 1 to 5 radians, which are along one edge and no other
+ROWS = 3  # of four numbers each, aligned loads: what the quick test reads of a mirror
+
+
+@dataclass(frozen=True, eq=False)
+class FlatMirrors:
+    """The flat mirrors of a scene on the device."""
+
+    n_mirrors: int
+    count: mi.UInt32  # opaque copy of ``n_mirrors``
+    # 12 a mirror: its plane (n, d) with n . x + d = 0, and two coordinates in it, affine maps (w, w0) of points: the
+    # mirror lies where both are at least 0, and their sum is at most 1
+    packed: mi.Float
+    lobes: mi.UInt32  # two a mirror: bits of the delta reflection components of its BSDF on the front and on the back
+    components: tuple[int, ...]  # that any of them has
+    first_facet: mi.UInt32  # by number of a shape's pointer: where its facets begin in ``mirror_of``; NONE
+    mirror_of: mi.UInt32  # mirror of each facet; NONE for those that no point of the wall sees
+
+    @classmethod
+    def of(cls, built: BuiltScene) -> FlatMirrors:
+        """Return the flat mirrors of a scene; polarised light has none."""
+        corners, facets, lobes = [np.zeros((0, 3, 3))], [np.zeros(0, np.uint32)], [np.zeros((0, 2), np.uint32)]
+        shapes = [] if mi.is_polarized else [shape for shape in built.scene.shapes() if has_flat_mirrors(shape)]
+        number = {shape: int(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))[0]) for shape in shapes}
+        first_facet = np.full(max(number.values(), default=0) + 1, NONE, np.uint32)
+        n_mirrors = n_facets = 0
+        for shape in shapes:
+            triangles, primitives = _facets(built, shape)
+            mirror, bounds = _mirrors_of(triangles)
+            mirror_of = np.full(shape.face_count() if shape.is_mesh() else 1, NONE, np.uint32)
+            mirror_of[primitives] = mirror + n_mirrors
+            first_facet[number[shape]] = n_facets
+            corners.append(bounds)
+            facets.append(mirror_of)
+            lobes.append(np.tile(np.array(delta_lobes(shape.bsdf()), np.uint32), (len(bounds), 1)))
+            n_mirrors, n_facets = n_mirrors + len(bounds), n_facets + len(mirror_of)
+        bits = np.concatenate(lobes)
+        used = int(np.bitwise_or.reduce(bits, axis=None))
+        mirrors = cls(
+            n_mirrors,
+            dr.opaque(mi.UInt32, n_mirrors),
+            on_device(mi.Float, np.ravel(_packed(np.concatenate(corners))).astype(np.float32)),
+            on_device(mi.UInt32, np.ravel(bits)),
+            tuple(k for k in range(32) if used >> k & 1),
+            on_device(mi.UInt32, first_facet),
+            on_device(mi.UInt32, np.concatenate(facets)),
+        )
+        dr.eval(mirrors.packed, mirrors.lobes, mirrors.first_facet, mirrors.mirror_of)
+        return mirrors
+
+    def number_at(self, si: mi.SurfaceInteraction3f | mi.PreliminaryIntersection3f, active: mi.Bool) -> mi.UInt32:
+        """Return the number of the mirror that a ray met; NONE where it met none."""
+        if not self.n_mirrors:
+            return mi.UInt32(NONE)
+        shape = dr.reinterpret_array(mi.UInt32, si.shape)  # 0: nothing was met
+        known = active & si.is_valid() & (shape < dr.width(self.first_facet))
+        first = dr.select(known, dr.gather(mi.UInt32, self.first_facet, shape, known), NONE)
+        known &= first != NONE
+        return dr.select(known, dr.gather(mi.UInt32, self.mirror_of, first + si.prim_index, known), NONE)
+
+    def may_reflect(self, number: mi.UInt32, point: mi.Point3f, laser: mi.Point3f) -> mi.Bool:
+        """Return whether mirrors can reflect the light of a laser point to a point: no ray is traced.
+
+        True also for points of reflection beside a mirror of many facets, but not beside a single facet.
+        """
+        plane, one, other = (dr.gather(mi.Vector4f, self.packed, number * ROWS + row) for row in range(ROWS))
+        height, above = _affine(plane, point), _affine(plane, laser)
+        is_before = dr.minimum(height * dr.sign(above), dr.abs(above)) > MIN_HEIGHT
+        height, above = dr.abs(height), dr.abs(above)
+        # the point of reflection divides the distance between the feet in the ratio of the heights
+        u = above * _affine(one, point) + height * _affine(one, laser)
+        v = above * _affine(other, point) + height * _affine(other, laser)
+        return is_before & (u >= 0) & (v >= 0) & (u + v <= height + above)
+
+    def reflected(
+        self,
+        built: BuiltScene,
+        number: mi.UInt32,
+        si: mi.SurfaceInteraction3f,
+        lit: mi.SurfaceInteraction3f,
+        active: mi.Bool,
+    ) -> Reflection:
+        """Connect points to laser points by way of mirrors, where ``may_reflect`` says they can be connected."""
+        plane = dr.gather(mi.Vector4f, self.packed, number * ROWS, active)
+        normal, height, above = mi.Normal3f(plane.x, plane.y, plane.z), _affine(plane, si.p), _affine(plane, lit.p)
+        to_image = lit.p - si.p - (2 * above) * normal
+        distance = dr.norm(to_image)
+        direction = to_image / distance
+        hit, active = self._met(built, number, si, direction, distance * height / (height + above), normal, active)
+        hit.p = si.p + to_image * (height / (height + above))
+        from_laser = direction - (2 * dr.dot(direction, normal)) * normal
+        side = dr.select(mi.Frame3f.cos_theta(hit.wi) > 0, 0, 1)
+        lobes = dr.gather(mi.UInt32, self.lobes, number * 2 + mi.UInt32(side), active)
+        weight = mi.Spectrum(0)
+        for component in self.components:
+            context = mi.BSDFContext()
+            context.component = component
+            has_lobe = active & ((lobes >> component & 1) == 1)
+            bs, value = hit.bsdf().sample(context, hit, 0.5, mi.Point2f(0.5), has_lobe)
+            weight += dr.select(has_lobe & mi.has_flag(bs.sampled_type, mi.BSDFFlags.DeltaReflection), value, 0)
+        weight *= built.wall_bsdf.eval(mi.BSDFContext(), lit, lit.to_local(-from_laser), active)
+        active &= dr.any(weight > 0)
+        active &= ~built.scene.ray_test(connection_segment(built, hit, from_laser, lit), coherent=False, active=active)
+        return Reflection(direction, distance, weight / dr.square(distance), active)
+
+    @dr.syntax
+    def _met(
+        self,
+        built: BuiltScene,
+        number: mi.UInt32,
+        si: mi.SurfaceInteraction3f,
+        direction: mi.Vector3f,
+        distance: mi.Float,
+        normal: mi.Normal3f,
+        active: mi.Bool,
+    ) -> tuple[mi.SurfaceInteraction3f, mi.Bool]:
+        """Return the facet of a mirror in a direction and at a distance from points, and whether they see one there.
+
+        Rays slip through between triangles: those that meet no facet are sent beside the point, too.
+        """
+        origin, frame = offset_origin(built, si, direction), mi.Frame3f(normal)
+        nudge = NUDGE * (1 + dr.max(dr.abs(si.p)) + distance)
+        ray, facet = mi.Ray3f(origin, direction), dr.zeros(mi.PreliminaryIntersection3f)
+        is_met, tried = mi.Bool(False), mi.UInt32(0)
+        while dr.hint(
+            active & ~is_met & (tried < TRIES),
+            exclude=[self, built, number, origin, direction, distance, frame, nudge],
+        ):
+            sine, cosine = dr.sincos(mi.Float(tried))
+            beside = dr.select(tried == 0, 0, nudge) * (cosine * frame.s + sine * frame.t)
+            ray.d = dr.normalize(direction * distance + beside)
+            facet = built.scene.ray_intersect_preliminary(ray, coherent=False, active=active & ~is_met)
+            is_met = self.number_at(facet, active) == number
+            tried += 1
+        active &= is_met
+        return facet.compute_surface_interaction(ray, mi.RayFlags.All, active), active
+
+
+@dataclass(frozen=True, eq=False)
+class Reflection:
+    """Connection of a point to a laser point by way of a mirror."""
+
+    direction: mi.Vector3f  # from the point to the mirror
+    distance: mi.Float  # by way of the mirror [engine units]
+    value: mi.Spectrum  # radiance from the mirror per J, times the solid angle of the laser's image per area of it
+    active: mi.Bool  # whether nothing hides it
+
+
+def has_flat_mirrors(shape: mi.Shape) -> bool:
+    """Return whether the facets of a shape are flat and have a delta reflection lobe about their normals."""
+    is_flat = not shape.has_vertex_normals() if shape.is_mesh() else shape.class_name() in FLAT_PLUGINS
+    return is_flat and any(delta_lobes(shape.bsdf()))
+
+
+def delta_lobes(bsdf: mi.BSDF) -> tuple[int, int]:
+    """Return bits of the components that are delta reflection about the shading normal, on the front and on the back.
+
+    Sampling a component by itself has the lobe's own weight as its result, in BSDFs that hold no other, in blends of
+    these, and in ``twosided``, where a component belongs to one side. Not in masks; bump maps turn the normal.
+    """
+    parts = [part for part, (holder, _) in mi.traverse(bsdf).hierarchy.items() if holder is bsdf]
+    parts = [part for part in parts if isinstance(part, mi.BSDF)]
+    if not parts:
+        is_mirror = (bool(bsdf.flags(k) & mi.BSDFFlags.DeltaReflection) for k in range(bsdf.component_count()))
+        own = sum(1 << k for k, mirrors in enumerate(is_mirror) if mirrors)
+        return own, own
+    front, back = delta_lobes(parts[0])
+    if bsdf.class_name() == "TwoSidedBRDF":  # its back is the front of a BSDF
+        return front, delta_lobes(parts[1])[0] << parts[0].component_count() if len(parts) > 1 else front
+    if bsdf.class_name() != "BlendBSDF":
+        return 0, 0
+    shift = parts[0].component_count()
+    other = delta_lobes(parts[1])
+    return front | other[0] << shift, back | other[1] << shift
+
+
+def _facets(built: BuiltScene, shape: mi.Shape) -> tuple[Float64, NDArray[np.uint32]]:
+    """Return triangles (n, 3, 3) of a shape, and its facet that each belongs to, as rays number them.
+
+    Of a mesh those that some point of the wall may see; of a rectangle or disk two that cover it.
+    """
+    if shape.is_mesh():
+        return facing_triangles(built, shape)
+    to_world = np.array(mi.traverse(shape)["to_world"].matrix, dtype=np.float64).reshape(4, 4)
+    square = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]) @ to_world[:3, :3].T + to_world[:3, 3]
+    return square[[[0, 1, 2], [0, 2, 3]]], np.zeros(2, np.uint32)
+
+
+def _affine(row: mi.Vector4f, point: mi.Point3f) -> mi.Float:
+    return dr.fma(row.x, point.x, dr.fma(row.y, point.y, dr.fma(row.z, point.z, row.w)))
+
+
+def _mirrors_of(triangles: Float64) -> tuple[NDArray[np.intp], Float64]:
+    """Return the mirror (n,) of each triangle (n, 3, 3), and a triangle (m, 3, 3) around each mirror, in its plane."""
+    if not len(triangles):
+        return np.zeros(0, np.intp), triangles
+    areas = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+    normals = areas / np.linalg.norm(areas, axis=1, keepdims=True)
+    _, vertex = np.unique(triangles.reshape(-1, 3), axis=0, return_inverse=True)
+    edges = np.sort(vertex.reshape(-1, 3)[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+    order = np.lexsort(edges.T)
+    same = (edges[order][1:] == edges[order][:-1]).all(axis=1)
+    one, other = order[:-1][same] // 3, order[1:][same] // 3
+    turned = np.linalg.norm(normals[one] - normals[other], axis=1)
+    one, other = one[turned < COPLANAR], other[turned < COPLANAR]
+    links = sparse.coo_matrix((np.ones(len(one)), (one, other)), shape=(len(triangles), len(triangles)))
+    n_mirrors, mirror = sparse.csgraph.connected_components(links, directed=False)
+    sizes = np.bincount(mirror, minlength=n_mirrors)
+    around = np.zeros((n_mirrors, 3, 3))
+    around[mirror] = triangles  # of those with several facets replaced below
+    for number in np.flatnonzero(sizes > 1):
+        around[number] = _triangle_around(triangles[mirror == number], areas[mirror == number])
+    return mirror, around
+
+
+def _triangle_around(triangles: Float64, areas: Float64) -> Float64:
+    """Return a triangle (3, 3) around triangles in a plane: half of it is their rectangle, along an edge of theirs."""
+    normal, weights = areas.sum(axis=0), np.linalg.norm(areas, axis=1)
+    normal /= np.linalg.norm(normal)
+    middle = np.average(triangles.mean(axis=1), axis=0, weights=weights)
+    along = triangles[0, 1] - triangles[0, 0]
+    along -= (along @ normal) * normal
+    along /= np.linalg.norm(along)
+    across = np.cross(normal, along)
+    places = (triangles.reshape(-1, 3) - middle) @ np.stack([along, across], axis=1)
+    low, size = places.min(axis=0), np.ptp(places, axis=0)
+    corner = middle + low[0] * along + low[1] * across
+    return np.stack([corner, corner + 2 * size[0] * along, corner + 2 * size[1] * across])
+
+
+def _packed(triangles: Float64) -> Float64:
+    """Return planes and coordinates (n, 3, 4) of the triangles (n, 3, 3) around mirrors, with margins."""
+    corner, edges = triangles[:, 0], triangles[:, 1:] - triangles[:, :1]
+    normals = np.cross(edges[:, 0], edges[:, 1])
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    dual = np.swapaxes(np.linalg.pinv(edges), 1, 2)  # (n, 2, 3): d_i . e_j = 1 where i = j, else 0
+    reach = 1 + np.abs(triangles).max(axis=(1, 2), initial=0.0)
+    steepest = np.linalg.norm(np.concatenate([dual, dual.sum(axis=1, keepdims=True)], axis=1), axis=2)
+    margins = ROUNDING * reach[:, None] * steepest  # of both coordinates, and of their sum
+    scale = 1 + margins.sum(axis=1)
+    rows = np.empty((len(triangles), ROWS, 4))
+    rows[:, 0, :3], rows[:, 0, 3] = normals, -np.einsum("nx,nx->n", normals, corner)
+    rows[:, 1:, :3] = dual / scale[:, None, None]
+    rows[:, 1:, 3] = (margins[:, :2] - np.einsum("nkx,nx->nk", dual, corner)) / scale[:, None]
+    return rows

@@ -1,0 +1,172 @@
+"""Flat mirrors: the laser's images in them, against a closed form and sums over images by numpy."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from support.image_sums import image_sum
+from support.rendering import Scene, flat_wall
+from support.varied_scenes import Stage, plate
+from support.wall_meshes import flat, sheet, wavy, write_uv_ply
+
+Array = NDArray[np.float64]
+MIRROR: Scene = {"type": "conductor"}
+GREY: Scene = {"type": "diffuse", "reflectance": 0.7}
+SCREEN = plate((-0.3, 0.2, 0.4), (0.2, 0.1, -1.0), (0.3, 0.5), 0.0)
+TILTED = ((0.15, -0.05, 0.9), (0.1, 0.2, -1.0), (1.1, 0.8))
+# float32 coordinates of size 1 lie within 6e-8: a term is good to a few times that, a sum of squares to less
+ROUNDING = 2e-6
+
+
+def third(stage: Stage) -> Array:
+    """Return H of the third bounce (laser, sensor, bin), which the engine states to be exact."""
+    from nlosrender.engine.interface import Budget
+
+    result = stage.engine.render(stage.batch, stage.engine.calibrate(Budget(target_error=0.1)))
+    assert not result.variance.any()
+    return np.asarray(result.mean[0, stage.bounces.slot(3)])
+
+
+def triangles(stage: Stage, shape: int) -> Array:
+    """Return the triangles of a hidden shape [m]."""
+    from nlosrender.engine.launch.facing_triangles import triangles_of
+
+    built = stage.engine.built
+    return triangles_of(built.hidden_shapes[shape]) * built.metres_per_engine_unit
+
+
+def expected(stage: Stage, screens: int = 1) -> Array:
+    """Return the sum over images in the first hidden shape, the last ``screens`` shapes before it."""
+    before = [np.zeros((0, 3, 3)), *(triangles(stage, 1 + k) for k in range(screens))]
+    return image_sum(triangles(stage, 0), np.concatenate(before), stage.engine.capture, stage.engine.time_axis)
+
+
+@pytest.mark.parametrize("engine", ["path", "virtual_lights"])
+@pytest.mark.parametrize("scan", ["single", "confocal", "exhaustive"])
+def test_a_mirror_mesh_sends_the_light_of_its_images(scan: str, engine: str, tmp_path: Path) -> None:
+    """Every facet has an image of every laser point, where nothing hides the way to and fro; legs are counted."""
+    name = write_uv_ply(tmp_path / "mirror.ply", *sheet(wavy(1.6, 1.2, 0.05), 9, 7))
+    mirror = {"type": "mesh", "filename": name, "translate": [0, 0, 0.9], "normals": "flat"}
+    mirror |= {"bsdf": {"type": "twosided", "bsdf": MIRROR}}
+    sensors = (7, 5) if scan == "exhaustive" else (17, 13)
+    capture = {"account_first_and_last_bounces": True}
+    settings: dict[str, Any] = {"bins": (2.0, 0.03, 110), "spp": None, "target_error": 0.1, "engine": engine}
+    stage = Stage.of(flat_wall(mirror, SCREEN, scan=scan, sensors=sensors, capture=capture, **settings), tmp_path)
+    assert stage.engine.name == engine
+    light = expected(stage)
+    assert (light > 0).sum() > 30
+    assert np.linalg.norm(third(stage) - light) < ROUNDING * np.linalg.norm(light)
+
+
+@pytest.mark.parametrize("inside", [False, True])
+def test_round_walls_see_images(inside: bool) -> None:
+    """Cosines are those of the wall at either point; a wall that sees itself keeps its second bounce apart."""
+    at = ((0.1, 0.05, -0.3 if inside else 1.6), (0.1, 0.2, -1.0), (1.1, 0.8))
+    grid = {"nx": 6, "ny": 5, "width": 1.8, "height": 0.8}  # all of it is seen from the default place of the camera
+    capture = {"sensor_grid": grid, "laser_point": [0.22, -0.05]}
+    config = flat_wall(plate(*at, {"type": "twosided", "bsdf": MIRROR}), capture=capture, bins=(0.0, 0.02, 400))
+    wall = {"type": "sphere", "radius": 0.8, "inside": inside, "bsdf": {"type": "diffuse", "reflectance": 1.0}}
+    config["scene"]["relay_wall"] = wall
+    stage = Stage.of(config)
+    exact = dict(stage.engine.device.exact_light(stage.batch))
+    assert (2 in exact and exact[2].any()) == inside
+    light = expected(stage, 0)
+    assert (light > 0).sum() > 20
+    assert np.linalg.norm(exact[3][0, 0, ..., :-1] - light) < ROUNDING * np.linalg.norm(light)
+
+
+def test_points_on_edges_count_once(tmp_path: Path) -> None:
+    """A plate cut into triangles is one mirror, wherever its edges are: image of the laser, once for every point.
+
+    Points of reflection are in the middle between laser and sensor point: on vertices, edges and diagonals here.
+    """
+    name = write_uv_ply(tmp_path / "plate.ply", *sheet(flat(1.0, 0.8), 10, 8))
+    mesh = {"type": "mesh", "filename": name, "translate": [0, 0, 0.9], "rotate_deg": [180, 0, 0], "bsdf": MIRROR}
+    capture = {"laser_point": [0, 0], "sensor_grid": {"nx": 17, "ny": 13, "width": 1.7, "height": 1.3}}
+    whole = plate((0, 0, 0.9), (0, 0, -1), (1.0, 0.8), MIRROR)
+    cut, one = (third(Stage.of(flat_wall(item, capture=capture), tmp_path)) for item in (mesh, whole))
+    assert (one.sum(axis=-1) > 0).all()
+    np.testing.assert_allclose(cut, one, rtol=ROUNDING)
+
+
+def fresnel(cosine: Array, eta: float = 1.9) -> Array:
+    """Return the reflectance of a smooth dielectric surface for unpolarised light."""
+    inner = np.sqrt(1 - (1 - cosine**2) / eta**2)
+    s, p = (cosine - eta * inner) / (cosine + eta * inner), (eta * cosine - inner) / (eta * cosine + inner)
+    return (s**2 + p**2) / 2
+
+
+LOBES: dict[str, tuple[Scene, Any]] = {
+    "half a mirror": ({"type": "blendbsdf", "weight": 0.25, "a": GREY, "b": MIRROR}, lambda cosine: 0.25),
+    "a mirror on the back": ({"type": "twosided", "a": GREY, "b": MIRROR}, lambda cosine: 0.0),
+    "a mirror on the front": ({"type": "twosided", "a": MIRROR, "b": GREY}, lambda cosine: 1.0),
+    "a coat": ({"type": "plastic", "int_ior": 1.9, "ext_ior": 1.0}, fresnel),
+    "glass": ({"type": "dielectric", "int_ior": 1.9, "ext_ior": 1.0}, fresnel),
+    "a blend of coats": (
+        {
+            "type": "blendbsdf",
+            "weight": 0.25,
+            "a": {"type": "twosided", "bsdf": {"type": "plastic", "int_ior": 1.9, "ext_ior": 1.0}},
+            "b": {"type": "conductor", "specular_reflectance": 0.4},
+        },
+        lambda cosine: 0.75 * fresnel(cosine) + 0.25 * 0.4,
+    ),
+    "matt": (GREY, lambda cosine: 0.0),
+}
+
+
+@pytest.mark.parametrize("kind", LOBES)
+def test_a_lobe_has_its_weight(kind: str) -> None:
+    """The light of an image is that in a perfect mirror times the weight of the delta lobe: Fresnel's, a blend's."""
+    bsdf, weight = LOBES[kind]
+    stages = [Stage.of(flat_wall(plate(*TILTED, kind_of), sensors=(9, 7), spp=16)) for kind_of in (MIRROR, bsdf)]
+    exact = [dict(stage.engine.device.exact_light(stage.batch)) for stage in stages]
+    perfect, own = (light.get(3, 0 * exact[0][3])[..., :-1] for light in exact)
+    rows = perfect[0, 0, 0].sum(axis=-1) > 0
+    assert rows.any()
+    built, capture = stages[0].engine.built, stages[0].engine.capture
+    normal = np.cross(*np.diff(triangles(stages[0], 0)[0], axis=0))
+    normal /= np.linalg.norm(normal)
+    corner = triangles(stages[0], 0)[0, 0]
+    laser, sensors = capture.laser_grid.positions.reshape(-1, 3), capture.sensor_grid.positions.reshape(-1, 3)[rows]
+    to_image = laser - 2 * ((laser - corner) @ normal)[:, None] * normal - sensors
+    cosine = np.abs(to_image @ normal) / np.linalg.norm(to_image, axis=1)
+    assert built.n_triangles == 2
+    lit = own[0, 0, 0][rows].sum(axis=-1)
+    # Mitsuba's Fresnel terms in float32 cancel to a few 1e-6 of their value
+    np.testing.assert_allclose(lit, perfect[0, 0, 0][rows].sum(axis=-1) * weight(cosine), rtol=2e-5)
+
+
+def test_pictures_are_read_at_the_point_of_reflection() -> None:
+    """A mirror of two reflectances, left and right, sends each point the light of one: its point of reflection's."""
+    halves = {"type": "checkerboard", "color0": 0.2, "color1": 0.8, "to_uv": [{"scale": [1.0, 0.5, 1.0]}]}
+    size = {"sensors": (8, 7), "capture": {"laser_point": [0.0, 0.0]}}
+    at = ((0.0, 0.0, 0.9), (0.0, 0.0, -1.0), (1.2, 1.0))
+    kinds = (MIRROR, {"type": "conductor", "specular_reflectance": halves})
+    plain, board = (third(Stage.of(flat_wall(plate(*at, kind), **size)))[0].sum(axis=-1) for kind in kinds)
+    shares = (board / plain).reshape(7, 8)
+    one, other = (0.2, 0.8) if shares[0, 0] < 0.5 else (0.8, 0.2)
+    np.testing.assert_allclose(shares[:, :4], one, rtol=1e-6)
+    np.testing.assert_allclose(shares[:, 4:], other, rtol=1e-6)
+
+
+def test_half_matt_half_mirror_is_both() -> None:
+    """The third bounce of a blend is its weighted parts, in either engine: no more, no less."""
+    from nlosrender.engine.interface import Budget
+
+    blend = {"type": "blendbsdf", "weight": 0.5, "a": GREY, "b": MIRROR}
+    energies = {}
+    for engine in ("path", "virtual_lights"):
+        for name, bsdf in (("blend", blend), ("matt", GREY), ("mirror", MIRROR)):
+            stage = Stage.of(flat_wall(plate(*TILTED, bsdf), engine=engine, spp=None, target_error=0.01))
+            result = stage.engine.render(stage.batch, stage.engine.calibrate(Budget(target_error=0.01)))
+            energies[engine, name] = result.mean.sum()
+    mean = (energies["path", "matt"] + energies["virtual_lights", "matt"]) / 2
+    for engine in ("path", "virtual_lights"):
+        parts = (mean + energies[engine, "mirror"]) / 2
+        assert math.isclose(energies[engine, "blend"], parts, rel_tol=0.01)
