@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from support.agreement import assert_agrees
+from support.agreement import assert_agrees, t_limit
 from support.quadrature import (
     Array,
     Cells,
@@ -21,7 +21,7 @@ from support.quadrature import (
     unit,
 )
 from support.rendering import flat_wall, render
-from support.views import see, view_config
+from support.views import REPLICAS, see, view_config
 
 from nlosrender.engine.backend.start import start_backend
 
@@ -277,3 +277,15 @@ def test_a_ball_lit_from_the_camera_is_a_flat_disc(tmp_path: Path) -> None:
     assert np.ptp(cosine) > 0.3
     # 4096 samples of radiances within 10 % in a pixel deviate by 0.1 / sqrt(12 x 4096) = 4.5e-4; the expansion: 1e-5
     np.testing.assert_allclose(picture, expected * np.array([1, 1, 2])[:, None, None], rtol=2.3e-3)
+
+
+def test_a_box_of_shining_retroreflectors_keeps_its_light() -> None:
+    """Within walls of radiance 1 every bounce k has the radiance (albedo + diffuse)^k, in whatever direction."""
+    shape = {"type": "cube", "flip_normals": True, "to_world": [{"scale": [5, 4, 6]}]}
+    walls = {"type": "mitsuba", "shape": shape, "radiance": 1.0, "bsdf": retroreflector(5.0)}
+    view = see(view_config(emitters=[walls], max_bounces=4, bins=(0.0, 100.0, 1), spp=16384))
+    mean, variance = view.mean[0, ..., 0], view.variance[0, ..., 0]
+    expected = 0.9 ** np.arange(5)[:, None, None]
+    limit = t_limit(mean.size, REPLICAS - 1) * np.sqrt(variance) + 2e-5  # float32, and the table of h
+    assert (np.abs(mean - expected) < limit).all()
+    assert np.sqrt(variance.mean()) < 5e-3

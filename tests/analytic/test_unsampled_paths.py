@@ -52,6 +52,7 @@ SPREAD = {
     "a blend of weight 0": ({"type": "blendbsdf", "weight": 0.0, "a": GREY, "b": MIRROR}, set()),
     "rough metal": ({"type": "roughconductor", "alpha": 0.1}, set()),
     "rough plastic": ({"type": "roughplastic"}, set()),
+    "retroreflector": ({"type": "retroreflector", "width": 0.1, "albedo": 0.9}, set()),
     "rough glass": ({"type": "roughdielectric"}, set()),
     "Lambertian": (GREY, set()),
 }

@@ -28,6 +28,7 @@ BSDFS: tuple[dict[str, Any], ...] = (
     {"type": "roughconductor", "alpha": 0.2, "distribution": "ggx"},
     {"type": "plastic", "diffuse_reflectance": 0.5, "int_ior": 1.5},
     {"type": "principled", "base_color": 0.5, "roughness": 0.4, "metallic": 0.2},
+    {"type": "retroreflector", "width": 0.5, "albedo": 0.6, "diffuse": 0.3},
     {"type": "mask", "opacity": 0.5, "inner": {"type": "diffuse"}},
     {"type": "blendbsdf", "weight": 0.3, "a": {"type": "diffuse"}, "b": {"type": "conductor"}},
     {"type": "diffuse", "reflectance": {"type": "checkerboard", "to_uv": [{"scale": 4}]}},

@@ -15,6 +15,8 @@ where half of D lies below the surface, h is finite. Division by max(cos_i, cos_
 incidence, and by sqrt(cos_i cos_o) makes light there without bound. (1) is the scaling of a symmetric positive matrix
 (Sinkhorn 1964), which has one solution. Integrated around the normal, with a and b the elevations of wi and wo, D is
 k exp(-k (1 - cos(a - b))) i0e(k cos a cos b) / (1 - exp(-2 k)), i0e(x) = exp(-x) I0(x).
+
+Patches need not be smaller than the lobe: docs/retroreflectors.md.
 """
 
 from __future__ import annotations
