@@ -14,12 +14,12 @@ FOLDER = Path(__file__).parent
 BLUE, RED, GREY = "#2166ac", "#b2182b", "#777777"
 
 # virtual-lights.md, 6.4: patches and relative L2 errors of the two scenes there
-PLATE = [(288, 9.2e-2), (512, 5.57e-2), (968, 3.02e-2), (1800, 1.61e-2), (3528, 8.24e-3), (7200, 4.24e-3)]
-PLATE += [(14112, 2.23e-3), (27848, 1.21e-3), (55112, 6.99e-4)]
-BLOCKER = [(360, 1.36e-1), (640, 8.96e-2), (1210, 5.24e-2), (2250, 2.84e-2), (4496, 1.30e-2), (9000, 7.03e-3)]
-BLOCKER += [(17810, 3.34e-3), (35048, 1.67e-3), (69562, 7.47e-4)]
-NOISE = [(360, 7.18e-3), (640, 5.13e-3), (1210, 3.96e-3), (2250, 2.97e-3), (4496, 1.80e-3), (9000, 1.28e-3)]
-NOISE += [(17810, 8.17e-4), (35048, 5.47e-4), (69562, 3.12e-4), (138312, 2.22e-4), (278248, 1.29e-4)]
+PLATE = [(288, 3.31e-2), (512, 1.60e-2), (968, 8.32e-3), (1800, 4.11e-3), (3528, 1.91e-3), (7200, 8.20e-4)]
+PLATE += [(14112, 3.3e-4), (27848, 1.4e-4), (55112, 7e-5)]
+BLOCKER = [(360, 4.83e-2), (640, 2.37e-2), (1210, 2.42e-2), (2312, 1.66e-2), (4496, 1.09e-2), (9122, 5.91e-3)]
+BLOCKER += [(17984, 3.59e-3), (35536, 2.36e-3), (70600, 1.49e-3)]
+NOISE = [(360, 1.95e-2), (640, 1.13e-2), (1210, 1.25e-2), (2312, 9.25e-3), (4496, 5.95e-3), (9122, 3.90e-3)]
+NOISE += [(17984, 2.45e-3), (35536, 1.73e-3), (70600, 1.18e-3)]
 
 
 def save(figure: Figure, name: str) -> None:
@@ -141,7 +141,7 @@ def draw_error() -> None:
     curves["noise of its shadow rays"] = (NOISE, GREY, "^")
     for label, (points, colour, marker) in curves.items():
         axes.loglog(*zip(*points, strict=True), marker=marker, color=colour, label=label)
-    for power, first, last, start in ((-1, 4e3, 1.2e5, 4.5e-3), (-0.5, 350, 6e3, 5e-3), (-0.75, 2e4, 3e5, 5e-4)):
+    for power, first, last, start in ((-1.25, 500, 2e4, 1.2e-2), (-0.5, 350, 6e3, 1.5e-2), (-0.75, 1e4, 8e4, 6.5e-3)):
         n = np.geomspace(first, last, 2)
         axes.loglog(n, start * (n / first) ** power, ":", color="black", linewidth=1.1)
         axes.annotate(f"$N^{{{power:g}}}$", (last, start * (last / first) ** power), fontsize=9)

@@ -13,7 +13,7 @@ from nlosrender.engine.launch.device_capture import DeviceCapture, RenderOptions
 from nlosrender.engine.line_of_sight.engine import LineOfSightEngine
 from nlosrender.engine.path.engine import PathEngine
 from nlosrender.engine.virtual_lights.elements.tessellator import can_tessellate, wall_sees_itself
-from nlosrender.engine.virtual_lights.engine import VirtualLightEngine, is_lambertian
+from nlosrender.engine.virtual_lights.engine import VirtualLightEngine
 from nlosrender.scene.build import BuiltScene
 from nlosrender.scene.view import BuiltView
 
@@ -32,8 +32,8 @@ def choose_engine(
 ) -> Engine:
     """Return the engine for a scene, with its reason in plain words (backend started).
 
-    ``auto`` chooses virtual lights for Lambertian scenes that they support; asked for by name, they also render rough
-    surfaces. The path engine renders all others.
+    ``auto`` chooses virtual lights for scenes that they support: diffuse and rough surfaces. The path engine renders
+    all others.
 
     Parameters
     ----------
@@ -45,8 +45,6 @@ def choose_engine(
     if isinstance(built, BuiltView):
         return LineOfSightEngine(built, capture, time_axis, options)
     reason = "asked for" if render.engine == "path" else _obstacle(render, capture, built)
-    if reason is None and render.engine == "auto" and not all(is_lambertian(s.bsdf()) for s in built.hidden_shapes):
-        reason = "some hidden surfaces are not Lambertian"
     if reason is None and render.engine == "auto" and wall_sees_itself(built) and built.wall_shape.is_mesh():
         reason = "the relay wall is a mesh that sees itself: the edges between its triangles take very many patches"
     device = DeviceCapture(built, capture, time_axis, options)

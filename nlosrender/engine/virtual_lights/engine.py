@@ -79,7 +79,8 @@ class VirtualLightEngine:
         if self.has_further_bounces and self.settings.is_diffuse:
             masks = self.third.masks if self.settings.needs_visibility else None
             self.further = VplBounces(device, self.tessellator, masks)
-        self.reason = f"Lambertian surfaces before a {'planar' if built.wall.is_planar else 'curved'} wall"
+        surfaces = "Lambertian" if self.settings.is_diffuse else "diffuse and rough"
+        self.reason = f"{surfaces} surfaces before a {'planar' if built.wall.is_planar else 'curved'} wall"
         self._calibrated: dict[Budget, Budget] = {}
 
     def set_up(self) -> None:

@@ -26,7 +26,6 @@ class Gathered:
     values: NDArray[np.float64]
     n_patches: int
     patch_scale: float
-    clustered_share: float  # of the area
 
     @property
     def squares(self) -> float:
@@ -43,15 +42,13 @@ def estimated_error(coarse: Gathered, fine: Gathered, known_squares: float = 0.0
 def difference_divisor(coarse: Gathered, fine: Gathered) -> float:
     """Return the divisor that turns the difference of two resolutions into the error of the finer one.
 
-    The error of patches cut from the same surfaces falls as 1 / n: the difference is (r - 1) times the finer's error,
-    with r the ratio of the numbers of patches (Richardson 1911). The error of random shadow rays falls as n^(-3/4) and
-    is independent: sqrt(r^1.5 + 1). So is that of clusters, whose boxes lie elsewhere at every scale; it falls at least
-    as fast, with the boxes' size: where small triangles cease to be merged there may be many more patches.
+    The error of random shadow rays is independent at the two, and falls as n^(-1/2) to n^(-3/4): at least sqrt(r + 1),
+    with r the ratio of the numbers of patches, or of the scales' squares where small triangles cease to be merged.
+    What is left of the discretisation falls faster than 1 / n: at least r - 1, which is no less from r = 3 on
+    (docs/virtual-lights.md, 6.2).
     """
     ratio = min(fine.n_patches / coarse.n_patches, (coarse.patch_scale / fine.patch_scale) ** 2)
-    ratio = max(ratio, 1.0 + 1e-9)
-    independent = math.sqrt(ratio**1.5 + 1)
-    return (1 - fine.clustered_share) * min(ratio - 1, independent) + fine.clustered_share * independent
+    return math.sqrt(max(ratio, 1.0) + 1)
 
 
 def finer_scale(tessellator: Tessellator, patch_scale: float, factor: float) -> float:

@@ -102,10 +102,8 @@ class ThirdBounce:
         else:
             values = self._sums(batch, patch_scale, patches, passes.stage("sums")).on_host()
         passes.finish(Snapshot({"values": values}))
-        # of the shared ones: how a capture is cut must not show in the error it states
-        clustered = float(patches.areas[patches.is_cluster].sum() / max(patches.areas.sum(), 1e-300))
         count = len(patches) if self.tessellator.regions is None else self.tessellator.count(patch_scale)
-        return Gathered(values, max(count, 1), patch_scale, clustered)  # 1: nothing may face the wall
+        return Gathered(values, max(count, 1), patch_scale)  # 1: nothing may face the wall
 
     @property
     def tuning(self) -> VirtualLightTuning:
@@ -211,7 +209,9 @@ class ThirdBounce:
         self, params: LaunchParams, shape: HistogramShape, patches: Patches, places: PatchRegions, wall_tiles: WallTiles
     ) -> LitPatches:
         is_near = self.tessellator.nearest < self.tuning.near_distance
-        on_device = upload_patches(self.device.built, patches, places, self.device.options.seed, is_near, self.tuning)
+        on_device = upload_patches(
+            self.device.built, patches, places, self.device.options.seed, is_near, self.settings.is_diffuse, self.tuning
+        )
         return light_patches(self.settings, params, on_device, MaskQuery(self.masks, wall_tiles), shape.lasers)
 
     def _wall_tiles(self, batch: Batch | Pilot, regions: list[int] | None = None) -> WallTiles:

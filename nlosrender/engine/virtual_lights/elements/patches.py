@@ -31,8 +31,7 @@ class SurfacePoints(StructOfArrays):
 class Patches(StructOfArrays):
     """Triangular patches, and parallelograms of clusters [engine units].
 
-    ``areas``, ``centres`` and ``normals`` are those of the true surface where it is curved; ``corners`` are raised to
-    its mean height over them.
+    ``areas``, ``centres`` and ``normals`` are those of the true surface where it is curved; its corners lie on it.
     """
 
     corners: Float64  # (n, 3, 3) of clusters three successive ones of a parallelogram's four
@@ -56,6 +55,13 @@ class Patches(StructOfArrays):
     def points(self, positions: Float64, barycentric: Float64) -> SurfacePoints:
         """Return one point per patch; parameters (n, 3) and (n, 2)."""
         return SurfacePoints(positions, self.normals, self.shapes, self.primitives, barycentric)
+
+    def mixed(self, weights: Float64) -> SurfacePoints:
+        """Return one point per patch, its corners' mean with ``weights`` (n, 3)."""
+        position, barycentric = (
+            np.einsum("nk,nkx->nx", weights, values) for values in (self.corners, self.corner_barycentric)
+        )
+        return self.points(position, barycentric)
 
     @classmethod
     def triangles(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import combinations
 from typing import TYPE_CHECKING
 
@@ -54,19 +54,11 @@ class RoundShape:
         n_around, n_along = self._rings(across, along)
         return 2 * n_around * n_along
 
-    def patches(self, across: float, along: float, *, raised: bool = True) -> Patches:
-        """Return patches of sizes up to ``across``, and ``along`` the axis of a cylinder.
-
-        ``raised`` to the mean height of the surface over them; otherwise their corners lie on it.
-        """
+    def patches(self, across: float, along: float) -> Patches:
+        """Return patches of sizes up to ``across``, and ``along`` the axis of a cylinder; their corners lie on it."""
         if self.axis.any():
-            patches, height = _cylinder(self, *self._rings(across, along))
-        else:
-            patches, height = _sphere(self, self._splits(across))
-        if not raised:
-            return patches
-        outward = patches.normals * (np.sign(self.radius) * height)[:, None]
-        return replace(patches, corners=patches.corners + outward[:, None])
+            return _cylinder(self, *self._rings(across, along))
+        return _sphere(self, self._splits(across))
 
     def _splits(self, allowed: float) -> int:
         return int(np.ceil(ICOSAHEDRON_EDGE * abs(self.radius) / allowed))
@@ -110,16 +102,8 @@ def onto_round_shapes(positions: Float64, normals: Float64, rows: Float64) -> tu
     return positions, normals, stretch
 
 
-def _sphere(shape: RoundShape, n: int) -> tuple[Patches, Float64]:
-    """Cut a sphere into 20 n^2 spherical triangles: an icosahedron's faces, cut and projected.
-
-    Returns
-    -------
-    tuple
-        Patches; and the mean height (20 n^2,) of the sphere over the plane through their corners: (a^2 + b^2 + c^2) /
-        (24 R) over a triangle with edges a, b, c, the mean power of its points over 2 R. With it their mean delay is
-        right.
-    """
+def _sphere(shape: RoundShape, n: int) -> Patches:
+    """Cut a sphere into 20 n^2 spherical triangles: an icosahedron's faces, cut and projected."""
     flat = np.einsum("pkb,tbx->tpkx", split_weights(n), _icosahedron()).reshape(-1, 3, 3)
     unit = flat / np.linalg.norm(flat, axis=-1, keepdims=True)
     a, b, c = unit[:, 0], unit[:, 1], unit[:, 2]
@@ -130,25 +114,17 @@ def _sphere(shape: RoundShape, n: int) -> tuple[Patches, Float64]:
     direction = unit.mean(axis=1)
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
     centre, radius = shape.centre, abs(shape.radius)
-    patches = Patches.triangles(
+    return Patches.triangles(
         centre + radius * unit,
         radius**2 * solid_angle,
         centre + radius * direction,
         np.sign(shape.radius) * direction,
         np.full(len(unit), shape.index, np.uint32),
     )
-    squares = np.square(unit - np.roll(unit, 1, axis=1)).sum(axis=(1, 2))
-    return patches, radius * squares / 24
 
 
-def _cylinder(shape: RoundShape, around: int, along: int) -> tuple[Patches, Float64]:
-    """Cut a cylinder into ``around`` times ``along`` rectangles of two patches each.
-
-    Returns
-    -------
-    tuple
-        As of ``_sphere``: a chord s lies s^2 / (12 R) below its arc on average.
-    """
+def _cylinder(shape: RoundShape, around: int, along: int) -> Patches:
+    """Cut a cylinder into ``around`` times ``along`` rectangles of two patches each."""
     length = float(np.linalg.norm(shape.axis))
     axis, radius = shape.axis / length, abs(shape.radius)
     first = np.cross(axis, np.eye(3)[np.abs(axis).argmin()])
@@ -169,14 +145,13 @@ def _cylinder(shape: RoundShape, around: int, along: int) -> tuple[Patches, Floa
     radial = centres - shape.centre
     radial -= (radial @ axis)[:, None] * axis
     count = len(corners)
-    patches = Patches.triangles(
+    return Patches.triangles(
         corners,
         np.full(count, 2 * np.pi * radius * length / count),
         centres,
         np.sign(shape.radius) * radial / radius,
         np.full(count, shape.index, np.uint32),
     )
-    return patches, np.full(count, radius * (2 * np.sin(np.pi / around)) ** 2 / 12)
 
 
 def _icosahedron() -> Float64:

@@ -159,7 +159,7 @@ class Tessellator:
 
     def round_elements(self) -> list[tuple[RoundShape, Patches]]:
         """Return every round shape, and its elements, whose corners lie on it."""
-        return [(shape, shape.patches(*self._allowed_on(shape, 1.0), raised=False)) for shape in self.round_shapes]
+        return [(shape, shape.patches(*self._allowed_on(shape, 1.0))) for shape in self.round_shapes]
 
     def _allowed_on(self, shape: RoundShape, patch_scale: float) -> tuple[float, float]:
         """Return the size of patches across a round shape, and along the axis of a cylinder, which is straight."""

@@ -9,6 +9,7 @@ cumulative distribution function (CDF), the part of the area with a delay below 
     1 - (t3 - t)^2 / ((t3 - t2) s)             for t2 <= t <= t3
 
 with s = t3 + t2 - t1 - t0, and a bin's fraction is the difference of the CDF at its edges: docs/virtual-lights.md, 2.
+Of a triangle whose light is not even but linear, the squares get factors that are linear in the delay.
 Cf. Iseringhausen & Hullin 2020; Tsai et al. 2019.
 """
 
@@ -34,12 +35,32 @@ class Delays:
     t1: mi.Float
     t2: mi.Float | None  # None: no patch is a parallelogram, t2 = t1
     t3: mi.Float
+    light: mi.Vector3f | None = None  # per area, at t0, t1 and t3 of triangles, mean 1; None: even over all patches
 
     @classmethod
     def of_triangle(cls, a: mi.Float, b: mi.Float, c: mi.Float) -> Delays:
         """Return the density's corners of a triangle; parameters are the delays of its corners."""
         middle = dr.maximum(dr.minimum(a, b), dr.minimum(dr.maximum(a, b), c))
         return cls(dr.minimum(a, dr.minimum(b, c)), middle, None, dr.maximum(a, dr.maximum(b, c)))
+
+    @classmethod
+    def of_lit_triangle(cls, delays: mi.Vector3f, light: mi.Vector3f) -> Delays:
+        """Return those of light that is linear over a triangle; ``light``: per area at the corners, mean 1."""
+        (a, b, c), (p, q, r) = delays, light
+        low, high = dr.minimum(a, b), dr.maximum(a, b)
+        at_low, at_high = dr.select(a > b, q, p), dr.select(a > b, p, q)
+        first, last = c < low, c > high
+        return cls(
+            t0=dr.select(first, c, low),
+            t1=dr.select(first, low, dr.select(last, high, c)),
+            t2=None,
+            t3=dr.select(last, c, high),
+            light=mi.Vector3f(
+                dr.select(first, r, at_low),
+                dr.select(first, at_low, dr.select(last, at_high, r)),
+                dr.select(last, r, at_high),
+            ),
+        )
 
     @classmethod
     def of_parallelogram(cls, a: mi.Float, b: mi.Float, c: mi.Float, d: mi.Float) -> Delays:
@@ -53,16 +74,53 @@ class Delays:
         return cls(t0, t0 + short, t0 + long, t0 + short + long)
 
     @classmethod
-    def of_either(cls, is_parallelogram: mi.Bool, delays: mi.Vector4f) -> Delays:
-        """Return those of parallelograms, elsewhere of the triangles of the first three corners."""
+    def of_patch(cls, delays: mi.Vector4f, is_parallelogram: mi.Bool | None, light: mi.Vector3f | None) -> Delays:
+        """Return those of patches with four corners, of triangles the first three.
+
+        ``is_parallelogram`` None: no patch is one; their light is even. ``light``: see ``of_lit_triangle``.
+        """
         a, b, c, d = delays
-        triangle = cls.of_triangle(a, b, c)
-        return dr.select(is_parallelogram, cls.of_parallelogram(a, b, c, d), replace(triangle, t2=triangle.t1))
+        triangle = cls.of_triangle(a, b, c) if light is None else cls.of_lit_triangle(delays.xyz, light)
+        if is_parallelogram is None:
+            return triangle
+        other = replace(cls.of_parallelogram(a, b, c, d), light=None if light is None else mi.Vector3f(1))
+        return dr.select(is_parallelogram, other, replace(triangle, t2=triangle.t1))
 
     def later(self, delay: mi.Float | int) -> Delays:
         """Return the delays that begin so much later."""
         t2 = None if self.t2 is None else self.t2 + delay
-        return Delays(self.t0 + delay, self.t1 + delay, t2, self.t3 + delay)
+        return Delays(self.t0 + delay, self.t1 + delay, t2, self.t3 + delay, self.light)
+
+
+def corner_delays(
+    point: mi.Point3f,
+    centre: mi.Point3f,
+    corners: tuple[mi.Point3f, mi.Point3f, mi.Point3f],
+    bins_per_unit: mi.Float,
+    is_parallelogram: mi.Bool | None,
+) -> mi.Vector4f:
+    """Return the delays from ``point`` to the four corners of patches, moved by one delay so that their mean is right.
+
+    Between its corners the linear delay is later than the true one. Cubature with the corners and the centre, exact for
+    quadratic functions, tells by how much on average: weights 1/12 and 3/4 over a triangle, 1/12 and 2/3 over a
+    parallelogram (docs/virtual-lights.md, 2.1).
+
+    Parameters
+    ----------
+    point, centre, corners
+        A wall point; a patch's centre, on the true surface; its corners, successive ones of a parallelogram.
+    bins_per_unit
+        Bins per engine unit.
+    is_parallelogram
+        None: no patch is one.
+    """
+    a, b, c = corners
+    delays = mi.Vector4f(*(dr.norm(end - point) * bins_per_unit for end in (a, b, c, a + (c - b))))
+    middle = dr.norm(centre - point) * bins_per_unit
+    shift = 0.75 * (middle - (delays.x + delays.y + delays.z) / 3)
+    if is_parallelogram is not None:
+        shift = dr.select(is_parallelogram, (2 / 3) * (middle - dr.mean(delays)), shift)
+    return dr.maximum(delays + shift, 0)  # of a patch around the point itself, the shift may exceed the least delay
 
 
 class _DelayCdf:
@@ -73,13 +131,22 @@ class _DelayCdf:
         t2 = t1 if delays.t2 is None else delays.t2
         self.delays = delays
         self.height = dr.rcp(dr.maximum((t3 - t0) + (t2 - t1), MIN_WIDTH))
-        self.rising = self.height * dr.rcp(dr.maximum(t1 - t0, MIN_RAMP))
-        self.falling = self.height * dr.rcp(dr.maximum(t3 - t2, MIN_RAMP))
+        rise, fall = dr.rcp(dr.maximum(t1 - t0, MIN_RAMP)), dr.rcp(dr.maximum(t3 - t2, MIN_RAMP))
+        self.rising, self.falling = self.height * rise, self.height * fall
+        if delays.light is not None:
+            early, middle, late = delays.light
+            along = (late - early) * self.height
+            self.more = (along + (middle - early) * rise) / 3
+            self.less = ((middle - late) * fall - along) / 3
 
     def __call__(self, delay: mi.Float | int) -> mi.Float:
         t0, t1, t2, t3 = self.delays.t0, self.delays.t1, self.delays.t2, self.delays.t3
-        up = dr.square(dr.maximum(delay - t0, 0)) * self.rising
-        down = 1 - dr.square(dr.maximum(t3 - delay, 0)) * self.falling
+        since, until = dr.maximum(delay - t0, 0), dr.maximum(t3 - delay, 0)
+        up, down = dr.square(since) * self.rising, dr.square(until) * self.falling
+        if self.delays.light is not None:
+            up *= self.delays.light.x + self.more * since
+            down *= self.delays.light.z + self.less * until
+        down = 1 - down
         if t2 is not None:
             down = dr.select(delay < t2, ((delay - t0) + (delay - t1)) * self.height, down)
         return dr.select(delay < t1, up, down)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import drjit as dr
@@ -102,6 +102,7 @@ class DevicePatches:
     has_clusters: bool
     areas: mi.Vector3f  # geometric normal times area
     interaction: mi.SurfaceInteraction3f  # at the centres
+    middles: list[mi.SurfaceInteraction3f]  # in the middle of the edge before each corner; none of Lambertian patches
     reflectance: mi.Spectrum  # of Lambertian patches
     member_normals: mi.Vector3f  # geometric, where shadow rays end
     offset: mi.Vector3f  # ray offset there, see ``off_the_surface``; on curved patches in the middle
@@ -137,13 +138,14 @@ def upload_patches(
     regions: PatchRegions,
     seed: int,
     is_near: bool,
+    is_diffuse: bool,
     tuning: VirtualLightTuning = DEFAULT_TUNING,
 ) -> DevicePatches:
     """Bring patches to the device, neighbours together, and evaluate their reflectance and shading frames.
 
     ``seed`` draws the points where shadow rays end: a partly hidden patch counts by its visible share, on average
     (docs/virtual-lights.md, 5.1). ``is_near``: some patch is so near to a laser or sensor point that float32 positions
-    are too coarse.
+    are too coarse. ``is_diffuse``: all are Lambertian.
     """
     patches = patches.select(np.lexsort((morton_order(patches.centres), regions.regions)))
     interaction = surface_at(built, patches.points(patches.centres, patches.barycentric))
@@ -167,6 +169,7 @@ def upload_patches(
         has_clusters=bool(patches.is_cluster.any()),
         areas=to_vectors(patches.normals * patches.areas[:, None]),
         interaction=interaction,
+        middles=[] if is_diffuse else _middles(built, patches, interaction, is_cluster > 0),
         reflectance=reflectance,
         member_normals=to_vectors(patches.member_normals),
         offset=to_vectors(offset),
@@ -192,6 +195,28 @@ def surface_at(built: BuiltScene, points: SurfacePoints) -> mi.SurfaceInteractio
     return interaction
 
 
+def _middles(
+    built: BuiltScene, patches: Patches, centre: mi.SurfaceInteraction3f, is_cluster: mi.Bool
+) -> list[mi.SurfaceInteraction3f]:
+    """Return the surface in the middle of the edge opposite each corner; of clusters ``centre``.
+
+    Where a BSDF has a picture, at random points instead, each nearest to that edge: three texels on a grid would be the
+    picture's mean or not as patches and texels happen to lie (docs/virtual-lights.md, 2.5).
+    """
+    chosen = np.flatnonzero(_of_shapes(built, patches, _has_picture))
+    rng = np.random.default_rng(len(patches))
+    random = np.stack(triangle_weights(rng.random(len(chosen)), rng.random(len(chosen))), axis=1)
+    least = random.argmin(axis=1)[:, None]
+    result = []
+    for corner in range(3):
+        weights = np.tile(0.5 - 0.5 * np.eye(3)[corner], (len(patches), 1))
+        weights[chosen] = np.take_along_axis(random, (np.arange(3) - corner + least) % 3, axis=1)
+        middle = surface_at(built, patches.mixed(weights))
+        result.append(dr.select(is_cluster, centre, middle))
+        dr.eval(result[-1])
+    return result
+
+
 def _mean_reflectance(
     built: BuiltScene, patches: Patches, reflectance: mi.Spectrum, tuning: VirtualLightTuning
 ) -> mi.Spectrum:
@@ -200,8 +225,7 @@ def _mean_reflectance(
     With that of the centre alone, ``reflectance``, a texture finer than the patches had other colours at every scale,
     and the difference of two scales, the stated error, would be noise.
     """
-    textured = np.array([_has_texture(shape.bsdf()) for shape in built.scene.shapes()])[patches.shapes]
-    chosen = np.flatnonzero(textured & ~patches.is_cluster)
+    chosen = np.flatnonzero(_of_shapes(built, patches, _has_reflectances) & ~patches.is_cluster)
     if not len(chosen):
         return reflectance
     some, random = patches.select(chosen), np.random.default_rng(len(patches))
@@ -209,16 +233,23 @@ def _mean_reflectance(
     total = mi.Spectrum(0)
     for part in parts:
         weights = np.stack(triangle_weights(random.random(len(chosen)), random.random(len(chosen))), axis=1) @ part
-        positions = np.einsum("nk,nkx->nx", weights, some.corners)
-        barycentric = np.einsum("nk,nkx->nx", weights, some.corner_barycentric)
-        total += normal_reflectance(surface_at(built, some.points(positions, barycentric)))
+        total += normal_reflectance(surface_at(built, some.mixed(weights)))
         dr.eval(total)
     dr.scatter(reflectance, total / len(parts), on_device(mi.UInt32, chosen))
     return reflectance
 
 
-def _has_texture(bsdf: mi.BSDF) -> bool:
+def _of_shapes(built: BuiltScene, patches: Patches, of_bsdf: Callable[[mi.BSDF], bool]) -> NDArray[np.bool_]:
+    """Return for each patch whether the BSDF of its shape is such a one."""
+    return np.array([of_bsdf(shape.bsdf()) for shape in built.scene.shapes()])[patches.shapes]
+
+
+def _has_reflectances(bsdf: mi.BSDF) -> bool:
     return bsdf.class_name() == "SmoothDiffuse" and not is_uniform_diffuse(bsdf)
+
+
+def _has_picture(bsdf: mi.BSDF) -> bool:
+    return any(key.endswith("to_uv") for key, _ in mi.traverse(bsdf))
 
 
 def normal_reflectance(interaction: mi.SurfaceInteraction3f) -> mi.Spectrum:

@@ -20,13 +20,8 @@ from nlosrender.engine.launch.device_arrays import on_device
 from nlosrender.engine.launch.launch_params import LaunchParams
 from nlosrender.engine.launch.passes import Passes, PassSize, Snapshot
 from nlosrender.engine.launch.wall_points import WallPoints
-from nlosrender.engine.virtual_lights.gather.delay_distribution import Delays, deposit_patch
-from nlosrender.engine.virtual_lights.gather.lighting import (
-    ROWS,
-    GatherSettings,
-    PackedPatches,
-    four_corners,
-)
+from nlosrender.engine.virtual_lights.gather.delay_distribution import Delays, corner_delays, deposit_patch
+from nlosrender.engine.virtual_lights.gather.lighting import ROWS, GatherSettings, PackedPatches
 from nlosrender.engine.virtual_lights.visibility.shadow_rays import is_visible
 
 if TYPE_CHECKING:
@@ -170,32 +165,27 @@ def gather_third_bounce(
             active = is_visible(built, sensor, to_surface, mi.Vector3f(offset), active, mask, tile)
 
         # ---- Reflect towards the lasers and deposit -----------------------------------------------------------------
-        scale = params.bins_per_unit
-        delays = mi.Vector4f(
-            *(dr.norm(end - sensor.p) * scale + sensors.delay_fraction for end in four_corners(a, b, c))
-        )
+        delays = corner_delays(sensor.p, centre, (a, b, c), params.bins_per_unit, is_cluster) + sensors.delay_fraction
+        seen = _SeenPatch(patch, weight, is_cluster, (a, b, c), to_patch - from_sensor, active)
         if dr.hint(settings.is_confocal, mode="scalar"):
-            lit = own_laser.interaction
-            value = weight * wall_bsdf.eval(context, lit, lit.to_local(direction)) / distance2
+            light = wall_bsdf.eval(context, sensor, sensor.to_local(direction)) / distance2
             if dr.hint(settings.is_diffuse, mode="scalar"):
-                value *= dr.gather(mi.Spectrum, packed.reflectance, patch) * cosine
-            else:
-                value *= _reflected(packed, patch, direction, -direction, active)
+                light *= dr.gather(mi.Spectrum, packed.reflectance, patch) * cosine
             delays = 2 * delays + (own_laser.delay_fraction - sensors.delay_fraction)
-            whole = own_laser.delay_bins + sensors.delay_bins
-            _spread(histogram, lane, mi.UInt32(0), delays, whole, value, is_cluster, active)
+            _deposit(settings, packed, histogram, sensors, own_laser, lane, mi.UInt32(0), light, delays, seen)
         elif dr.hint(params.lasers_per_lane == 1, mode="scalar"):
-            seen = _SeenPatch(patch, weight, delays, is_cluster, direction, active)
-            _deposit(settings, packed, histogram, sensors, own_laser, lane, mi.UInt32(0), patch, seen)
+            light, legs = packed.from_laser(patch)
+            delays += legs + own_laser.delay_fraction
+            _deposit(settings, packed, histogram, sensors, own_laser, lane, mi.UInt32(0), light, delays, seen)
         else:
             laser = mi.UInt32(0)
             while dr.hint(
-                laser < n_lasers,
-                exclude=[settings, params, packed, histogram, sensors, weight, delays, direction, patch, count],
+                laser < n_lasers, exclude=[settings, params, packed, histogram, sensors, delays, patch, count, seen]
             ):
                 points = params.lasers.gather(laser)
-                seen = _SeenPatch(patch, weight, delays, is_cluster, direction, active)
-                _deposit(settings, packed, histogram, sensors, points, lane, laser, laser * count + patch, seen)
+                light, legs = packed.from_laser(laser * count + patch)
+                legs += delays + points.delay_fraction
+                _deposit(settings, packed, histogram, sensors, points, lane, laser, light, legs, seen)
                 laser += 1
         patch += 1
 
@@ -204,11 +194,11 @@ def gather_third_bounce(
 class _SeenPatch:
     """A patch as the lane's sensor point sees it."""
 
-    patch: mi.UInt32
+    number: mi.UInt32
     weight: mi.Spectrum  # wall's BSDF and the geometry between; of patches that are not Lambertian without their BSDF
-    delays: mi.Vector4f  # from the corners [bins]
     is_cluster: mi.Bool | None  # None: no patch is
-    direction: mi.Vector3f  # towards it
+    corners: tuple[mi.Point3f, mi.Point3f, mi.Point3f]
+    residual: mi.Vector3f  # what float32 rounds off its place
     active: mi.Bool
 
 
@@ -220,53 +210,55 @@ def _deposit(
     laser_points: WallPoints,
     lane: mi.UInt32,
     laser: mi.UInt32,
-    entry: mi.UInt32,
+    light: mi.Spectrum,
+    delays: mi.Vector4f,
     seen: _SeenPatch,
 ) -> None:
-    """Deposit what a patch sends on from one laser; ``entry`` is the pair of patch and laser."""
-    value = seen.weight * dr.gather(mi.Spectrum, packed.laser_light, entry)
+    """Deposit what a patch sends on of the ``light`` from one laser; ``delays`` [bins] of its corners."""
+    value = seen.weight * light
     lit = seen.active & dr.any(value > 0)
+    distribution = None
     if not settings.is_diffuse:
-        centre = dr.gather(mi.Point3f, packed.interaction.p, seen.patch)
-        to_laser = laser_points.interaction.p - centre
-        if packed.rounding_residual is not None:
-            to_laser -= _rounding_residual(packed, seen.patch)
-        to_laser = dr.normalize(to_laser)
-        value *= _reflected(packed, seen.patch, seen.direction, to_laser, lit)
+        reflected, distribution = _reflected(packed, sensors.interaction.p, laser_points.interaction.p, seen, lit)
+        value *= reflected
         lit &= dr.any(value > 0)
-    legs = dr.gather(mi.Vector4f, packed.delays, entry)
-    delays = seen.delays + legs + laser_points.delay_fraction
-    _spread(histogram, lane, laser, delays, laser_points.delay_bins + sensors.delay_bins, value, seen.is_cluster, lit)
+    covered = Delays.of_patch(delays, seen.is_cluster, distribution)
+    deposit_patch(histogram, lane, laser, covered, laser_points.delay_bins + sensors.delay_bins, value, lit)
 
 
-def _spread(
-    histogram: BlockHistogram,
-    lane: mi.UInt32,
-    laser: mi.UInt32,
-    delays: mi.Vector4f,
-    whole: mi.Int32,
-    value: mi.Spectrum,
-    is_cluster: mi.Bool | None,
-    active: mi.Bool,
-) -> None:
-    """Deposit a patch: a triangle, or a cluster's parallelogram."""
-    if is_cluster is None:
-        covered = Delays.of_triangle(delays.x, delays.y, delays.z)
-    else:
-        covered = Delays.of_either(is_cluster, delays)
-    deposit_patch(histogram, lane, laser, covered, whole, value, active)
+def _reflected(
+    packed: PackedPatches, sensor: mi.Point3f, laser: mi.Point3f, seen: _SeenPatch, active: mi.Bool
+) -> tuple[mi.Spectrum, mi.Vector3f]:
+    """Return the mean over patches of their BSDF times the cosine towards the laser, and its distribution.
+
+    The BSDF is evaluated at the middles of the three edges, whose mean is exact for quadratic functions. The linear
+    function through them tells the light per area at the corners, mean 1: docs/virtual-lights.md, 2.5.
+    """
+    a, b, c = (corner + seen.residual for corner in seen.corners)
+    interactions, to_laser = [], []
+    for number, (one, other) in enumerate(((b, c), (c, a), (a, b))):
+        middle = (one + other) / 2
+        si = dr.gather(mi.SurfaceInteraction3f, packed.middles[number], seen.number)
+        si.wi = dr.normalize(si.to_local(sensor - middle))
+        interactions.append(si)
+        to_laser.append(dr.normalize(si.to_local(laser - middle)))
+    values = dr.dispatch(interactions[0].bsdf(), _bsdf_values, interactions, to_laser, active)
+    mean = (values[0] + values[1] + values[2]) / 3
+    scale = dr.rcp(dr.maximum(dr.mean(mean), dr.smallest(mi.Float)))
+    light = mi.Vector3f(*(3 - 2 * (dr.mean(value) * scale) for value in values))
+    light = dr.maximum(light, 0)
+    return mean, light * (3 / dr.sum(light))
+
+
+def _bsdf_values(
+    bsdf: mi.BSDF, interactions: list[mi.SurfaceInteraction3f], directions: list[mi.Vector3f], active: mi.Bool
+) -> list[mi.Spectrum]:
+    """Return the BSDF times the cosine at several points of one surface."""
+    context = mi.BSDFContext()
+    return [bsdf.eval(context, si, wo, active) for si, wo in zip(interactions, directions, strict=True)]
 
 
 def _rounding_residual(packed: PackedPatches, patch: mi.UInt32) -> mi.Vector3f:
     """Return what float32 rounds off a patch's centre."""
     row = dr.gather(mi.Vector4f, packed.rounding_residual, patch)
     return mi.Vector3f(row.x, row.y, row.z)
-
-
-def _reflected(
-    packed: PackedPatches, patch: mi.UInt32, direction: mi.Vector3f, to_laser: mi.Vector3f, active: mi.Bool
-) -> mi.Spectrum:
-    """Return BSDF times the cosine towards the laser, of patches that are not Lambertian."""
-    si = dr.gather(mi.SurfaceInteraction3f, packed.interaction, patch)
-    si.wi = si.to_local(-direction)
-    return si.bsdf().eval(mi.BSDFContext(), si, si.to_local(to_laser), active)

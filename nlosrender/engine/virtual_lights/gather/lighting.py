@@ -12,6 +12,7 @@ import numpy as np
 from nlosrender.engine.launch.device_arrays import on_device
 from nlosrender.engine.launch.launch_params import LaunchParams
 from nlosrender.engine.launch.wall_points import WallPoints
+from nlosrender.engine.virtual_lights.gather.delay_distribution import corner_delays
 from nlosrender.engine.virtual_lights.tuning import DEFAULT_TUNING
 from nlosrender.engine.virtual_lights.visibility.shadow_rays import is_visible
 from nlosrender.scene.build import BuiltScene
@@ -49,7 +50,8 @@ class PackedPatches:
     mask: mi.UInt64  # of that point, see ``VisibilityMasks.of``
     rounding_residual: mi.Float | None  # four a patch: float64 minus float32 centre; None: negligible
     shading: mi.Normal3f  # shading normals
-    interaction: mi.SurfaceInteraction3f  # at the centres; not read for Lambertian patches
+    interaction: mi.SurfaceInteraction3f  # at the centres
+    middles: list[mi.SurfaceInteraction3f]  # in the middle of each edge; none of Lambertian patches
     reflectance: mi.Spectrum  # confocal Lambertian patches: reflectance / pi
     # index = laser * count + patch: light that arrives, per area perpendicular to it; of Lambertian patches the light
     # that leaves; empty for confocal captures
@@ -58,6 +60,10 @@ class PackedPatches:
     has_clusters: bool
     count: mi.UInt32  # of lit patches, opaque
     first: mi.UInt32  # of slice k: its patches are first[k] to first[k + 1]
+
+    def from_laser(self, entry: mi.UInt32) -> tuple[mi.Spectrum, mi.Vector4f]:
+        """Return ``laser_light`` and the delays [bins] of corners of pairs of laser and patch."""
+        return dr.gather(mi.Spectrum, self.laser_light, entry), dr.gather(mi.Vector4f, self.delays, entry)
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,8 +137,10 @@ def pack_patches(
         laser, patch = index // n_lit, dr.gather(mi.UInt32, lit, index % n_lit)
         laser_light = dr.gather(mi.Spectrum, laser_light, laser * dr.opaque(mi.UInt32, count) + patch)
         points = dr.gather(mi.Point3f, params.lasers.interaction.p, laser)
-        ends = four_corners(*_corners(patches, patch))
-        delays = dr.ravel(mi.Vector4f(*(dr.norm(end - points) * params.bins_per_unit for end in ends)))
+        centre = dr.gather(mi.Point3f, patches.interaction.p, patch)
+        is_cluster = dr.gather(mi.Vector4f, patches.members, patch).w > 0 if patches.has_clusters else None
+        corners = _corners(patches, patch)
+        delays = dr.ravel(corner_delays(points, centre, corners, params.bins_per_unit, is_cluster))
     a, b, c = _corners(patches, lit)
     areas = dr.gather(mi.Vector3f, patches.areas, lit)
     interaction = dr.gather(mi.SurfaceInteraction3f, patches.interaction, lit)
@@ -153,6 +161,7 @@ def pack_patches(
         rounding_residual=rounding_residual,
         shading=interaction.sh_frame.n,
         interaction=interaction,
+        middles=[] if settings.is_diffuse else [dr.gather(mi.SurfaceInteraction3f, si, lit) for si in patches.middles],
         reflectance=dr.gather(mi.Spectrum, patches.reflectance, lit) * dr.inv_pi,
         laser_light=laser_light,
         delays=delays,
@@ -236,14 +245,10 @@ def _lit_fraction(
     return mi.Float(n_seen) / settings.laser_rays, chosen
 
 
-def four_corners(a: mi.Point3f, b: mi.Point3f, c: mi.Point3f) -> tuple[mi.Point3f, ...]:
-    """Return a triangle's corners and the fourth that makes it a parallelogram."""
-    return a, b, c, a + (c - b)
-
-
-def _corners(patches: DevicePatches, index: mi.UInt32) -> list[mi.Point3f]:
+def _corners(patches: DevicePatches, index: mi.UInt32) -> tuple[mi.Point3f, mi.Point3f, mi.Point3f]:
     centre = dr.gather(mi.Point3f, patches.interaction.p, index)
-    return [centre + dr.gather(mi.Vector3f, corner, index) for corner in patches.corners]
+    a, b, c = (centre + dr.gather(mi.Vector3f, corner, index) for corner in patches.corners)
+    return a, b, c
 
 
 def irradiance(built: BuiltScene, laser: WallPoints, point: mi.Point3f, shading: mi.Normal3f) -> mi.Spectrum:

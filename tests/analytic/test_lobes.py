@@ -1,0 +1,208 @@
+"""Glossy surfaces in the gather: quadrature of a microfacet model of the test's own, and both engines per BSDF."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from support.agreement import assert_agrees, relative_l2
+from support.quadrature import (
+    Array,
+    Cells,
+    Setup,
+    confocal_third_bounces,
+    grid_points,
+    rectangle_cells,
+    third_bounces,
+)
+from support.rendering import Rendering, flat_wall, render
+
+from nlosrender.engine.backend.start import start_backend
+
+NORMAL = [0.2, -0.1, -1.0]
+PLACE = {"type": "rectangle", "width": 0.5, "height": 0.4, "center": [0.1, -0.05, 0.6], "normal": NORMAL}
+ETA, K = 1.4, 2.5
+BINS = (1.0, 0.02, 90)
+GRID = {"nx": 4, "ny": 3, "width": 0.5, "height": 0.4}  # around the points that see the lobe's middle
+SETUP = {"bins": BINS, "spp": None, "engine": "auto", "color": "grey", "capture": {"sensor_grid": GRID}}
+# Of 300 x 300 cells a bin's edges, 300 cells long, misplace sqrt(2 * 300 / 12) = 7 of about 4,500: 0.2 %. The narrowest
+# lobe is 8 cells wide.
+N_CELLS, QUADRATURE = 300, 2e-3
+
+
+def ggx(alpha: float) -> Any:
+    """Return the BRDF of a rough conductor: Walter et al. 2007, with Smith's shadowing and complex Fresnel terms."""
+
+    def smith(cosine: Array) -> Array:
+        return 2 / (1 + np.sqrt(1 + alpha**2 * (1 / cosine**2 - 1)))
+
+    def fresnel(cosine: Array) -> Array:
+        index = complex(ETA, K)
+        inside = np.sqrt(1 - (1 - cosine**2) / index**2)
+        across = (cosine - index * inside) / (cosine + index * inside)
+        along = (index * cosine - inside) / (index * cosine + inside)
+        return (np.abs(across) ** 2 + np.abs(along) ** 2) / 2
+
+    def brdf(cells: Cells, to_laser: Array, to_sensor: Array) -> Array:
+        half = to_laser + to_sensor
+        half /= np.linalg.norm(half, axis=1, keepdims=True)
+        at_laser, at_sensor, tilt = ((way * cells.normals).sum(axis=1) for way in (to_laser, to_sensor, half))
+        density = alpha**2 / (np.pi * (tilt**2 * (alpha**2 - 1) + 1) ** 2)
+        shadowing = smith(at_laser) * smith(at_sensor)
+        return fresnel((half * to_laser).sum(axis=1)) * density * shadowing / (4 * at_laser * at_sensor)
+
+    return brdf
+
+
+@pytest.mark.parametrize(
+    ("alpha", "scan"),
+    [(0.02, "single"), (0.1, "confocal")]
+    + [pytest.param(*more, marks=pytest.mark.slow) for more in ((0.02, "confocal"), (0.1, "single"), (0.3, "single"))],
+)
+def test_a_rough_metal_plate_is_gathered_to_its_target(alpha: float, scan: str) -> None:
+    """`auto` takes virtual lights, the true error meets the target, and the stated one is within a factor of 2."""
+    bsdf = {"type": "roughconductor", "distribution": "ggx", "alpha": alpha, "eta": ETA, "k": K}
+    result = render(flat_wall(PLACE | {"bsdf": bsdf}, scan=scan, target_error=0.01, **SETUP))
+    assert result.samples == 0
+    setup = Setup(
+        rectangle_cells(0.5, 0.4, PLACE["center"], NORMAL, n=N_CELLS),
+        BINS[0] + BINS[1] * np.arange(BINS[2] + 1),
+        brdf=ggx(alpha),
+    )
+    sensors = grid_points(4, 3, 0.5, 0.4)
+    if scan == "confocal":
+        truth = confocal_third_bounces(setup, sensors)
+    else:
+        truth = third_bounces(setup, np.array([[[0.3, -0.2, 0.0]]]), sensors)
+    error = relative_l2(result.total - truth, truth)
+    assert error < 0.01 + QUADRATURE
+    assert error < 2 * result.error_estimate + QUADRATURE, (error, result.error_estimate)
+
+
+LOBES: dict[str, dict[str, Any]] = {
+    "rough plastic": {"type": "roughplastic", "alpha": 0.15, "diffuse_reflectance": 0.5},
+    "plastic": {"type": "plastic", "diffuse_reflectance": 0.5},
+    "principled": {"type": "principled", "base_color": 0.6, "roughness": 0.3, "metallic": 0.5},
+    "brushed metal": {"type": "roughconductor", "alpha_u": 0.1, "alpha_v": 0.4},
+    "blend": {
+        "type": "blendbsdf",
+        "weight": 0.3,
+        "first": {"type": "diffuse", "reflectance": 0.5},
+        "second": {"type": "roughconductor", "alpha": 0.2},
+    },
+    "two sides": {"type": "twosided", "bsdf": {"type": "roughconductor", "alpha": 0.3}},
+}
+
+
+def engines(item: dict[str, Any], folder: Path | None = None) -> tuple[Rendering, Rendering]:
+    """Render both ways: virtual lights at 0.5 %, and paths."""
+    common = {"sensors": (3, 2), "bins": (1.0, 0.06, 30), "color": "grey"}
+    lights = render(flat_wall(item, spp=None, engine="auto", target_error=0.005, **common), folder=folder)
+    return lights, render(flat_wall(item, spp=2**15, **common), replicas=32, folder=folder)
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[] if name == "blend" else pytest.mark.slow) for name in LOBES]
+)
+def test_both_engines_agree_on_every_lobe(name: str) -> None:
+    """The third bounce per bin, per sensor point and in total, against the noise of paths."""
+    lights, paths = engines(PLACE | {"bsdf": LOBES[name]})
+    assert lights.samples == 0
+    assert_agrees(paths.total, paths.total_variance, lights.total, replicas=32, floor=0.01)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["normalmap", "bumpmap"])
+def test_lobes_turn_with_a_map_of_normals(kind: str, tmp_path: Path) -> None:
+    """A relief of waves turns the lobe from place to place."""
+    start_backend("llvm")
+    import mitsuba as mi
+
+    waves = 0.1 * np.sin(2 * np.pi * np.arange(64) / 32)
+    if kind == "normalmap":
+        texels = np.stack([np.broadcast_to(0.5 + waves, (64, 64)), np.full((64, 64), 0.5), np.ones((64, 64))], axis=-1)
+    else:
+        texels = np.broadcast_to(0.2 * (waves + 0.1), (64, 64))[..., None]
+    mi.Bitmap(np.ascontiguousarray(texels, np.float32)).write(str(tmp_path / "relief.exr"))
+    relief = {"type": "bitmap", "filename": "relief.exr", "raw": True}
+    nested = {"type": "roughconductor", "alpha": 0.3}
+    bsdf = {"type": kind, ("normalmap" if kind == "normalmap" else "arbitrary"): relief, "bsdf": nested}
+    lights, paths = engines(PLACE | {"bsdf": bsdf}, tmp_path)
+    assert lights.samples == 0
+    assert_agrees(paths.total, paths.total_variance, lights.total, replicas=32, floor=0.01)
+
+
+def test_lobes_follow_averaged_normals(tmp_path: Path) -> None:
+    """A coarse bowl with normals of its own at the corners: the lobe turns across each facet."""
+    grid = np.linspace(-0.25, 0.25, 5)
+    x, y = (axis.ravel() for axis in np.meshgrid(grid, grid))
+    lines = [f"v {a} {b} {1.5 * (a * a + b * b):.6f}" for a, b in zip(x, y, strict=True)]
+    lines += [f"vn {3 * a} {3 * b} -1" for a, b in zip(x, y, strict=True)]
+    for row in range(4):
+        for column in range(4):
+            k = 5 * row + column + 1
+            lines += [f"f {i}//{i} {j}//{j} {m}//{m}" for i, j, m in ((k, k + 6, k + 1), (k, k + 5, k + 6))]
+    (tmp_path / "bowl.obj").write_text("\n".join(lines) + "\n")
+    item = {"type": "mesh", "filename": "bowl.obj", "translate": [0, 0, 0.7]}
+    lights, paths = engines(item | {"bsdf": {"type": "roughconductor", "alpha": 0.15}}, tmp_path)
+    assert lights.samples == 0
+    assert_agrees(paths.total, paths.total_variance, lights.total, replicas=32, floor=0.01)
+
+
+def test_linear_light_is_spread_over_bins_as_over_the_triangle() -> None:
+    """Shares of light per bin where light is linear over a triangle, in any order of the corners, against cells."""
+    start_backend("llvm")
+    import drjit as dr
+    import mitsuba as mi
+
+    from nlosrender.engine.virtual_lights.gather.block_histogram import BLOCK
+    from nlosrender.engine.virtual_lights.gather.delay_distribution import Delays, _DelayCdf
+
+    n = 600
+    u, v = ((np.stack(np.meshgrid(np.arange(n), np.arange(n))).reshape(2, -1)) + 0.5) / n
+    u, v = np.where(u + v > 1, 1 - u, u), np.where(u + v > 1, 1 - v, v)  # the square's other half, onto the triangle
+    weights = np.stack([1 - u - v, u, v])
+    light = [0.2, 1.9, 0.9]
+    for delays in (
+        [0.4, 2.7, 6.1],
+        [6.1, 0.4, 2.7],
+        [2.7, 6.1, 0.4],
+        [1.5, 1.5, 3.2],
+        [3.2, 1.0, 3.2],
+        [2.7, 0.4, 6.1],
+    ):
+        shares = (
+            np.bincount((np.array(delays) @ weights).astype(int), weights=np.array(light) @ weights, minlength=BLOCK)
+            / n**2
+        )
+        cdf = _DelayCdf(Delays.of_lit_triangle(mi.Vector3f(delays), mi.Vector3f(light)))
+        fractions, end = cdf.bin_fractions(mi.Float(0))
+        # a line of equal delay misplaces less than 2 n of n^2 / 2 cells by its cells' halves
+        np.testing.assert_allclose([fraction[0] for fraction in fractions], shares, atol=2e-3)
+        assert float(dr.slice(end)) == pytest.approx(1, abs=1e-5)
+
+
+def test_the_mean_delay_of_a_patch_is_right_to_the_third_order() -> None:
+    """Half the patch's size leaves a tenth of the error: without the shift a quarter, h^2 / (4 d) for both legs."""
+    start_backend("llvm")
+    import mitsuba as mi
+
+    from nlosrender.engine.virtual_lights.gather.delay_distribution import corner_delays
+
+    rng = np.random.default_rng(3)
+    weights = rng.dirichlet([1, 1, 1], 400_000)
+    corners = np.array([[-0.3, -0.2, 1.0], [0.3, -0.2, 0.9], [0.0, 0.4, 1.1]])
+    centre, point = corners.mean(axis=0), np.array([0.2, 0.1, 0.0])
+    errors = []
+    for size in (1.0, 0.5):
+        ends = centre + size * (corners - centre)
+        along = np.linalg.norm(weights @ ends - point, axis=1)
+        linear = weights @ np.linalg.norm(ends - point, axis=1)
+        delays = corner_delays(mi.Point3f(point), mi.Point3f(centre), tuple(map(mi.Point3f, ends)), mi.Float(1), None)
+        moved = np.mean([delays.x[0], delays.y[0], delays.z[0]]) - np.mean(np.linalg.norm(ends - point, axis=1))
+        late = float((linear - along).mean())
+        errors.append((abs(late + moved), late))
+    assert errors[0][0] < 0.02 * errors[0][1]
+    assert errors[1][0] < 0.005 * errors[1][1]
