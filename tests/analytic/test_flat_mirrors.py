@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from support.agreement import assert_agrees
 from support.image_sums import image_sum
-from support.rendering import Scene, flat_wall
+from support.rendering import Scene, flat_wall, render
 from support.varied_scenes import Stage, plate
 from support.wall_meshes import flat, sheet, wavy, write_uv_ply
 
@@ -21,6 +23,7 @@ SCREEN = plate((-0.3, 0.2, 0.4), (0.2, 0.1, -1.0), (0.3, 0.5), 0.0)
 TILTED = ((0.15, -0.05, 0.9), (0.1, 0.2, -1.0), (1.1, 0.8))
 # float32 coordinates of size 1 lie within 6e-8: a term is good to a few times that, a sum of squares to less
 ROUNDING = 2e-6
+RADIUS = 0.06  # m
 
 
 def third(stage: Stage) -> Array:
@@ -170,3 +173,56 @@ def test_half_matt_half_mirror_is_both() -> None:
     for engine in ("path", "virtual_lights"):
         parts = (mean + energies[engine, "mirror"]) / 2
         assert math.isclose(energies[engine, "blend"], parts, rel_tol=0.01)
+
+
+def test_a_spot_sends_the_light_of_its_points() -> None:
+    """The third bounce of a spot is the mean over its points of the light of their images."""
+    settings: dict[str, Any] = {"sensors": (7, 5), "bins": (1.5, 0.05, 60), "spp": 2**13}
+    config = flat_wall(plate(*TILTED, MIRROR), capture={"laser_spot_radius": RADIUS}, **settings)
+    found, stage = render(config, replicas=16), Stage.of(config)
+    number = np.arange(2000) + 0.5
+    place, turn = RADIUS * np.sqrt(number / 2000), number * math.pi * (3 - math.sqrt(5))
+    disc = np.stack([place * np.cos(turn), place * np.sin(turn), 0 * turn], axis=-1)
+    grid = found.capture.laser_grid
+    points = SimpleNamespace(
+        positions=grid.positions.reshape(3) + disc, normals=np.tile(grid.normals.reshape(3), (2000, 1))
+    )
+    legs = {"laser_legs": np.zeros(2000), "sensor_legs": found.capture.sensor_legs}
+    capture: Any = SimpleNamespace(
+        scan_type="exhaustive", laser_grid=points, sensor_grid=found.capture.sensor_grid, **legs
+    )
+    light = image_sum(triangles(stage, 0), np.zeros((0, 3, 3)), capture, found.time_axis).mean(axis=0)
+    # 2000 points know the part of a disc that an edge leaves to about 1 / 2000^(3/4)
+    assert_agrees(
+        found.mean[0, -1, 0, 0].reshape(35, -1),
+        found.variance[0, -1, 0, 0].reshape(35, -1),
+        light,
+        replicas=16,
+        floor=0.005,
+    )
+    assert found.error_estimate < 0.02
+
+
+def box(length: float, end: Any) -> list[Scene]:
+    """Return a room of 2 x 2 m and a ``length`` before the wall, from x = -1; its far end is made of ``end``."""
+    x = length / 2 - 1
+    sides = [plate((x, y, 1), (0, -y, 0), (2, length), 0.5) for y in (-1, 1)]
+    sides += [plate((x, 0, 2), (0, 0, -1), (length, 2), 0.5), plate((-1, 0, 1), (1, 0, 0), (2, 2), 0.5)]
+    return [*sides, plate((length - 1, 0, 1), (-1, 0, 0), (2, 2), end)]
+
+
+@pytest.mark.parametrize("p_hidden_sampling", [0.5, 1.0])
+def test_a_room_with_a_mirror_wall_is_one_of_twice_the_length(p_hidden_sampling: float) -> None:
+    """Light of all bounces is that of the room and its image in one, lit by the laser point and by its image."""
+    n, settings = 4, {"bins": (0.0, 0.2, 60), "max_bounces": None, "split_bounces": False, "spp": 20_000}
+    wall = {"height": 2.0, "bsdf": {"type": "diffuse", "reflectance": 0.5}}
+    own = {"sensors": (n, n), "wall": {**wall, "width": 2.0}, "capture": {"laser_point": [0.25, 0.0]}}
+    folded = render(flat_wall(*box(2, MIRROR), **own, **settings), p_hidden_sampling=p_hidden_sampling, replicas=16)
+    lasers = {"laser_grid": {"nx": 2, "ny": 1, "width": 3.0, "height": 2.0}}  # x = 1 - 0.75, 1 + 0.75
+    both = {"scan": "exhaustive", "sensors": (2 * n, n), "wall": {**wall, "width": 4.0, "center": [1, 0, 0]}}
+    unfolded = render(flat_wall(*box(4, 0.5), **both, capture=lasers, **settings), replicas=16)
+    mean, variance = (values[0, 0, 0, :, :, :n].sum(axis=0) for values in (unfolded.mean, unfolded.variance))
+    variance *= 2  # lasers share paths
+    own_light = folded.mean[0, 0, 0, 0], folded.variance[0, 0, 0, 0]
+    assert_agrees(*own_light, mean, replicas=16, reference_variance=variance, share=0.1)
+    assert math.sqrt(own_light[1].sum() + variance.sum()) < 0.003 * mean.sum()

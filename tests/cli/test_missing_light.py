@@ -52,8 +52,8 @@ def test_the_error_of_a_capture_without_its_mirror_is_unknown(tmp_path: Path) ->
 
 
 def test_bounces_below_the_first_that_misses_light_have_their_errors(tmp_path: Path) -> None:
-    """A mirror lights another plate alone: bounce 3 is all there and has its errors, from bounce 4 on they are null."""
-    mirror = {**MIRROR, "center": [0.8, 0, 0.8], "width": 0.4, "normal": [1, 0, -1]}  # away from the wall
+    """A mask lights another plate alone: bounce 3 is all there and has its errors, from bounce 4 on they are null."""
+    mirror = {**HOLED, "center": [0.8, 0, 0.8], "width": 0.4, "normal": [1, 0, -1]}  # away from the wall
     lit = {**GREY, "center": [2.0, 0, 1.4], "width": 2.0, "height": 2.0, "normal": [-1, 0, 0]}
     config = write(tmp_path, GREY | {"center": [-0.5, 0, 0.8]}, mirror, lit, max_bounces=4)
     report = json.loads(run(tmp_path, "render", config, "-o", "a.hdf5", "--json", "--quiet").stdout)

@@ -18,7 +18,7 @@ from nlosrender.engine.launch.energy_contrasts import no_contrasts
 from nlosrender.engine.launch.flat_mirrors import FlatMirrors, has_flat_mirrors
 from nlosrender.engine.launch.histogram import DeviceHistogram, Histogram, HistogramShape
 from nlosrender.engine.launch.launch_params import LaunchParams
-from nlosrender.engine.launch.mirrored_bounce import deposit_mirrored_bounce
+from nlosrender.engine.launch.mirror_connections import deposit_mirrored_bounce
 from nlosrender.engine.launch.morton import morton_order
 from nlosrender.engine.launch.schedule import DEFAULT_SCHEDULE, ScheduleTuning
 from nlosrender.engine.launch.second_bounce import deposit_second_bounce
@@ -146,26 +146,23 @@ class DeviceCapture:
 
     @cached_property
     def mirrors(self) -> FlatMirrors | None:
-        """Flat mirrors that send light of the laser points to sensor points, bounce 3; None: none are asked for.
-
-        A laser's spot is found by chance.
-        """
+        """Flat mirrors by way of which light of the lasers is looked for; None where there are none."""
         highest = self.options.bounces.max_bounces
-        if self.capture.laser_spot_radius > 0 or (highest is not None and highest < THIRD_BOUNCE):
+        if highest is not None and highest < THIRD_BOUNCE:
             return None
         return FlatMirrors.of(self.built) if any(map(has_flat_mirrors, self.built.scene.shapes())) else None
 
     def exact_light(self, batch: Batch | Pilot) -> Iterator[tuple[int, NDArray[np.float64]]]:
         """Yield bounces and their light (channel, 1, laser, sensor, row) that is exact: one replica computes it.
 
-        The second bounce, of which a planar wall has none, and the third by way of flat mirrors.
+        The second bounce, of which a planar wall has none, and the third of laser points by way of flat mirrors.
         """
         shape = replace(self.shape(batch, 1), replicas=1)
         if not self.built.wall.is_planar:
             histogram = DeviceHistogram(shape)
             deposit_second_bounce(self.launch_params(batch, shape), histogram)
             yield FIRST_BOUNCE, histogram.on_host(histogram.total(self.scale))
-        if self.mirrors is not None:
+        if self.mirrors is not None and self.capture.laser_spot_radius == 0:
             histogram = DeviceHistogram(shape)
             deposit_mirrored_bounce(self.launch_params(batch, shape), self.mirrors, histogram)
             yield THIRD_BOUNCE, histogram.on_host(histogram.total(self.scale))

@@ -21,7 +21,7 @@ from nlosrender.engine.launch.ray_offsets import connection_segment, offset_orig
 from nlosrender.scene.build import BuiltScene
 from nlosrender.scene.pose import Float64
 
-NONE = 0xFFFFFFFF
+NO_MIRROR = 0xFFFFFFFF
 FLAT_PLUGINS = ("Rectangle", "Disk")
 COPLANAR = 1e-5  # radians between neighbouring facets of one mirror: what float32 vertices leave of a plane's facets
 # What float32 rounds a point of reflection by, over 1 + the largest coordinate [engine units]: the quick test goes so
@@ -44,21 +44,21 @@ class FlatMirrors:
     packed: mi.Float
     lobes: mi.UInt32  # two a mirror: bits of the delta reflection components of its BSDF on the front and on the back
     components: tuple[int, ...]  # that any of them has
-    first_facet: mi.UInt32  # by number of a shape's pointer: where its facets begin in ``mirror_of``; NONE
-    mirror_of: mi.UInt32  # mirror of each facet; NONE for those that no point of the wall sees
+    first_facet: mi.UInt32  # by number of a shape's pointer: where its facets begin in ``mirror_of``; NO_MIRROR
+    mirror_of: mi.UInt32  # mirror of each facet; NO_MIRROR for those that no point of the wall sees
 
     @classmethod
     def of(cls, built: BuiltScene) -> FlatMirrors:
-        """Return the flat mirrors of a scene; polarised light has none."""
+        """Return the flat mirrors of a scene; with polarised light there are none."""
         corners, facets, lobes = [np.zeros((0, 3, 3))], [np.zeros(0, np.uint32)], [np.zeros((0, 2), np.uint32)]
-        shapes = [] if mi.is_polarized else [shape for shape in built.scene.shapes() if has_flat_mirrors(shape)]
+        shapes = [shape for shape in built.scene.shapes() if has_flat_mirrors(shape)]
         number = {shape: int(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))[0]) for shape in shapes}
-        first_facet = np.full(max(number.values(), default=0) + 1, NONE, np.uint32)
+        first_facet = np.full(max(number.values(), default=0) + 1, NO_MIRROR, np.uint32)
         n_mirrors = n_facets = 0
         for shape in shapes:
             triangles, primitives = _facets(built, shape)
             mirror, bounds = _mirrors_of(triangles)
-            mirror_of = np.full(shape.face_count() if shape.is_mesh() else 1, NONE, np.uint32)
+            mirror_of = np.full(shape.face_count() if shape.is_mesh() else 1, NO_MIRROR, np.uint32)
             mirror_of[primitives] = mirror + n_mirrors
             first_facet[number[shape]] = n_facets
             corners.append(bounds)
@@ -80,14 +80,14 @@ class FlatMirrors:
         return mirrors
 
     def number_at(self, si: mi.SurfaceInteraction3f | mi.PreliminaryIntersection3f, active: mi.Bool) -> mi.UInt32:
-        """Return the number of the mirror that a ray met; NONE where it met none."""
+        """Return the number of the mirror that a ray met; NO_MIRROR where it met none."""
         if not self.n_mirrors:
-            return mi.UInt32(NONE)
+            return mi.UInt32(NO_MIRROR)
         shape = dr.reinterpret_array(mi.UInt32, si.shape)  # 0: nothing was met
         known = active & si.is_valid() & (shape < dr.width(self.first_facet))
-        first = dr.select(known, dr.gather(mi.UInt32, self.first_facet, shape, known), NONE)
-        known &= first != NONE
-        return dr.select(known, dr.gather(mi.UInt32, self.mirror_of, first + si.prim_index, known), NONE)
+        first = dr.select(known, dr.gather(mi.UInt32, self.first_facet, shape, known), NO_MIRROR)
+        known &= first != NO_MIRROR
+        return dr.select(known, dr.gather(mi.UInt32, self.mirror_of, first + si.prim_index, known), NO_MIRROR)
 
     def may_reflect(self, number: mi.UInt32, point: mi.Point3f, laser: mi.Point3f) -> mi.Bool:
         """Return whether mirrors can reflect the light of a laser point to a point: no ray is traced.
@@ -178,9 +178,24 @@ class Reflection:
 
 
 def has_flat_mirrors(shape: mi.Shape) -> bool:
-    """Return whether the facets of a shape are flat and have a delta reflection lobe about their normals."""
+    """Return whether a shape has flat facets with delta reflection lobes, all of them about the facets' normals."""
+    if mi.is_polarized:
+        return False
     is_flat = not shape.has_vertex_normals() if shape.is_mesh() else shape.class_name() in FLAT_PLUGINS
-    return is_flat and any(delta_lobes(shape.bsdf()))
+    return is_flat and any(delta_lobes(shape.bsdf())) and _are_known(shape.bsdf())
+
+
+def _are_known(bsdf: mi.BSDF) -> bool:
+    """Return whether ``delta_lobes`` has all delta reflection components of a BSDF."""
+    parts = _parts(bsdf)
+    if not parts or bsdf.class_name() in ("TwoSidedBRDF", "BlendBSDF"):
+        return all(map(_are_known, parts))
+    return not bool(bsdf.flags() & mi.BSDFFlags.DeltaReflection)
+
+
+def _parts(bsdf: mi.BSDF) -> list[mi.BSDF]:
+    parts = [part for part, (holder, _) in mi.traverse(bsdf).hierarchy.items() if holder is bsdf]
+    return [part for part in parts if isinstance(part, mi.BSDF)]
 
 
 def delta_lobes(bsdf: mi.BSDF) -> tuple[int, int]:
@@ -189,8 +204,7 @@ def delta_lobes(bsdf: mi.BSDF) -> tuple[int, int]:
     Sampling a component by itself has the lobe's own weight as its result, in BSDFs that hold no other, in blends of
     these, and in ``twosided``, where a component belongs to one side. Not in masks; bump maps turn the normal.
     """
-    parts = [part for part, (holder, _) in mi.traverse(bsdf).hierarchy.items() if holder is bsdf]
-    parts = [part for part in parts if isinstance(part, mi.BSDF)]
+    parts = _parts(bsdf)
     if not parts:
         is_mirror = (bool(bsdf.flags(k) & mi.BSDFFlags.DeltaReflection) for k in range(bsdf.component_count()))
         own = sum(1 << k for k, mirrors in enumerate(is_mirror) if mirrors)

@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import cached_property
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -16,6 +17,7 @@ from nlosrender.engine.interface import Budget, OmittedWork, PilotSeconds, TimeE
 from nlosrender.engine.launch.accumulation import Accumulation, lane_randomness
 from nlosrender.engine.launch.cost_pilot import sampled_batch_bytes, sampling_estimate
 from nlosrender.engine.launch.device_capture import DeviceCapture
+from nlosrender.engine.launch.flat_mirrors import FlatMirrors
 from nlosrender.engine.launch.hidden_aabb import HiddenAabb
 from nlosrender.engine.launch.histogram import DeviceHistogram, Histogram, HistogramShape
 from nlosrender.engine.launch.lane_random_state import LaneRandomness
@@ -82,6 +84,7 @@ class PathEngine:
     def settings(self) -> PathSettings:
         """What the kernels compute, and how."""
         flags = [shape.bsdf().flags() for shape in self.built.hidden_shapes]
+        has_spot = self.capture.laser_spot_radius > 0
         return PathSettings(
             bounces=self.options.bounces,
             first_bounce=self.first_bounce,
@@ -92,8 +95,17 @@ class PathEngine:
             needs_visibility=not nothing_occludes(self.built),
             has_transmission=any(bool(flag & mi.BSDFFlags.Transmission) for flag in flags),
             is_plain_diffuse=is_plain_diffuse(self.built),
-            max_tries=self.tuning.max_tries,
+            has_mirrors=self.mirrors is not None,
+            # with a mirrored spot every path adds what its sensor point sees of it
+            max_tries=0 if has_spot and self.mirrors is not None else self.tuning.max_tries,
         )
+
+    @property
+    def mirrors(self) -> FlatMirrors | None:
+        """Flat mirrors by way of which vertices are connected to lasers: from bounce 4 on, with a spot from 3 on."""
+        highest, has_spot = self.options.bounces.max_bounces, self.capture.laser_spot_radius > 0
+        is_needed = has_spot or highest is None or highest > THIRD_BOUNCE
+        return self.device.mirrors if is_needed and self.options.laser_sampling else None
 
     @cached_property
     def hidden_aabb(self) -> HiddenAabb | None:
@@ -191,7 +203,12 @@ class PathEngine:
         params = self.device.launch_params(batch, shape, self.device.lane_order(batch))
         if self.p_hidden_sampling > 0:
             self.sampler.set_up()
-        own = {"hidden_aabb": self.hidden_aabb, "continuation_period": dr.opaque(mi.UInt32, period)}
+        own: dict[str, Any] = {
+            "hidden_aabb": self.hidden_aabb,
+            "continuation_period": dr.opaque(mi.UInt32, period),
+            "mirrors": self.mirrors,
+            "mirrors_per_vertex": dr.opaque(mi.UInt32, self.tuning.mirrors_per_vertex),
+        }
         return PathParams(**vars(params), **own)
 
     def _pilot_shape(self, pilot: Pilot) -> HistogramShape:

@@ -19,6 +19,8 @@ energy E with f_l; V is visibility. With bounce index b = k + 2 the deposit, in 
 
     H_b += E  T_k  f(x_k) cos  f_l cos_l  V / |x_k - l|^2                     [``laser_connections``]
 
+and the same by way of flat mirrors one bounce later, see ``connect_by_mirrors``.
+
 Russian roulette divides T by the survival probability (``_survival``): at every bounce from the first deposited one on
 the albedo, at bounce 3 over the period n (``continuation_period``); and, once, that of the time gate where a path can
 only bring light after the time window.
@@ -37,12 +39,19 @@ from nlosrender.engine.launch.lane_random_state import LaneRandomness
 from nlosrender.engine.launch.sequences import SystematicSequence, first_coordinate, recurrence_steps
 from nlosrender.engine.launch.surface_sampler import SurfaceSample
 from nlosrender.engine.launch.time_gate import time_gate_roulette
-from nlosrender.engine.path.laser_connections import PathVertex, connect_to_lasers, deposit_spot
+from nlosrender.engine.path.laser_connections import (
+    PathVertex,
+    connect_by_mirrors,
+    connect_to_lasers,
+    deposit_spot,
+    disk_point,
+)
 from nlosrender.engine.path.settings import PathParams, PathSettings
 from nlosrender.engine.path.vertex_steps import (
     Departure,
     DirectionNumbers,
     arrive,
+    is_imaged,
     leave,
     misses_hidden,
     turns_away,
@@ -133,6 +142,7 @@ def trace_paths(
         if dr.hint(settings.laser_sampling, mode="scalar"):
             lit_vertex = PathVertex(there.si, way.origin, there.leg, opl, throughput, bounce)
             connect_to_lasers(settings, params, histogram, generator, lit_vertex, hit & settings.is_deposited(bounce))
+            connect_by_mirrors(settings, params, histogram, generator, lit_vertex, hit)
 
         # ---- Continue, or start the next path -----------------------------------------------------------------------
         go_on = hit & settings.may_go_on(bounce)
@@ -151,19 +161,28 @@ def trace_paths(
             further = DirectionNumbers.drawn(generator, go_on)
             numbers = dr.select(start, numbers, further)
             t = dr.select(start, t, unit_interval(generator.next_uint32(go_on)))
+        if dr.hint(settings.mirrors_spot, mode="scalar"):
+            at_sensor = PathVertex(
+                sensor, sensor.p, mi.Vector3f(0), mi.Float(0), mi.Spectrum(1), mi.UInt32(FIRST_BOUNCE)
+            )
+            in_spot = settings.spot_radius * disk_point(mi.Point2f(unit_interval(numbers.bits_u), numbers.v))
+            connect_by_mirrors(settings, params, histogram, generator, at_sensor, start, in_spot)
         has_target = alive & on_wall & (t < q)
         by_bsdf = alive & ~has_target
         sample = None
         if dr.hint(q > 0, mode="scalar"):
             sample = sampler.sample(numbers.bits_u, numbers.v, has_target)
             dark = has_target & turns_away(params, sample, vertex.p)
-            if dr.hint(q == 1 and sampler.dark_behind, mode="scalar"):
+            if dr.hint(q == 1 and sampler.dark_behind and not settings.mirrors_spot, mode="scalar"):
                 starts, sample, dark = _begin_until_lit(
                     params, starts, stride, steps, n_samples, vertex.p, start, sample, dark
                 )
             alive &= ~dark
             has_target &= ~dark
+        before = way
         way, survival, eta = leave(settings, params, generator, vertex, on_wall, numbers, sample, by_bsdf, has_target)
+        if dr.hint(settings.mirrors_spot, mode="scalar"):
+            way.is_imaged = is_imaged(params, vertex, before, way, by_bsdf & ~start)
         if dr.hint(params.hidden_aabb is not None, mode="scalar"):
             misses = start & by_bsdf & misses_hidden(params, way.ray)
             generator, starts, way, survival, eta, misses = _begin_until_near(

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import drjit as dr
 import mitsuba as mi
 
+from nlosrender.engine.launch.mirror_connections import MirroredVertex, deposit_reflections
 from nlosrender.engine.launch.ray_offsets import connection_segment
 
 if TYPE_CHECKING:
@@ -59,6 +60,37 @@ def connect_to_lasers(
         while dr.hint(laser < params.n_lasers, exclude=[settings, params, histogram, vertex, active]):
             _connect(settings, params, histogram, in_spot, laser, vertex, active, coherent)
             laser += 1
+
+
+def connect_by_mirrors(
+    settings: PathSettings,
+    params: PathParams,
+    histogram: DeviceHistogram,
+    generator: mi.PCG32,
+    vertex: PathVertex,
+    active: mi.Bool,
+    in_spot: mi.Vector3f | None = None,
+) -> None:
+    """Connect a vertex to every laser of the lane by way of flat mirrors and deposit, one bounce later than directly.
+
+    By way of ``mirrors_per_vertex`` from a random one on, with the weight that makes up for the others; of all of them
+    where the point of the spot is given. docs/virtual-lights.md, 11.2.
+    """
+    mirrors, bounce = params.mirrors, vertex.bounce + 1
+    if mirrors is None:
+        return
+    active = active & settings.is_deposited(bounce)
+    count = mirrors.count
+    if in_spot is None:
+        count = dr.minimum(count, params.mirrors_per_vertex)
+        if settings.finds_spot:
+            in_spot = _on_disk(generator, active) * settings.spot_radius
+    first = mi.UInt32(generator.next_float32(active & (count < mirrors.count)) * mi.Float(mirrors.count))
+    first = dr.select(count < mirrors.count, dr.minimum(first, mirrors.count - 1), 0)
+    throughput = vertex.throughput * (mi.Float(mirrors.count) / mi.Float(count))
+    slot = settings.slot(bounce)
+    start = MirroredVertex(vertex.si, throughput, vertex.opl, slot, first, count, in_spot)
+    deposit_reflections(params, mirrors, histogram, start, active)
 
 
 def _connect(
@@ -117,12 +149,13 @@ def deposit_spot(
 ) -> None:
     """Deposit the radiance of the laser's spot on rays that met the relay wall inside it; once per laser of the lane.
 
-    ``opl`` is the path's length up to the wall, ``throughput`` and ``bounce`` those of the vertex before.
+    ``opl`` is the path's length up to the wall, ``throughput`` and ``bounce`` those of the vertex before. What
+    ``connect_by_mirrors`` finds is left out.
     """
     context, slot, si = mi.BSDFContext(), settings.slot(bounce), there.si
     spot_area = dr.pi * settings.spot_radius**2
     cosine = dr.maximum(-dr.dot(si.n, way.ray.d), 1e-9)
-    on_wall = there.is_reached & there.on_wall
+    on_wall = there.is_reached & there.on_wall & ~way.is_imaged
     laser = mi.UInt32(0)
     while dr.hint(laser < params.n_lasers, exclude=[settings, params, histogram, there, way, si]):
         points = params.lasers.gather(params.first_laser + laser)
@@ -143,6 +176,10 @@ def _balance_heuristic(own: mi.Float, other: mi.Float) -> mi.Float:
 
 
 def _on_disk(generator: mi.PCG32, active: mi.Bool) -> mi.Vector3f:
-    square = mi.Point2f(generator.next_float32(active), generator.next_float32(active))
+    return disk_point(mi.Point2f(generator.next_float32(active), generator.next_float32(active)))
+
+
+def disk_point(square: mi.Point2f) -> mi.Vector3f:
+    """Return points of the unit disk in z = 0, uniform by area where the numbers are in the unit square."""
     point = mi.warp.square_to_uniform_disk_concentric(square)
     return mi.Vector3f(point.x, point.y, 0)

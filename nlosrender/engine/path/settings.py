@@ -8,6 +8,7 @@ import drjit as dr
 import mitsuba as mi
 
 from nlosrender.capture.bounces import FIRST_BOUNCE, THIRD_BOUNCE, BounceAxis
+from nlosrender.engine.launch.flat_mirrors import FlatMirrors
 from nlosrender.engine.launch.hidden_aabb import HiddenAabb
 from nlosrender.engine.launch.launch_params import LaunchParams
 from nlosrender.engine.path.tuning import PathTuning
@@ -26,6 +27,7 @@ class PathSettings:
     needs_visibility: bool  # something may occlude a vertex from a laser or sensor point
     has_transmission: bool  # some BSDF refracts: the optical path length needs the medium's index
     is_plain_diffuse: bool  # flat surfaces of one reflectance each: only normals matter to their BSDFs
+    has_mirrors: bool = False  # vertices are connected to the lasers by way of flat mirrors, too
     max_tries: int = PathTuning.max_tries  # see ``PathTuning``
 
     @property
@@ -72,6 +74,11 @@ class PathSettings:
         return dr.minimum(bounce - (FIRST_BOUNCE + 1), mi.UInt32(self.bounces.n_slots - 2))
 
     @property
+    def mirrors_spot(self) -> bool:
+        """Whether sensor points are connected to points of the spot by way of mirrors, and rays need not find it so."""
+        return self.has_mirrors and self.finds_spot
+
+    @property
     def finds_spot(self) -> bool:
         """Whether rays may find the laser's spot by chance."""
         return self.spot_radius > 0
@@ -83,3 +90,5 @@ class PathParams(LaunchParams):
 
     hidden_aabb: HiddenAabb | None  # None: few rays from the wall miss it
     continuation_period: mi.UInt32  # n: one path in n continues after bounce 3; opaque
+    mirrors: FlatMirrors | None  # None: vertices are not connected by way of mirrors
+    mirrors_per_vertex: mi.UInt32  # how many of them a vertex is connected by way of, drawn at random; opaque

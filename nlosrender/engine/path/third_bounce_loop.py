@@ -14,6 +14,8 @@ Higher bounces by Russian roulette: one path in n continues with weight n (``fol
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import drjit as dr
 import mitsuba as mi
 
@@ -24,7 +26,7 @@ from nlosrender.engine.launch.ray_offsets import connection_segment
 from nlosrender.engine.launch.sequences import SystematicSequence, first_coordinate, recurrence_steps
 from nlosrender.engine.launch.surface_sampler import SurfaceSample, SurfaceSampler
 from nlosrender.engine.launch.time_gate import time_gate_roulette
-from nlosrender.engine.path.laser_connections import PathVertex, connect_to_lasers
+from nlosrender.engine.path.laser_connections import PathVertex, connect_by_mirrors, connect_to_lasers
 from nlosrender.engine.path.settings import PathParams, PathSettings
 from nlosrender.engine.path.vertex_steps import DirectionNumbers, arrive, leave, turns_away, unit_interval
 
@@ -136,6 +138,7 @@ def follow_paths(
     on_wall = mi.Bool(False)  # the vertex lies on the relay wall
     medium = mi.Float(1)  # refractive index along the ray
     is_past_gate = mi.Bool(False)  # as in ``trace_paths``
+    connect_by_mirrors(settings, params, histogram, generator, replace(first, throughput=throughput), alive)
 
     while dr.hint(alive, exclude=[settings, params, histogram, built, sampler, time_gate]):
         # ---- Sample the next direction ------------------------------------------------------------------------------
@@ -168,6 +171,7 @@ def follow_paths(
         vertex, on_wall = there.si, there.on_wall
         lit_vertex = PathVertex(vertex, way.origin, there.leg, opl, throughput, bounce)
         connect_to_lasers(settings, params, histogram, generator, lit_vertex, alive)
+        connect_by_mirrors(settings, params, histogram, generator, lit_vertex, alive)
 
         # ---- Stop ---------------------------------------------------------------------------------------------------
         if dr.hint(last_vertex is not None, mode="scalar"):

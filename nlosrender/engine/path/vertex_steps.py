@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 import drjit as dr
 import mitsuba as mi
 
+from nlosrender.engine.launch.flat_mirrors import NO_MIRROR
 from nlosrender.engine.launch.launch_params import MAX_SURVIVAL
 from nlosrender.engine.launch.ray_offsets import leg_to_tangent_plane, offset_origin
 
@@ -33,6 +34,7 @@ class Departure:
     bsdf_density: mi.Float  # share of BSDF sampling in the direction's density [1/sr]; 1 for delta lobes
     hidden_density: mi.Float  # share of hidden geometry sampling, before the Jacobian [1/area]
     is_delta: mi.Bool  # the direction comes from a delta lobe
+    is_imaged: mi.Bool  # that of a flat mirror, and the direction before from none: connections by way of it find more
     has_target: mi.Bool  # it was sent to a sampled point of the hidden geometry: the next three
     target: mi.Point3f
     target_shape: mi.ShapePtr
@@ -43,7 +45,7 @@ class Departure:
         """Return the state before the first path."""
         ray, origin, shape = dr.zeros(mi.Ray3f), mi.Point3f(0), mi.ShapePtr(built.wall_shape)
         zero, no = mi.Float(0), mi.Bool(False)
-        return cls(ray, origin, mi.Spectrum(0), zero, zero, no, no, mi.Point3f(0), shape, mi.UInt32(0))
+        return cls(ray, origin, mi.Spectrum(0), zero, zero, no, no, no, mi.Point3f(0), shape, mi.UInt32(0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -178,6 +180,17 @@ def leave(
         world = dr.select(has_target, dr.normalize(sample.p - ray_origin), world)
     way.ray = mi.Ray3f(ray_origin, world)
     return way, survival, eta
+
+
+def is_imaged(
+    params: PathParams, vertex: mi.SurfaceInteraction3f, before: Departure, way: Departure, active: mi.Bool
+) -> mi.Bool:
+    """Return whether a vertex is a flat mirror that reflects a scattered ray: ``before`` the ray to it, ``way`` on."""
+    if params.mirrors is None:
+        return mi.Bool(False)
+    is_reflected = mi.Frame3f.cos_theta(vertex.wi) * dr.dot(vertex.sh_frame.n, way.ray.d) > 0
+    is_first = active & way.is_delta & ~before.is_delta & is_reflected
+    return is_first & (params.mirrors.number_at(vertex, is_first) != NO_MIRROR)
 
 
 def turns_away(params: PathParams, sample: SurfaceSample, origin: mi.Point3f) -> mi.Bool:

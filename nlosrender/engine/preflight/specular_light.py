@@ -2,7 +2,7 @@
 
 Rays whose first hit has a delta lobe (S) are followed until they scatter at a vertex that a sensor point sees. Nothing
 is rendered: the result is which surfaces send light along paths that no technique samples, see ``unsampled_paths``.
-What flat mirrors send from the laser to sensor points, bounce 3, is none of it: it is computed (``FlatMirrors``).
+What a flat mirror sends from the laser to a surface that scatters is none of it: connections find it (``FlatMirrors``).
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from nlosrender.capture.arrivals import sampled_indices
 from nlosrender.capture.grids import Capture
 from nlosrender.capture.time_axis import TimeAxis
 from nlosrender.engine.launch.device_arrays import columns
-from nlosrender.engine.launch.flat_mirrors import NONE, FlatMirrors
+from nlosrender.engine.launch.flat_mirrors import NO_MIRROR, FlatMirrors
 from nlosrender.engine.launch.ray_offsets import offset_origin
 from nlosrender.engine.launch.surface_sampler import SAMPLEABLE_PLUGINS
 from nlosrender.engine.launch.wall_points import laser_points
@@ -126,7 +126,7 @@ def _followed(
 ) -> Iterator[SpecularLight]:
     """Follow rays that had ``interactions`` surface interactions; yield the specular light of the surfaces met first.
 
-    What ``mirrors`` send straight to sensor points is left out.
+    Rays that ``mirrors`` send straight to where they scatter are left out.
 
     The bounce is the lowest that a surface was seen to add to: a ray met the wall among the sensor points, or scattered
     where one of them sees it.
@@ -154,12 +154,12 @@ def _followed(
             first = 2 * np.array(dr.reinterpret_array(mi.UInt32, si.shape), dtype=np.int64) + np.array(crossing > 0)
             hit &= is_delta | start.is_specular
             if mirrors is not None:
-                is_imaged = np.array((mirrors.number_at(si, mi.Bool(hit)) != NONE) & (crossing > 0), dtype=bool)
+                is_imaged = np.array((mirrors.number_at(si, mi.Bool(hit)) != NO_MIRROR) & (crossing > 0), dtype=bool)
+        if event == 1:
+            hit &= is_delta | ~is_imaged
         if event > 0 or start.is_specular:
             scattered = mi.Bool(hit & ~is_delta)
             for more, measured in enumerate(_measured(built, capture, si, scattered, event)):
-                if event == 1 and more == 0:
-                    measured &= ~is_imaged  # in place: an array of its own
                 for sent in np.unique(first[measured]).tolist():
                     lowest.setdefault(sent, count + more)
         if set(np.unique(first[hit]).tolist()) <= set(lowest):

@@ -1,0 +1,87 @@
+"""Mirror connections: from vertices to the laser points by way of one flat mirror, and deposits."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+from nlosrender.engine.launch.flat_mirrors import FlatMirrors
+from nlosrender.engine.launch.histogram import DeviceHistogram
+from nlosrender.engine.launch.launch_params import LaunchParams
+
+
+@dataclass(frozen=True, eq=False)
+class MirroredVertex:
+    """Vertices to be connected, one per lane, and by way of which mirrors."""
+
+    si: mi.SurfaceInteraction3f
+    throughput: mi.Spectrum  # of the path up to it
+    opl: mi.Float  # of the path up to it [engine units]
+    slot: mi.UInt32  # bounce slot of the deposits
+    first: mi.UInt32  # mirror of the first connection
+    count: mi.UInt32  # of mirrors; after the last one follows number 0
+    in_spot: mi.Vector3f | None  # from the laser point to the point of its spot, in the wall's frame; None: no spot
+
+
+def deposit_mirrored_bounce(params: LaunchParams, mirrors: FlatMirrors, histogram: DeviceHistogram) -> None:
+    """Deposit the third bounce by way of one mirror, for every lane and each of its lasers; exact.
+
+    As ``deposit_second_bounce``.
+    """
+    sensor, zero = params.sensors.interaction, mi.UInt32(0)
+    vertex = MirroredVertex(sensor, mi.Spectrum(1), mi.Float(0), zero, zero, mirrors.count, None)
+    deposit_reflections(params, mirrors, histogram, vertex, mi.Bool(True))
+
+
+@dr.syntax
+def deposit_reflections(
+    params: LaunchParams, mirrors: FlatMirrors, histogram: DeviceHistogram, vertex: MirroredVertex, active: mi.Bool
+) -> None:
+    """Deposit what mirrors reflect to vertices from every laser of their lanes."""
+    laser = mi.UInt32(0)
+    while dr.hint(laser < params.n_lasers, exclude=[params, mirrors, histogram, vertex, active]):
+        place, tried = _lit(params, vertex, laser).p, mi.UInt32(0)
+        while dr.hint(
+            active & (tried < vertex.count),
+            exclude=[params, mirrors, histogram, vertex, active, laser, place],
+        ):
+            number = vertex.first + tried
+            number = dr.select(number < mirrors.count, number, number - mirrors.count)
+            is_near = active & mirrors.may_reflect(number, vertex.si.p, place)
+            _connect(params, mirrors, histogram, vertex, laser, number, is_near)
+            tried += 1
+        laser += 1
+
+
+@dr.syntax
+def _connect(
+    params: LaunchParams,
+    mirrors: FlatMirrors,
+    histogram: DeviceHistogram,
+    vertex: MirroredVertex,
+    laser: mi.UInt32,
+    number: mi.UInt32,
+    active: mi.Bool,
+) -> None:
+    """Connect vertices by way of one mirror; packets with no active lane skip the rays."""
+    if dr.hint(active, exclude=[params, mirrors, histogram, vertex, laser, number]):
+        built, si, lit = params.built, vertex.si, _lit(params, vertex, laser)
+        seen = mi.Bool(active)
+        if dr.hint(vertex.in_spot is not None, mode="scalar"):
+            # the part of a spot beyond the wall's edge lights nothing
+            seen &= built.wall_shape.ray_test(mi.Ray3f(lit.p + 1e-2 * lit.n, -lit.n), active=seen)
+        found = mirrors.reflected(built, number, si, lit, seen)
+        scattered = si.bsdf().eval(mi.BSDFContext(), si, si.to_local(found.direction), found.active)
+        bins = params.delay_bin(params.lasers.gather(params.first_laser + laser), vertex.opl + found.distance)
+        value = vertex.throughput * scattered * found.value
+        histogram.deposit(params.row_of_lane, laser, vertex.slot, bins, value, found.active)
+
+
+def _lit(params: LaunchParams, vertex: MirroredVertex, laser: mi.UInt32) -> mi.SurfaceInteraction3f:
+    """Return the point that is connected to: a laser point, or the same point of every laser's spot."""
+    lit = params.lasers.gather(params.first_laser + laser).interaction
+    if vertex.in_spot is not None:
+        lit.p = lit.p + lit.to_world(vertex.in_spot)
+    return lit
