@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -94,32 +95,32 @@ def refined_to(
         Sum of the squares of exact light at these points [(engine unit)^-4].
     """
     tuning = tessellator.tuning
-    levels = [(gather(tuning.coarsest_scale), math.inf)]  # and its error, coarse to fine
+    gather = cache(gather)
+    levels: list[tuple[int, float]] = []  # numbers of patches and their errors, coarse to fine
     patch_scale = finer_scale(tessellator, tuning.coarsest_scale, tuning.refinement)
     while True:
-        fine = gather(patch_scale)
-        # no level nearer: two that differ in few patches differ by more than either errs, by how they are cut
-        levels = levels[_last_at_most(levels, fine.n_patches / tuning.min_patch_ratio) :]
-        coarse = levels[0][0]
+        # with the coarser one that the render itself will have
+        coarse, fine = gather(coarser_scale(tessellator, patch_scale)), gather(patch_scale)
         error = estimated_error(coarse, fine, known_squares)
-        coarser = coarser_scale(tessellator, patch_scale)
-        if error <= target and not math.isclose(coarse.patch_scale, coarser, rel_tol=tuning.same_scale):
-            # as the render will estimate it, from the pair of resolutions that it has
-            error = max(error, estimated_error(gather(coarser), fine, known_squares))
-        earlier = levels[_last_at_most(levels, fine.n_patches / 2)][1]
+        earlier = next((error for count, error in reversed(levels) if count <= fine.n_patches / 2), math.inf)
         is_stuck = tuning.stagnation * earlier < error and fine.n_patches > 2 * coarse.n_patches
         is_beyond = fine.n_patches * error / target > tuning.max_patches
         in_vain = error < tuning.max_regular_error and (is_stuck or is_beyond)
         if error <= target or in_vain or 2 * fine.n_patches > tuning.max_patches:
             return patch_scale, fine
-        levels.append((fine, error))
-        more = max(tuning.refinement_margin * error / target, tuning.min_refinement)
-        patch_scale = finer_scale(tessellator, patch_scale, min(more, tuning.refinement))
+        more = (tuning.refinement_margin * error / target) ** (
+            1 / _order(levels, fine.n_patches, error, tuning.max_order)
+        )
+        levels.append((fine.n_patches, error))
+        patch_scale = finer_scale(tessellator, patch_scale, min(max(more, tuning.min_refinement), tuning.refinement))
 
 
-def _last_at_most(levels: list[tuple[Gathered, float]], n_patches: float) -> int:
-    """Return the index of the finest level of at most ``n_patches``, of the coarsest if all have more."""
-    return max((index for index, (gathered, _) in enumerate(levels) if gathered.n_patches <= n_patches), default=0)
+def _order(levels: list[tuple[int, float]], n_patches: int, error: float, most: float) -> float:
+    """Return the power of the number of patches that the error falls by from the last level on: 1 to ``most``."""
+    if not levels or levels[-1][0] >= n_patches:
+        return 1.0
+    count, earlier = levels[-1]
+    return min(max(math.log(earlier / error) / math.log(n_patches / count), 1.0), most)
 
 
 def _squares(values: NDArray[np.float64]) -> float:
