@@ -151,6 +151,42 @@ def test_lobes_follow_averaged_normals(tmp_path: Path) -> None:
     assert_agrees(paths.total, paths.total_variance, lights.total, replicas=32, floor=0.01)
 
 
+def facing_plates(bsdf: dict[str, Any], *, turned: bool) -> tuple[dict[str, Any], ...]:
+    """Return two plates that light each other; the first may turn its back to the wall."""
+    normal = np.array([-0.7, 0.1, -0.7]) * (-1 if turned else 1)
+    first = {"width": 0.6, "height": 0.5, "center": [0.25, 0, 0.6], "normal": normal.tolist()}
+    second = {"width": 0.5, "height": 0.6, "center": [-0.25, 0.05, 0.55], "normal": [0.8, 0, -0.6]}
+    return tuple({"type": "rectangle", "bsdf": bsdf} | place for place in (first, second))
+
+
+FURTHER = [("principled", "single", False), ("two sides", "confocal", True)]
+FURTHER_SLOWLY = [
+    ("two sides", "single", True),
+    ("brushed metal", "confocal", False),
+    ("blend", "exhaustive", False),
+    ("rough plastic", "exhaustive", False),
+]
+
+
+@pytest.mark.parametrize(
+    ("name", "scan", "turned"), FURTHER + [pytest.param(*more, marks=pytest.mark.slow) for more in FURTHER_SLOWLY]
+)
+def test_further_bounces_agree_on_every_lobe(name: str, scan: str, turned: bool) -> None:
+    """VPLs and paths, bounce by bounce, in every sensor point's energy and in all of it."""
+    plates = facing_plates(LOBES[name], turned=turned)
+    common = {"scan": scan, "sensors": (3, 2), "bins": (0.8, 0.2, 20), "color": "grey", "max_bounces": 6}
+    lights = render(flat_wall(*plates, spp=None, engine="auto", target_error=0.02, **common))
+    paths = render(flat_wall(*plates, spp=2**15, **common))
+    assert lights.samples > 0
+    for bounce in (4, 5, 6):
+        energies = [result.bounce(bounce).sum(axis=-1) for result in (lights, paths)]
+        sigma = np.sqrt(sum(result.bounce_variance(bounce).sum(axis=-1) for result in (lights, paths)))
+        assert energies[1].sum() > 0
+        assert (np.abs(energies[0] - energies[1]) <= 5 * sigma).all()
+        # sensor points share VPLs: their errors may all have one sign
+        assert abs(energies[0].sum() - energies[1].sum()) <= 4 * sigma.sum()
+
+
 def test_linear_light_is_spread_over_bins_as_over_the_triangle() -> None:
     """Shares of light per bin where light is linear over a triangle, in any order of the corners, against cells."""
     start_backend("llvm")

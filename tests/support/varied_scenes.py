@@ -235,7 +235,7 @@ TRAPS = {
         {"color": "grey"},
     ),
     "rough metal": Trap(
-        "BSDFs that are not Lambertian: their third bounce is gathered, the rest is traced",
+        "BSDFs that are not Lambertian, in the gather of patches and of VPLs",
         (
             plate((0.15, -0.1, 0.6), (0.2, -0.1, -1.0), (0.8, 0.6), {"type": "roughconductor", "alpha": 0.4}),
             plate((-0.6, 0.0, 0.55), (1.0, 0.1, -0.2), (0.6, 0.8), {"type": "roughplastic", "alpha": 0.3}),

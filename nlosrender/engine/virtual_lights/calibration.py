@@ -34,7 +34,7 @@ def calibrated_lights(third: ThirdBounce, further: VplBounces | None, budget: Bu
     if further is not None:
         share = tuning.third_shares[0]
     few = _pilot_of_patches(third, pilot)
-    patch_scale, gathered = _refined(third, few, share * target)
+    patch_scale, gathered, of_third = _refined(third, few, share * target)
     if further is None:
         return replace(budget, patch_scale=patch_scale)
     goal, squares = tuning.rest_share_of_many * target, gathered.squares * (pilot.sensors.size / few.sensors.size)
@@ -47,12 +47,14 @@ def calibrated_lights(third: ThirdBounce, further: VplBounces | None, budget: Bu
         error = histogram.relative_error(done, squares)
     share = further.share_of_third(gathered.n_patches, error * math.sqrt(done) / target)
     if share < tuning.third_shares[0]:
-        patch_scale, _ = _refined(third, few, share * target)
-    rounds = further.rounds_needed(error, done, math.sqrt(tuning.share_squares - share**2) * target)
+        patch_scale, _, of_third = _refined(third, few, share * target)
+    # patches come in steps: what they leave of their share is spent on rounds
+    left = math.sqrt(tuning.share_squares - min(share, of_third / target) ** 2) * target
+    rounds = further.rounds_needed(error, done, left)
     return replace(budget, patch_scale=patch_scale, rounds=rounds)
 
 
-def _refined(third: ThirdBounce, pilot: Pilot, target: float) -> tuple[float, Gathered]:
+def _refined(third: ThirdBounce, pilot: Pilot, target: float) -> tuple[float, Gathered, float]:
     known_squares = third.device.exact_squares(pilot)
     return refined_to(target, third.tessellator, lambda scale: third.gather(pilot, scale), known_squares)
 

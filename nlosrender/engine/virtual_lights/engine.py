@@ -76,9 +76,9 @@ class VirtualLightEngine:
         reciprocal = is_reciprocal(built, capture, self.time_axis.n_bins, is_lambertian=all_lambertian, tuning=tuning)
         self.third = ThirdBounce(device, self.tessellator, self.settings, lanes, reciprocal)
         self.further: VplBounces | None = None  # else ``paths``, where further bounces are asked for
-        if self.has_further_bounces and self.settings.is_diffuse:
+        if self.has_further_bounces and not any(_has_delta_lobe(shape.bsdf()) for shape in shapes):
             masks = self.third.masks if self.settings.needs_visibility else None
-            self.further = VplBounces(device, self.tessellator, masks)
+            self.further = VplBounces(device, self.tessellator, masks, self.settings.is_diffuse)
         surfaces = "Lambertian" if self.settings.is_diffuse else "diffuse and rough"
         self.reason = f"{surfaces} surfaces before a {'planar' if built.wall.is_planar else 'curved'} wall"
         self._calibrated: dict[Budget, Budget] = {}
@@ -234,3 +234,7 @@ class VirtualLightEngine:
 def is_lambertian(bsdf: mi.BSDF) -> bool:
     """Return whether a BSDF is Mitsuba's one-sided ``diffuse``."""
     return bsdf.class_name() == "SmoothDiffuse"
+
+
+def _has_delta_lobe(bsdf: mi.BSDF) -> bool:
+    return mi.has_flag(bsdf.flags(), mi.BSDFFlags.Delta)

@@ -79,8 +79,8 @@ def coarser_scale(tessellator: Tessellator, patch_scale: float) -> float:
 
 def refined_to(
     target: float, tessellator: Tessellator, gather: Callable[[float], Gathered], known_squares: float
-) -> tuple[float, Gathered]:
-    """Return the patch scale whose estimated error is at most ``target``, and the third bounce at it.
+) -> tuple[float, Gathered, float]:
+    """Return the patch scale whose estimated error is at most ``target``, the third bounce at it, and that error.
 
     Ends earlier where refining is in vain: float32 path lengths and grazing contacts leave an error that no refinement
     takes away, and ``max_patches`` bounds the number of patches.
@@ -107,7 +107,7 @@ def refined_to(
         is_beyond = fine.n_patches * error / target > tuning.max_patches
         in_vain = error < tuning.max_regular_error and (is_stuck or is_beyond)
         if error <= target or in_vain or 2 * fine.n_patches > tuning.max_patches:
-            return patch_scale, fine
+            return patch_scale, fine, error
         more = (tuning.refinement_margin * error / target) ** (
             1 / _order(levels, fine.n_patches, error, tuning.max_order)
         )

@@ -258,3 +258,9 @@ def irradiance(built: BuiltScene, laser: WallPoints, point: mi.Point3f, shading:
     direction = to_point * dr.rsqrt(distance2)
     emitted = built.wall_bsdf.eval(mi.BSDFContext(), laser.interaction, laser.interaction.to_local(direction))
     return emitted * (dr.maximum(-dr.dot(shading, direction), 0) / distance2)
+
+
+def perpendicular_irradiance(built: BuiltScene, laser: WallPoints, point: mi.Point3f) -> mi.Spectrum:
+    """Return the irradiance of a surface at a point that faces the laser point [1 / (engine unit)^2 per J]."""
+    to_point = point - laser.interaction.p
+    return irradiance(built, laser, point, mi.Normal3f(-dr.normalize(to_point)))

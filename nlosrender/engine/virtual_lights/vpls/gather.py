@@ -14,8 +14,8 @@ from nlosrender.engine.launch.device_arrays import on_device
 from nlosrender.engine.launch.histogram import DeviceHistogram, HistogramShape
 from nlosrender.engine.launch.launch_params import LaunchParams
 from nlosrender.engine.launch.ray_offsets import off_the_surface
-from nlosrender.engine.virtual_lights.gather.device_patches import to_points
-from nlosrender.engine.virtual_lights.gather.lighting import irradiance
+from nlosrender.engine.virtual_lights.gather.device_patches import surface_at, to_points
+from nlosrender.engine.virtual_lights.gather.lighting import irradiance, perpendicular_irradiance
 from nlosrender.engine.virtual_lights.visibility.masks import Surface, VisibilityMasks, WallTiles
 from nlosrender.engine.virtual_lights.visibility.shadow_rays import is_visible
 from nlosrender.scene.build import BuiltScene
@@ -34,6 +34,7 @@ class VplTable:
     shading: mi.Normal3f
     mask: mi.UInt64  # see ``VisibilityMasks.of``
     first: mi.UInt32  # per replica: its VPLs are first[r] to first[r + 1]
+    interaction: mi.SurfaceInteraction3f | None  # None: all are Lambertian
 
     @classmethod
     def of(
@@ -74,7 +75,8 @@ class VplTable:
             where, active = dr.zeros(mi.UInt32, len(used)), dr.full(mi.Bool, True, len(used))
             mask = masks.of(surface, wall_tiles, where, active)
         packed, first_vpl = on_device(mi.Float, rows.ravel()), on_device(mi.UInt32, first)
-        return cls(packed, mi.Vector3f(to_points(offset)), shading, mask, first_vpl)
+        interaction = None if contributions.directions is None else surface_at(built, vpls.select(used))
+        return cls(packed, mi.Vector3f(to_points(offset)), shading, mask, first_vpl, interaction)
 
 
 @dr.syntax
@@ -119,27 +121,60 @@ def gather_contributions(
         distance = dr.sqrt(distance2)
         direction = to_vpl / distance
         weight = wall_bsdf.eval(context, sensor, sensor.to_local(direction))
-        weight *= dr.maximum(-dr.dot(areas, direction), 0) / distance2
+        facing = -dr.dot(areas, direction)
+        if dr.hint(table.interaction is not None, mode="scalar"):
+            facing = dr.abs(facing)
+        weight *= dr.maximum(facing, 0) / distance2
         active = dr.any(weight > 0)
         if dr.hint(needs_visibility, mode="scalar"):
             mask = dr.gather(mi.UInt64, table.mask, vpl)
+            if dr.hint(table.interaction is not None, mode="scalar"):
+                mask = dr.select(dr.dot(areas, direction) < 0, mask, 0)
             offset = dr.gather(mi.Vector3f, table.offset, vpl)
             active = is_visible(built, sensor, to_vpl, offset, active, mask, tile)
 
         # ---- Deposit its contributions ------------------------------------------------------------------------------
         delay = distance * scale + sensors.delay_fraction
+        si: mi.SurfaceInteraction3f | None = None
+        si = sensor  # not read
+        if dr.hint(table.interaction is not None, mode="scalar"):
+            si = dr.gather(mi.SurfaceInteraction3f, table.interaction, vpl)
+            si.wi = si.to_local(-direction)
         contribution = dr.reinterpret_array(mi.UInt32, at.w)
         last = dr.select(active, dr.reinterpret_array(mi.UInt32, by.w), 0)
         while dr.hint(
             contribution < last,
-            exclude=[params, contributions, slots, histogram, built, sensors, weight, delay, last, own_laser],
+            exclude=[
+                params,
+                table,
+                contributions,
+                slots,
+                histogram,
+                built,
+                sensors,
+                weight,
+                delay,
+                last,
+                own_laser,
+                si,
+                context,
+            ],
         ):
             slot = dr.gather(mi.UInt32, slots, contribution)
+            reflected = mi.Spectrum(weight)
+            if dr.hint(table.interaction is not None, mode="scalar"):
+                reflected *= si.bsdf().eval(context, si, dr.gather(mi.Vector3f, contributions.directions, contribution))
             if dr.hint(is_confocal, mode="scalar"):
                 end_point = dr.gather(mi.Point3f, contributions.ends, contribution)
-                facing = dr.gather(mi.Normal3f, contributions.shading, contribution)
-                value = weight * dr.gather(mi.Spectrum, contributions.values, contribution)
-                value *= irradiance(built, own_laser, end_point, facing)
+                shading = dr.gather(mi.Normal3f, contributions.shading, contribution)
+                value = reflected * dr.gather(mi.Spectrum, contributions.values, contribution)
+                if dr.hint(contributions.interaction is None, mode="scalar"):
+                    value *= irradiance(built, own_laser, end_point, shading)
+                else:
+                    there = dr.gather(mi.SurfaceInteraction3f, contributions.interaction, contribution)
+                    to_laser = there.to_local(dr.normalize(own_laser.interaction.p - end_point))
+                    value *= perpendicular_irradiance(built, own_laser, end_point)
+                    value *= there.bsdf().eval(context, there, to_laser)
                 lit = dr.any(value > 0)
                 if dr.hint(needs_visibility, mode="scalar"):
                     end_offset = dr.gather(mi.Vector3f, contributions.offset, contribution)
@@ -152,11 +187,11 @@ def gather_contributions(
                 laser = mi.UInt32(0)
                 while dr.hint(
                     laser < n_lasers,
-                    exclude=[params, contributions, histogram, sensors, weight, delay, contribution, slot, count],
+                    exclude=[params, contributions, histogram, sensors, reflected, delay, contribution, slot, count],
                 ):
                     points = params.lasers.gather(params.first_laser + laser)
                     entry = laser * count + contribution
-                    value = weight * dr.gather(mi.Spectrum, contributions.values, entry)
+                    value = reflected * dr.gather(mi.Spectrum, contributions.values, entry)
                     arrival = delay + dr.gather(mi.Float, contributions.delays, entry) + points.delay_fraction
                     bins = mi.Int32(dr.floor(dr.minimum(arrival, 1e9))) + points.delay_bins + sensors.delay_bins
                     histogram.deposit(lane, laser, slot, bins, value, dr.any(value > 0))

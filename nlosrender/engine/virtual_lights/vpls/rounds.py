@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 
 class VplBounces:
-    """Bounces above the third of a scene of Lambertian surfaces before a planar wall.
+    """Bounces above the third of a scene without delta lobes.
 
     Parameters
     ----------
@@ -43,9 +43,13 @@ class VplBounces:
         Holds the elements that VPLs lie on.
     masks
         Tell what may lie between wall and hidden surfaces; None: nothing may.
+    is_diffuse
+        Whether all surfaces are Lambertian.
     """
 
-    def __init__(self, device: DeviceCapture, tessellator: Tessellator, masks: VisibilityMasks | None):
+    def __init__(
+        self, device: DeviceCapture, tessellator: Tessellator, masks: VisibilityMasks | None, is_diffuse: bool
+    ):
         self.device, self.masks = device, masks
         self.built, self.options = device.built, device.options
         tuning = self.tuning = tessellator.tuning
@@ -56,6 +60,12 @@ class VplBounces:
         self.proposal_lasers = ProposalLasers(
             points, proposal_lasers.size, proposal_lasers.size == capture.n_lasers, tuning.untried_share
         )
+        self.proposal_sensors = None
+        if not is_diffuse:
+            some = spread(capture.sensor_grid, tuning.proposal_sensors_per_axis).indices
+            self.proposal_sensors = (
+                capture.sensor_grid.positions.reshape(-1, 3)[list(some)] / built.metres_per_engine_unit
+            )
         pairs = capture.n_sensors * (capture.n_lasers if capture.scan_type == "exhaustive" else 1)
         self.is_confocal = capture.scan_type == "confocal"
         # every contribution of a confocal capture takes a shadow ray of its own to the laser
@@ -65,7 +75,8 @@ class VplBounces:
         self.vpls_per_round = min(
             tuning.vpls_per_round, max(64, tuning.max_contribution_values // (self.contributions_per_vpl * lasers))
         )
-        self.subpaths = int(min(max(pairs / 32, tuning.min_subpaths), tuning.max_subpaths))
+        most = tuning.max_subpaths if is_diffuse else tuning.max_glossy_subpaths
+        self.subpaths = int(min(max(pairs / 32, tuning.min_subpaths), most))
 
     @cached_property
     def sampler(self) -> VplSampler:
@@ -78,7 +89,14 @@ class VplBounces:
         max_bounces = self.options.bounces.max_bounces
         confocal, capture_gate = self.is_confocal, self.device.capture_gate
         return SubpathPlan(
-            replicas, vpls, self.subpaths, self.contributions_per_vpl, max_bounces, confocal, capture_gate
+            replicas,
+            vpls,
+            self.subpaths,
+            self.contributions_per_vpl,
+            max_bounces,
+            confocal,
+            self.proposal_sensors,
+            capture_gate,
         )
 
     @property

@@ -26,13 +26,15 @@ from nlosrender.engine.launch.ray_offsets import connection_segment, offset_orig
 from nlosrender.engine.launch.time_gate import CaptureTimeGate, TimeGate, time_gate_roulette
 from nlosrender.engine.launch.wall_points import WallPoints
 from nlosrender.engine.virtual_lights.gather.device_patches import normal_reflectance, surface_at
-from nlosrender.engine.virtual_lights.gather.lighting import irradiance
+from nlosrender.engine.virtual_lights.gather.lighting import irradiance, perpendicular_irradiance
 from nlosrender.engine.virtual_lights.tuning import DEFAULT_TUNING
 from nlosrender.scene.build import BuiltScene
 from nlosrender.scene.pose import Float64
 
 if TYPE_CHECKING:
     from nlosrender.engine.virtual_lights.vpls.sampler import Vpls
+
+SIDE_SEED = 0x9E3779B9  # makes the side that light leaves from independent of its direction
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,10 +55,11 @@ class SubpathVertex:
     normal: mi.Normal3f  # geometric
     shading: mi.Normal3f
     shape: mi.ShapePtr
-    carried: mi.Spectrum  # throughput up to the vertex, its reflectance / pi included
+    carried: mi.Spectrum  # throughput up to the vertex; of Lambertian surfaces its reflectance / pi included
     opl: mi.Float  # from the VPL [engine units]
     bounce: mi.UInt32  # of a connection to the laser
     expected: mi.Float  # light expected of it
+    interaction: mi.SurfaceInteraction3f | None  # None: all surfaces are Lambertian
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,13 +78,18 @@ class VplContributions:
     ends: mi.Point3f  # (count,) where the laser's light meets the subpath
     shading: mi.Normal3f  # (count,) shading normals there
     offset: mi.Vector3f  # (count,) ray offset there, along the geometric normal
+    # Of surfaces that are not Lambertian, whose BSDF ``values`` leave out; else None. (count,)
+    directions: mi.Vector3f | None = None  # to where the light comes from, in the VPL's frame
+    interaction: mi.SurfaceInteraction3f | None = None  # at the ends, in confocal captures
 
 
 @dr.syntax
 def trace_subpaths(
     built: BuiltScene,
     vpls: mi.SurfaceInteraction3f,
+    direction: mi.Vector3f,
     reflectance: mi.Spectrum,
+    is_diffuse: bool,
     proposal_lasers: ProposalLasers,
     max_bounces: int | None,
     time_gate: TimeGate | None,
@@ -89,24 +97,26 @@ def trace_subpaths(
 ) -> tuple[SubpathVertex, mi.Float]:
     """Trace one subpath per lane from ``vpls`` until roulette, escape or ``max_bounces`` (None: no limit) ends it.
 
+    The first ``direction`` is one of the VPL's frame.
+
     Returns one vertex of each, and the light expected of all of them.
     """
     scene, wall, context = built.scene, mi.ShapePtr(built.wall_shape), mi.BSDFContext()
     generator = mi.PCG32(randomness.generator)
-    square = mi.Point2f(mi.Float(randomness.sequence[0] >> 8), mi.Float(randomness.sequence[1] >> 8)) * 2.0**-24
     gate_survival = 1.0 if time_gate is None else time_gate.survival
 
     # ---- State ------------------------------------------------------------------------------------------------------
     throughput = mi.Spectrum(reflectance)
-    direction = vpls.sh_frame.to_world(mi.warp.square_to_cosine_hemisphere(square))
+    side = 1.0 if is_diffuse else dr.sign(direction.z)
+    direction = vpls.sh_frame.to_world(direction)
     ray = mi.Ray3f(offset_origin(built, vpls, direction), direction)
-    alive = dr.any(throughput > 0) & (dr.dot(direction, vpls.n) > 0)
+    alive = dr.any(throughput > 0) & (dr.dot(direction, vpls.n) * side > 0)
     origin = mi.Point3f(vpls.p)
     opl = mi.Float(0)  # optical path length from the VPL [engine units]
     bounce = mi.UInt32(FIRST_BOUNCE + 1)  # of a connection from the last vertex
-    vertex = SubpathVertex(
-        mi.Point3f(0), mi.Normal3f(0), mi.Normal3f(0), wall, mi.Spectrum(0), mi.Float(0), mi.UInt32(0), mi.Float(0)
-    )
+    nowhere = None if is_diffuse else dr.zeros(mi.SurfaceInteraction3f)
+    none = mi.Normal3f(0), mi.Normal3f(0), wall, mi.Spectrum(0), mi.Float(0), mi.UInt32(0), mi.Float(0)
+    vertex = SubpathVertex(mi.Point3f(0), *none, nowhere)
     total = mi.Float(0)  # light expected of all vertices so far
     is_past_gate = mi.Bool(False)  # all light still to be found comes too late; survived that roulette
 
@@ -124,16 +134,25 @@ def trace_subpaths(
 
         # ---- Light expected of the lasers, visibility aside; a plane is dark to its own laser points ----------------
         bsdf = si.bsdf()
-        hidden = alive & (mi.Frame3f.cos_theta(si.wi) > 0)
+        hidden = mi.Bool(alive)
+        if dr.hint(is_diffuse, mode="scalar"):
+            hidden &= mi.Frame3f.cos_theta(si.wi) > 0
         if dr.hint(built.wall.is_planar, mode="scalar"):
             hidden &= si.shape != wall
-        upright = mi.SurfaceInteraction3f(si)
-        upright.wi = mi.Vector3f(0, 0, 1)
-        leaving = throughput * bsdf.eval(context, upright, mi.Vector3f(0, 0, 1), hidden)
+        leaving = mi.Spectrum(throughput)
+        if dr.hint(is_diffuse, mode="scalar"):
+            upright = mi.SurfaceInteraction3f(si)
+            upright.wi = mi.Vector3f(0, 0, 1)
+            leaving *= bsdf.eval(context, upright, mi.Vector3f(0, 0, 1), hidden)
         lit = mi.Float(0)
         for k in range(proposal_lasers.count):
             point = proposal_lasers.points.gather(mi.UInt32(k))
-            lit += dr.mean(leaving * irradiance(built, point, si.p, si.sh_frame.n)) / proposal_lasers.count
+            if dr.hint(is_diffuse, mode="scalar"):
+                lit += dr.mean(leaving * irradiance(built, point, si.p, si.sh_frame.n)) / proposal_lasers.count
+            else:
+                to_laser = si.to_local(dr.normalize(point.interaction.p - si.p))
+                reflected = bsdf.eval(context, si, to_laser, hidden) * perpendicular_irradiance(built, point, si.p)
+                lit += dr.mean(throughput * reflected) / proposal_lasers.count
         if dr.hint(not proposal_lasers.are_all, mode="scalar"):
             away = dr.squared_norm(si.p - proposal_lasers.points.gather(mi.UInt32(0)).interaction.p)
             lit += proposal_lasers.untried_share * dr.mean(leaving) / away
@@ -143,7 +162,8 @@ def trace_subpaths(
         # reservoir sampling: of the vertices so far, each is chosen in proportion to its light
         total += lit
         pick = (lit > 0) & (generator.next_float32(alive) * total < lit)
-        found = SubpathVertex(si.p, si.n, mi.Normal3f(si.sh_frame.n), si.shape, leaving, opl, bounce, lit)
+        interaction = None if is_diffuse else si
+        found = SubpathVertex(si.p, si.n, mi.Normal3f(si.sh_frame.n), si.shape, leaving, opl, bounce, lit, interaction)
         vertex = dr.select(pick, found, vertex)
 
         # ---- Sample the next direction ------------------------------------------------------------------------------
@@ -172,6 +192,7 @@ class SubpathPlan:
     contributions: int  # kept per VPL, on average
     max_bounces: int | None
     is_confocal: bool
+    sensors: Float64 | None  # (k, 3) some sensor points; None: all surfaces are Lambertian
     capture_gate: CaptureTimeGate | None  # None: no light comes too late
 
 
@@ -181,20 +202,36 @@ def vpl_contributions(
     """Trace subpaths from ``vpls``, one replica after the other, and return what the batch's lasers send back."""
     built = params.built
     surface = surface_at(built, vpls)
-    reflectance = normal_reflectance(surface)
-    dr.eval(surface, reflectance)
+    dr.eval(surface)
     vpl = dr.arange(mi.UInt32, len(vpls) * plan.subpaths) // plan.subpaths
     time_gate = None
     if plan.capture_gate is not None:
         time_gate = plan.capture_gate.of_points(np.repeat(vpls.positions, plan.subpaths, axis=0))
+    randomness = LaneRandomness.seeded(seed, dr.arange(mi.UInt32, dr.width(vpl)))
+    square = mi.Point2f(mi.Float(randomness.sequence[0] >> 8), mi.Float(randomness.sequence[1] >> 8)) * 2.0**-24
+    direction, from_vpl = mi.warp.square_to_cosine_hemisphere(square), dr.gather(mi.SurfaceInteraction3f, surface, vpl)
+    is_diffuse = plan.sensors is None
+    if plan.sensors is None:
+        reflectance = normal_reflectance(surface)
+        dr.eval(reflectance)
+        reflectance = dr.gather(mi.Spectrum, reflectance, vpl)
+    else:
+        front = dr.gather(mi.Float, on_device(mi.Float, _front_shares(built, vpls, plan.sensors)), vpl)
+        is_front = mi.sample_tea_float32(dr.arange(mi.UInt32, dr.width(vpl)), mi.UInt32(seed ^ SIDE_SEED)) < front
+        direction.z = dr.select(is_front, direction.z, -direction.z)
+        response = _response(from_vpl, direction, plan.sensors)
+        reflectance = mi.Spectrum(response / dr.select(is_front, front, 1 - front))
+        dr.eval(direction, response)
     ends, expected = trace_subpaths(
         built,
-        dr.gather(mi.SurfaceInteraction3f, surface, vpl),
-        dr.gather(mi.Spectrum, reflectance, vpl),
+        from_vpl,
+        direction,
+        reflectance,
+        is_diffuse,
         proposal_lasers,
         plan.max_bounces,
         time_gate,
-        LaneRandomness.seeded(seed, dr.arange(mi.UInt32, dr.width(vpl))),
+        randomness,
     )
     dr.eval(ends, expected)
     subpath, copies, share = _resample(expected.numpy(), vpls, plan, np.random.default_rng(seed))
@@ -217,18 +254,46 @@ def vpl_contributions(
     end = on_device(mi.UInt32, chosen)
     si = _surface_of(ends, end)
     shading = dr.gather(mi.Normal3f, ends.shading, end)
+    values = dr.gather(mi.Spectrum, values, entry)
+    if not is_diffuse:
+        # over the density of the direction; the BSDF brings its cosine
+        direction = dr.gather(mi.Vector3f, direction, end)
+        density = dr.gather(mi.Float, response, end) * dr.abs(direction.z) * dr.inv_pi
+        values *= dr.gather(mi.Float, dr.rcp(density), index % per_laser)
     contributions = VplContributions(
         count=n_kept,
         vpls=chosen // plan.subpaths,
         bounces=dr.gather(mi.UInt32, ends.bounce, end),
-        values=dr.gather(mi.Spectrum, values, entry),
+        values=values,
         delays=dr.gather(mi.Float, delays, entry),
         ends=si.p,
         shading=shading,
         offset=mi.Vector3f(offset_origin(built, si, shading) - si.p),
+        directions=None if is_diffuse else direction,
+        interaction=si if plan.is_confocal and not is_diffuse else None,
     )
     dr.eval(contributions)
     return contributions
+
+
+def _front_shares(built: BuiltScene, vpls: Vpls, sensors: Float64) -> Float64:
+    """Return the probability (n,) that a VPL sends light from its front: of two-sided ones about what sees it."""
+    shares = (np.einsum("nkx,nx->nk", sensors - vpls.positions[:, None], vpls.normals) > 0).mean(axis=1)
+    is_two_sided = np.array([bool(shape.bsdf().flags() & mi.BSDFFlags.BackSide) for shape in built.scene.shapes()])
+    return np.where(is_two_sided[vpls.shapes], np.clip(shares, 0.05, 0.95), 1.0)
+
+
+def _response(vpls: mi.SurfaceInteraction3f, direction: mi.Vector3f, sensors: Float64) -> mi.Float:
+    """Return the part of the light from ``direction`` that VPLs send on to ``sensors``, times pi; never 0.
+
+    Half of it is the mean over all VPLs: other sensor points may receive more.
+    """
+    response, context = mi.Float(0), mi.BSDFContext()
+    for sensor in sensors:
+        vpls.wi = vpls.to_local(dr.normalize(mi.Point3f(sensor) - vpls.p))
+        response += dr.mean(vpls.bsdf().eval(context, vpls, direction))
+    response *= dr.pi / (len(sensors) * dr.maximum(dr.abs(direction.z), 1e-3))
+    return (response + dr.mean(response)) / 2
 
 
 def no_contributions() -> VplContributions:
@@ -238,7 +303,9 @@ def no_contributions() -> VplContributions:
 
 
 def _surface_of(ends: SubpathVertex, index: mi.UInt32) -> mi.SurfaceInteraction3f:
-    """Return position, geometric normal and shape of the ends of subpaths: what ray offsets depend on."""
+    """Return the ends of subpaths; of Lambertian ones position, geometric normal and shape, for ray offsets."""
+    if ends.interaction is not None:
+        return dr.gather(mi.SurfaceInteraction3f, ends.interaction, index)
     si = dr.zeros(mi.SurfaceInteraction3f, dr.width(index))
     si.p, si.n = dr.gather(mi.Point3f, ends.position, index), dr.gather(mi.Normal3f, ends.normal, index)
     si.shape = dr.gather(mi.ShapePtr, ends.shape, index)
@@ -295,7 +362,11 @@ def _connect(
     to_laser = lasers.interaction.p - si.p
     distance = dr.norm(to_laser)
     value = dr.gather(mi.Spectrum, ends.carried, end) / dr.gather(mi.Float, ends.expected, end)
-    value *= irradiance(built, lasers, si.p, dr.gather(mi.Normal3f, ends.shading, end))
+    if ends.interaction is None:
+        value *= irradiance(built, lasers, si.p, dr.gather(mi.Normal3f, ends.shading, end))
+    else:
+        value *= perpendicular_irradiance(built, lasers, si.p)
+        value *= si.bsdf().eval(mi.BSDFContext(), si, si.to_local(to_laser / distance))
     value *= dr.gather(mi.Float, scale, entry)
     active = dr.any(value > 0)
     segment = connection_segment(built, si, to_laser / distance, lasers.interaction)
