@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -211,18 +212,52 @@ def box(length: float, end: Any) -> list[Scene]:
     return [*sides, plate((length - 1, 0, 1), (-1, 0, 0), (2, 2), end)]
 
 
+POINTS = 4  # sensor points along each side of a room
+ROOM = {"bins": (0.0, 0.2, 60), "max_bounces": None, "split_bounces": False}
+SIDE = {"height": 2.0, "bsdf": {"type": "diffuse", "reflectance": 0.5}}
+
+
+def mirror_room(**render: Any) -> Scene:
+    """Return a room with a mirror wall, with light of all bounces."""
+    own = {"sensors": (POINTS, POINTS), "wall": {**SIDE, "width": 2.0}, "capture": {"laser_point": [0.25, 0.0]}}
+    return flat_wall(*box(2, MIRROR), **own, **ROOM, **render)
+
+
+@cache
+def unfolded_room() -> tuple[Array, Array]:
+    """Return H (sensor y, x, bin) of it and its variance: the room and its image in one, lit by laser and image."""
+    lasers = {"laser_grid": {"nx": 2, "ny": 1, "width": 3.0, "height": 2.0}}  # x = 1 - 0.75, 1 + 0.75
+    both = {"scan": "exhaustive", "sensors": (2 * POINTS, POINTS), "wall": {**SIDE, "width": 4.0, "center": [1, 0, 0]}}
+    unfolded = render(flat_wall(*box(4, 0.5), **both, capture=lasers, **ROOM, spp=20_000), replicas=16)
+    mean, variance = (values[0, 0, 0, :, :, :POINTS].sum(axis=0) for values in (unfolded.mean, unfolded.variance))
+    return mean, 2 * variance  # lasers share paths
+
+
 @pytest.mark.parametrize("p_hidden_sampling", [0.5, 1.0])
 def test_a_room_with_a_mirror_wall_is_one_of_twice_the_length(p_hidden_sampling: float) -> None:
-    """Light of all bounces is that of the room and its image in one, lit by the laser point and by its image."""
-    n, settings = 4, {"bins": (0.0, 0.2, 60), "max_bounces": None, "split_bounces": False, "spp": 20_000}
-    wall = {"height": 2.0, "bsdf": {"type": "diffuse", "reflectance": 0.5}}
-    own = {"sensors": (n, n), "wall": {**wall, "width": 2.0}, "capture": {"laser_point": [0.25, 0.0]}}
-    folded = render(flat_wall(*box(2, MIRROR), **own, **settings), p_hidden_sampling=p_hidden_sampling, replicas=16)
-    lasers = {"laser_grid": {"nx": 2, "ny": 1, "width": 3.0, "height": 2.0}}  # x = 1 - 0.75, 1 + 0.75
-    both = {"scan": "exhaustive", "sensors": (2 * n, n), "wall": {**wall, "width": 4.0, "center": [1, 0, 0]}}
-    unfolded = render(flat_wall(*box(4, 0.5), **both, capture=lasers, **settings), replicas=16)
-    mean, variance = (values[0, 0, 0, :, :, :n].sum(axis=0) for values in (unfolded.mean, unfolded.variance))
-    variance *= 2  # lasers share paths
-    own_light = folded.mean[0, 0, 0, 0], folded.variance[0, 0, 0, 0]
-    assert_agrees(*own_light, mean, replicas=16, reference_variance=variance, share=0.1)
-    assert math.sqrt(own_light[1].sum() + variance.sum()) < 0.003 * mean.sum()
+    """Light of all bounces is that of the unfolded room, by either loop of the path engine."""
+    folded = render(mirror_room(spp=20_000), p_hidden_sampling=p_hidden_sampling, replicas=16)
+    (mean, variance), (light, own) = unfolded_room(), (folded.mean[0, 0, 0, 0], folded.variance[0, 0, 0, 0])
+    assert_agrees(light, own, mean, replicas=16, reference_variance=variance, share=0.1)
+    assert math.sqrt(own.sum() + variance.sum()) < 0.003 * mean.sum()
+
+
+def test_virtual_lights_in_a_mirror_are_those_of_twice_the_length() -> None:
+    """Patches, VPLs and their subpaths by way of a mirror give what the unfolded room does, bin by bin and in all."""
+    settings: dict[str, Any] = {"engine": "virtual_lights", "spp": None, "target_error": 0.04}
+    stage = Stage.of(mirror_room(**settings))
+    assert stage.engine.further is not None
+    from nlosrender.engine.interface import Budget
+
+    lights = stage.repeated(stage.engine.calibrate(Budget(target_error=0.04)), range(8)).means[:, 0, 0, 0]
+    mean, variance = (values.reshape(POINTS**2, -1) for values in unfolded_room())
+    own = lights.var(axis=0, ddof=1) / 8
+    # all points share patches, VPLs, and their errors: each alone
+    for sums in (
+        lambda values: values.sum(axis=(-1, -2)),
+        lambda values: values.sum(axis=-2).reshape(*values.shape[:-2], 10, 6).sum(axis=-1),
+    ):
+        seeds, expected = sums(lights), sums(mean)
+        deviation = np.sqrt(seeds.var(axis=0, ddof=1) / 8 + sums(variance))
+        assert (np.abs(seeds.mean(axis=0) - expected) <= 6 * deviation + 0.002 * expected).all()
+    assert np.sqrt(own.sum()) < 0.03 * np.linalg.norm(mean)

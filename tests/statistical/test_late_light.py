@@ -136,7 +136,7 @@ def test_kernels_do_not_know_where_the_window_ends() -> None:
             axis = replace(engine.time_axis, start_opl=start)
             device = DeviceCapture(engine.built, engine.capture, axis, engine.options)
             paths = type(engine)(device)
-            further = type(lights.further)(device, lights.tessellator, lights.further.masks)
+            further = type(lights.further)(device, lights.tessellator, lights.further.masks, lights.settings.is_diffuse)
             dr.kernel_history_clear()
             paths.render(stage.batch, Budget(spp=16))
             further.accumulate(stage.batch, further.histogram(stage.batch, 2), 0)

@@ -321,6 +321,26 @@ TRAPS = {
         ),
         {"split_bounces": False, "max_bounces": 6},
     ),
+    "mirror wall": Trap(
+        "a room with one side of gold: its images of lasers, of sensor points and of VPLs, behind a ball",
+        (
+            plate((0.0, 0.0, 1.3), (0.0, 0.0, -1.0), (2.0, 1.6), 0.6),
+            plate((-1.0, 0.0, 0.65), (1.0, 0.0, 0.0), (1.3, 1.6), 0.6),
+            plate((0.9, 0.0, 0.65), (-1.0, 0.1, -0.2), (1.3, 1.6), {"type": "conductor", "material": "Au"}),
+            ball((0.3, 0.1, 0.5), 0.15, 0.8),
+        ),
+        {"max_bounces": 6, "bins": (0.0, 0.1, 90), "wall": GREY_WALL},
+    ),
+    "mirror behind, exhaustive": Trap(
+        "a two-sided mirror mesh whose edges cut the images, all pairs of points, legs, a checkerboard seen in it",
+        (
+            plate((0.15, -0.1, 0.6), (0.2, -0.1, 1.0), (0.8, 0.6), diffuse(CHECKER)),
+            SIDE,
+            plate((0.1, 0.1, 1.2), (0.1, -0.2, -1.0), (0.9, 0.8), {"type": "twosided", "bsdf": {"type": "conductor"}}),
+        ),
+        {"scan": "exhaustive", "sensors": (3, 2), "lasers": (3, 2), "capture": LEGS, "bins": (1.0, 0.07, 80)}
+        | {"max_bounces": 5, "wall": GREY_WALL, "color": "grey"},
+    ),
     "only third": Trap(
         "nothing but the third bounce of two surfaces in each other's shadow",
         (SLANTED, ball((0.1, 0.0, 0.3), 0.12)),

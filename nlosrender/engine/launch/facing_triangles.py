@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
@@ -38,14 +40,20 @@ def _visible_from(
     return visible & (np.einsum("nx,nx->n", farthest, normals) > 0)
 
 
-def facing_triangles(built: BuiltScene, mesh: mi.Mesh) -> tuple[Float64, NDArray[np.uint32]]:
+def facing_triangles(
+    built: BuiltScene, mesh: mi.Mesh, images: Callable[[Float64], Float64] | None = None
+) -> tuple[Float64, NDArray[np.uint32]]:
     """Return the corners (n, 3, 3) [engine units] of the triangles that the wall may see lit, and their numbers (n,).
 
-    Left out are triangles that turn a black side to the whole wall. Occlusion by other surfaces is not considered.
+    Left out are triangles that turn a black side to the whole wall, and to its image in a mirror, if there is one:
+    ``images`` returns those of points (n, 3). Occlusion by other surfaces is not considered.
     """
     triangles = triangles_of(mesh)
     corners = wall_box(built.wall) / built.metres_per_engine_unit
     # Shading normals may light part of a geometric back side.
     one_sided = is_one_sided(mesh) and not mesh.has_vertex_normals()
-    visible = np.flatnonzero(_visible_from(corners, triangles, one_sided, built.wall.is_planar))
-    return triangles[visible], visible.astype(np.uint32)
+    visible = _visible_from(corners, triangles, one_sided, built.wall.is_planar)
+    if images is not None:
+        visible |= _visible_from(images(corners), triangles, one_sided, built.wall.is_planar)
+    (numbers,) = np.nonzero(visible)
+    return triangles[numbers], numbers.astype(np.uint32)

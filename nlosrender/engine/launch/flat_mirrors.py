@@ -17,8 +17,8 @@ from scipy import sparse
 
 from nlosrender.engine.launch.device_arrays import on_device
 from nlosrender.engine.launch.facing_triangles import facing_triangles
-from nlosrender.engine.launch.ray_offsets import connection_segment, offset_origin
-from nlosrender.scene.build import BuiltScene
+from nlosrender.engine.launch.ray_offsets import offset_origin
+from nlosrender.scene.build import BuiltScene, wall_box
 from nlosrender.scene.pose import Float64
 
 NO_MIRROR = 0xFFFFFFFF
@@ -46,6 +46,26 @@ class FlatMirrors:
     components: tuple[int, ...]  # that any of them has
     first_facet: mi.UInt32  # by number of a shape's pointer: where its facets begin in ``mirror_of``; NO_MIRROR
     mirror_of: mi.UInt32  # mirror of each facet; NO_MIRROR for those that no point of the wall sees
+
+    def is_alone(self, built: BuiltScene) -> bool:
+        """Return whether one flat mirror is all that has delta lobes, and has no others: no two are met in a row."""
+        lobes = [shape.bsdf().flags() for shape in built.scene.shapes()]
+        smooth = [flags for flags in lobes if flags & mi.BSDFFlags.Delta]
+        is_whole = len(smooth) == 1 and not smooth[0] & (
+            mi.BSDFFlags.Smooth | mi.BSDFFlags.Null | mi.BSDFFlags.DeltaTransmission
+        )
+        return is_whole and self.n_mirrors == 1 and not (np.array(self.mirror_of) == NO_MIRROR).any()
+
+    def shows_wall(self, built: BuiltScene) -> bool:
+        """Return whether the only mirror may show a planar wall to itself: its image lies before the wall."""
+        plane = np.array(self.packed, np.float64)[:4]
+        heights = wall_box(built.wall) / built.metres_per_engine_unit @ plane[:3] + plane[3]
+        return built.wall.is_planar and bool((heights * plane[2] < -MIN_HEIGHT).any())
+
+    def images(self, points: Float64) -> Float64:
+        """Return the images of points (n, 3) in the only mirror."""
+        plane = np.array(self.packed, np.float64)[:4]
+        return points - 2 * (points @ plane[:3] + plane[3])[:, None] * plane[:3]
 
     @classmethod
     def of(cls, built: BuiltScene) -> FlatMirrors:
@@ -108,13 +128,17 @@ class FlatMirrors:
         built: BuiltScene,
         number: mi.UInt32,
         si: mi.SurfaceInteraction3f,
-        lit: mi.SurfaceInteraction3f,
+        lit: mi.Point3f,
+        start: mi.Point3f,
         active: mi.Bool,
     ) -> Reflection:
-        """Connect points to laser points by way of mirrors, where ``may_reflect`` says they can be connected."""
+        """Connect points ``si`` to points ``lit`` by way of mirrors, where ``may_reflect`` says they can be connected.
+
+        ``start``: where rays from the latter begin.
+        """
         plane = dr.gather(mi.Vector4f, self.packed, number * ROWS, active)
-        normal, height, above = mi.Normal3f(plane.x, plane.y, plane.z), _affine(plane, si.p), _affine(plane, lit.p)
-        to_image = lit.p - si.p - (2 * above) * normal
+        normal, height, above = mi.Normal3f(plane.x, plane.y, plane.z), _affine(plane, si.p), _affine(plane, lit)
+        to_image = lit - si.p - (2 * above) * normal
         distance = dr.norm(to_image)
         direction = to_image / distance
         hit, active = self._met(built, number, si, direction, distance * height / (height + above), normal, active)
@@ -129,10 +153,10 @@ class FlatMirrors:
             has_lobe = active & ((lobes >> component & 1) == 1)
             bs, value = hit.bsdf().sample(context, hit, 0.5, mi.Point2f(0.5), has_lobe)
             weight += dr.select(has_lobe & mi.has_flag(bs.sampled_type, mi.BSDFFlags.DeltaReflection), value, 0)
-        weight *= built.wall_bsdf.eval(mi.BSDFContext(), lit, lit.to_local(-from_laser), active)
         active &= dr.any(weight > 0)
-        active &= ~built.scene.ray_test(connection_segment(built, hit, from_laser, lit), coherent=False, active=active)
-        return Reflection(direction, distance, weight / dr.square(distance), active)
+        segment = mi.Ray3f(start, offset_origin(built, hit, from_laser) - start, mi.Float(1), mi.Float(0), [])
+        active &= ~built.scene.ray_test(segment, coherent=False, active=active)
+        return Reflection(direction, -from_laser, distance, weight / dr.square(distance), active)
 
     @dr.syntax
     def _met(
@@ -169,12 +193,30 @@ class FlatMirrors:
 
 @dataclass(frozen=True, eq=False)
 class Reflection:
-    """Connection of a point to a laser point by way of a mirror."""
+    """Connection of a point to a lit one by way of a mirror."""
 
     direction: mi.Vector3f  # from the point to the mirror
+    from_lit: mi.Vector3f  # from the lit point to the mirror
     distance: mi.Float  # by way of the mirror [engine units]
-    value: mi.Spectrum  # radiance from the mirror per J, times the solid angle of the laser's image per area of it
+    value: mi.Spectrum  # weight of the delta lobe over the distance squared
     active: mi.Bool  # whether nothing hides it
+
+
+def image_in(mirror: FlatMirrors | None, point: mi.Point3f) -> mi.Point3f:
+    """Return the images of points in a scene's only mirror, or the points themselves if it is None."""
+    if mirror is None:
+        return point
+    plane = dr.gather(mi.Vector4f, mirror.packed, mi.UInt32(0))
+    return point - (2 * _affine(plane, point)) * mi.Vector3f(plane.x, plane.y, plane.z)
+
+
+def turned_in(mirror: FlatMirrors | None, vector: mi.Vector3f) -> mi.Vector3f:
+    """Return the images of vectors, as ``image_in``."""
+    if mirror is None:
+        return vector
+    plane = dr.gather(mi.Vector4f, mirror.packed, mi.UInt32(0))
+    normal = mi.Vector3f(plane.x, plane.y, plane.z)
+    return vector - (2 * dr.dot(vector, normal)) * normal
 
 
 def has_flat_mirrors(shape: mi.Shape) -> bool:

@@ -10,6 +10,7 @@ import mitsuba as mi
 from nlosrender.engine.launch.flat_mirrors import FlatMirrors
 from nlosrender.engine.launch.histogram import DeviceHistogram
 from nlosrender.engine.launch.launch_params import LaunchParams
+from nlosrender.engine.launch.ray_offsets import off_the_wall
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,8 +73,10 @@ def _connect(
         if dr.hint(vertex.in_spot is not None, mode="scalar"):
             # the part of a spot beyond the wall's edge lights nothing
             seen &= built.wall_shape.ray_test(mi.Ray3f(lit.p + 1e-2 * lit.n, -lit.n), active=seen)
-        found = mirrors.reflected(built, number, si, lit, seen)
-        scattered = si.bsdf().eval(mi.BSDFContext(), si, si.to_local(found.direction), found.active)
+        found = mirrors.reflected(built, number, si, lit.p, off_the_wall(built, lit), seen)
+        context = mi.BSDFContext()
+        scattered = si.bsdf().eval(context, si, si.to_local(found.direction), found.active)
+        scattered *= built.wall_bsdf.eval(context, lit, lit.to_local(found.from_lit), found.active)
         bins = params.delay_bin(params.lasers.gather(params.first_laser + laser), vertex.opl + found.distance)
         value = vertex.throughput * scattered * found.value
         histogram.deposit(params.row_of_lane, laser, vertex.slot, bins, value, found.active)

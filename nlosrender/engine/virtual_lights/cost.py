@@ -47,7 +47,8 @@ def gather_batch_bytes(engine: VirtualLightEngine, plan: Plan, available: float)
             f"{readable_size(needed * PATCH_BYTES)}, but render.memory_limit leaves {readable_size(available)}. "
             "Use wider bins, or render.engine: path.",
         )
-    return max(engine.paths.batch_bytes(plan), gathered * BYTES_PER_SUM)
+    ways = 1 if engine.third.mirror is None else 3  # bounces that are gathered
+    return max(engine.paths.batch_bytes(plan), ways * gathered * BYTES_PER_SUM)
 
 
 def virtual_light_estimate(

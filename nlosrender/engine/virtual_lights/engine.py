@@ -61,27 +61,42 @@ class VirtualLightEngine:
         self.built, self.capture, self.time_axis = device.built, device.capture, device.time_axis
         self.options = device.options
         built, capture = self.built, self.capture
-        self.tessellator = Tessellator(
-            built, capture, self.time_axis.bin_width_opl / built.metres_per_engine_unit, tuning=tuning
-        )
         shapes = (*built.hidden_shapes, *([built.wall_shape] if wall_sees_itself(built) else []))
         self.settings = GatherSettings(
             is_confocal=capture.scan_type == "confocal",
-            is_diffuse=all(is_lambertian(shape.bsdf()) for shape in shapes),
+            is_diffuse=all(is_lambertian(shape.bsdf()) for shape in shapes if not is_mirror(shape.bsdf())),
             needs_visibility=not nothing_occludes(built),
             has_one_laser=capture.n_lasers == 1,
             laser_rays=tuning.laser_rays,
         )
         all_lambertian = self.settings.is_diffuse and is_lambertian(built.wall_shape.bsdf())
         reciprocal = is_reciprocal(built, capture, self.time_axis.n_bins, is_lambertian=all_lambertian, tuning=tuning)
-        self.third = ThirdBounce(device, self.tessellator, self.settings, lanes, reciprocal)
+        has_vpls = self.has_further_bounces and self._mirrors_once
+        mirror = device.mirrors if has_vpls else None
+        bin_width = self.time_axis.bin_width_opl / built.metres_per_engine_unit
+        self.tessellator = Tessellator(built, capture, bin_width, mirror=mirror, tuning=tuning)
+        reciprocal = reciprocal and mirror is None
+        self.third = ThirdBounce(device, self.tessellator, self.settings, lanes, reciprocal, mirror)
         self.further: VplBounces | None = None  # else ``paths``, where further bounces are asked for
-        if self.has_further_bounces and not any(_has_delta_lobe(shape.bsdf()) for shape in shapes):
+        if has_vpls:
             masks = self.third.masks if self.settings.needs_visibility else None
             self.further = VplBounces(device, self.tessellator, masks, self.settings.is_diffuse)
         surfaces = "Lambertian" if self.settings.is_diffuse else "diffuse and rough"
         self.reason = f"{surfaces} surfaces before a {'planar' if built.wall.is_planar else 'curved'} wall"
         self._calibrated: dict[Budget, Budget] = {}
+
+    @property
+    def _mirrors_once(self) -> bool:
+        """Whether VPLs find all light of mirrors: none is there, or one that shows a wall which may have VPLs."""
+        built, mirrors = self.built, self.device.mirrors
+        if not any(_has_delta_lobe(shape.bsdf()) for shape in built.scene.shapes()):
+            return True
+        if mirrors is None or self.settings.is_confocal or not (self.settings.is_diffuse and mirrors.is_alone(built)):
+            return False
+        if not built.wall.is_planar:
+            return wall_sees_itself(built)
+        has_vpls = built.wall_shape.class_name() == "Rectangle" and is_lambertian(built.wall_bsdf)
+        return has_vpls or not mirrors.shows_wall(built)
 
     def set_up(self) -> None:
         """Make what all resolutions and batches share, else made when it is first needed: it grows with the triangles.
@@ -168,19 +183,26 @@ class VirtualLightEngine:
             missed = self.third.tuning.missed_light
             np.add(result.variance, np.square(missed * result.mean), out=result.variance)
             result.contrasts[:] += missed * result.mean.sum(axis=(2, 3, 4))
-        slot, factor = self.options.bounces.slot(THIRD_BOUNCE), self.device.scale
+        factor = self.device.scale
         third, deviation = fine.values, coarse.values  # large: worked on in place
         np.subtract(third, deviation, out=deviation)
         deviation *= factor / difference_divisor(coarse, fine)
         third *= factor
-        result.mean[:, slot] += third[:, 0, ..., :-1]
         grid, sensors = self.capture.sensor_grid, self.device.sensor_indices(batch)
-        in_window = deviation[:, 0, ..., :-1]
-        result.contrasts[:, :, slot] += contrasts_of_deviation(in_window, sensors, (grid.nx, grid.ny))
-        result.variance[:, slot] += np.square(deviation, out=deviation)[:, 0, ..., :-1]
-        result.outside[:, slot] += third[:, 0, ..., -1]
+        for number, slot in enumerate(self._slots(third.shape[1])):
+            result.mean[:, slot] += third[:, number, ..., :-1]
+            in_window = deviation[:, number, ..., :-1]
+            result.contrasts[:, :, slot] += contrasts_of_deviation(in_window, sensors, (grid.nx, grid.ny))
+            result.variance[:, slot] += np.square(in_window, out=in_window)
+            result.outside[:, slot] += third[:, number, ..., -1]
         result.refuse_not_finite()
         return result
+
+    def _slots(self, count: int) -> list[int]:
+        """Return the bounce slots of gathered bounces, the third and what a mirror adds, up to the highest."""
+        highest = self.options.bounces.max_bounces
+        bounces = range(THIRD_BOUNCE, THIRD_BOUNCE + count)
+        return [self.options.bounces.slot(bounce) for bounce in bounces if highest is None or bounce <= highest]
 
     # What ``preflight`` and reports ask
 
@@ -229,6 +251,11 @@ class VirtualLightEngine:
     def cost_estimate(self, plan: Plan, budget: Budget, lanes: int, pilot: PilotSeconds) -> TimeEstimate:
         """Estimate the seconds of a render; see ``Engine.cost_estimate``."""
         return virtual_light_estimate(self, plan, budget, lanes, pilot)
+
+
+def is_mirror(bsdf: mi.BSDF) -> bool:
+    """Return whether a BSDF has delta lobes alone: no connection finds anything there."""
+    return not bool(bsdf.flags() & mi.BSDFFlags.Smooth)
 
 
 def is_lambertian(bsdf: mi.BSDF) -> bool:

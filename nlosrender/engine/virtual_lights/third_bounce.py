@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -14,6 +15,7 @@ from numpy.typing import NDArray
 from nlosrender.capture.plan import Batch
 from nlosrender.engine.launch.device_arrays import on_device
 from nlosrender.engine.launch.device_capture import DeviceCapture
+from nlosrender.engine.launch.flat_mirrors import FlatMirrors
 from nlosrender.engine.launch.histogram import HistogramShape
 from nlosrender.engine.launch.launch_params import LaunchParams
 from nlosrender.engine.launch.passes import Passes, Snapshot
@@ -76,6 +78,8 @@ class ThirdBounce:
     is_reciprocal
         Whether exchanging laser and sensor point changes nothing, see ``reciprocity.is_reciprocal``: then no two
         points are gathered from twice in one batch.
+    mirror
+        The only one, by way of which laser and sensor points see the patches as well: bounces 4 and 5.
     """
 
     def __init__(
@@ -85,11 +89,13 @@ class ThirdBounce:
         settings: GatherSettings,
         lanes: int,
         is_reciprocal: bool = False,
+        mirror: FlatMirrors | None = None,
     ):
+        self.mirror = mirror
         self.device, self.tessellator, self.settings, self.lanes = device, tessellator, settings, lanes
         self.is_reciprocal = is_reciprocal
         self.masks = VisibilityMasks(device.built, tessellator.tuning)
-        self._saved: dict[float, LitPatches] = {}  # per patch scale
+        self._saved: dict[tuple[float, bool], LitPatches] = {}  # per patch scale, and whether lit by mirror
 
     def gather(self, batch: Batch | Pilot, patch_scale: float, passes: Passes | None = None) -> Gathered:
         """Gather a batch at one resolution."""
@@ -100,10 +106,26 @@ class ThirdBounce:
         elif self.is_reciprocal and isinstance(batch, Batch):
             values = self._by_reciprocity(batch, patch_scale, patches, passes)
         else:
-            values = self._sums(batch, patch_scale, patches, passes.stage("sums")).on_host()
+            values = self._sums(
+                batch, patch_scale, patches, passes.stage("sums", 0, 0.25 if self.mirror else 1)
+            ).on_host()
+            if self.mirror is not None:
+                values = np.concatenate([values, *self._mirrored(batch, patch_scale, patches, passes)], axis=1)
         passes.finish(Snapshot({"values": values}))
         count = len(patches) if self.tessellator.regions is None else self.tessellator.count(patch_scale)
         return Gathered(values, max(count, 1), patch_scale)  # 1: nothing may face the wall
+
+    def _mirrored(
+        self, batch: Batch | Pilot, patch_scale: float, patches: Patches, passes: Passes
+    ) -> Iterator[NDArray[np.float64]]:
+        """Yield bounces 4 and 5: what laser, sensor point, or both of them see by way of the mirror."""
+        ways = {"sensor by mirror": (False, True), "laser by mirror": (True, False), "both by mirror": (True, True)}
+        values = []
+        for part, (name, way) in enumerate(ways.items(), 1):
+            stage = passes.stage(name, part / 4, (part + 1) / 4)
+            values.append(self._sums(batch, patch_scale, patches, stage, way=way).on_host())
+        yield values[0] + values[1]
+        yield values[2]
 
     @property
     def tuning(self) -> VirtualLightTuning:
@@ -146,20 +168,23 @@ class ThirdBounce:
         patches: Patches,
         passes: Passes,
         lasers: NDArray[np.int64] | None = None,
+        way: tuple[bool, bool] = (False, False),
     ) -> BlockHistogram:
         """Gather the ``patches`` that all sensor points share, then what regions have of their own.
 
         ``lasers`` (sensors,) tells of how many lasers each sensor point gathers the light, the first ones; None: all.
+        ``way``: whether lasers, and sensor points, see the patches by way of the mirror.
         """
+        lit_by, seen_by = (self.mirror if by_mirror else None for by_mirror in way)
         shape = self.shape(batch)
         lanes = self._lanes(batch, shape, lasers)
         histogram = BlockHistogram(shape, lanes.order)
         work = GatherPasses(self.settings, histogram, passes, self.device.options.schedule.first_gather_pairs)
         if len(patches):
             wall_tiles = self._wall_tiles(batch)
-            packed = self._shared_lights(lanes.params, shape, patch_scale, patches, wall_tiles)
+            packed = self._shared_lights(lanes.params, shape, patch_scale, patches, wall_tiles, lit_by)
             tile = wall_tiles.tile_bit(mi.UInt32(0), lanes.params.sensors.interaction.p)
-            work.gather(lanes.params, packed, lanes.index, lanes.slice_index, tile)
+            work.gather(lanes.params, packed, lanes.index, lanes.slice_index, tile, seen_by)
         for labels, near in self.tessellator.regional_patches(patch_scale, np.unique(lanes.regions).tolist()):
             places = PatchRegions.of([len(one) for one in near])
             if not len(places.numbers):  # nothing is close to the wall there
@@ -168,10 +193,10 @@ class ThirdBounce:
             slice_index = np.searchsorted(labels, lanes.regions[chosen]) * shape.replicas + chosen // shape.sensors
             index = on_device(mi.UInt32, chosen)
             some, wall_tiles = lanes.params.gather_lanes(index), self._wall_tiles(batch, labels)
-            lit_patches = self._light_by_lasers(some, shape, Patches.joined(near), places, wall_tiles)
-            packed = pack_patches(self.settings, some, lit_patches, shape.replicas, shape.lasers)
+            lit_patches = self._light_by_lasers(some, shape, Patches.joined(near), places, wall_tiles, lit_by)
+            packed = pack_patches(self.settings, some, lit_patches, shape.replicas, shape.lasers, lit_by)
             tile = wall_tiles.tile_bit(on_device(mi.UInt32, slice_index // shape.replicas), some.sensors.interaction.p)
-            work.gather(some, packed, index, on_device(mi.UInt32, slice_index), tile)
+            work.gather(some, packed, index, on_device(mi.UInt32, slice_index), tile, seen_by)
         return histogram
 
     def shadow_ray_targets(self, batch: Batch | Pilot, patch_scale: float) -> ShadowRayTargets:
@@ -182,7 +207,7 @@ class ThirdBounce:
             self.tessellator.patches(patch_scale),
             self._wall_tiles(batch),
         )
-        packed = self._shared_lights(lanes.params, shape, patch_scale, patches, wall_tiles)
+        packed = self._shared_lights(lanes.params, shape, patch_scale, patches, wall_tiles, None)
         rows = np.array(packed.packed, np.float32).reshape(-1, ROWS, 4)
         ends, normals = (rows[:, 3] + rows[:, 4] + rows[:, 5])[:, :3], np.array(packed.interaction.n, np.float64).T
         tiles = np.empty(shape.sensors, np.uint64)
@@ -191,28 +216,42 @@ class ThirdBounce:
         return ShadowRayTargets(ends.astype(np.float64), normals, np.array(packed.mask), tiles)
 
     def _shared_lights(
-        self, params: LaunchParams, shape: HistogramShape, patch_scale: float, patches: Patches, wall_tiles: WallTiles
+        self,
+        params: LaunchParams,
+        shape: HistogramShape,
+        patch_scale: float,
+        patches: Patches,
+        wall_tiles: WallTiles,
+        lit_by: FlatMirrors | None,
     ) -> PackedPatches:
         """Return what all sensor points gather; lit patches are saved where other batches have the same lasers."""
-        lit_patches = self._saved.get(patch_scale)
+        key = patch_scale, lit_by is not None
+        lit_patches = self._saved.get(key)
         if lit_patches is None:
-            lit_patches = self._light_by_lasers(params, shape, patches, PatchRegions.of([len(patches)]), wall_tiles)
+            places = PatchRegions.of([len(patches)])
+            lit_patches = self._light_by_lasers(params, shape, patches, places, wall_tiles, lit_by)
         elif self.settings.needs_visibility and not lit_patches.is_cleared:  # so far few points have looked
             lit_patches = lit_patches.cleared(MaskQuery(self.masks, wall_tiles))
         if self.settings.lights_once and len(patches) <= self.tuning.max_kept_patches:
             # a batch gathers two resolutions
-            others = [(other, lit) for other, lit in self._saved.items() if other != patch_scale]
-            self._saved = dict([*others, (patch_scale, lit_patches)][-2:])
-        return pack_patches(self.settings, params, lit_patches, shape.replicas, shape.lasers)
+            others = [(other, lit) for other, lit in self._saved.items() if other != key]
+            self._saved = dict([*others, (key, lit_patches)][-2 if self.mirror is None else -4 :])
+        return pack_patches(self.settings, params, lit_patches, shape.replicas, shape.lasers, lit_by)
 
     def _light_by_lasers(
-        self, params: LaunchParams, shape: HistogramShape, patches: Patches, places: PatchRegions, wall_tiles: WallTiles
+        self,
+        params: LaunchParams,
+        shape: HistogramShape,
+        patches: Patches,
+        places: PatchRegions,
+        wall_tiles: WallTiles,
+        lit_by: FlatMirrors | None,
     ) -> LitPatches:
         is_near = self.tessellator.nearest < self.tuning.near_distance
         on_device = upload_patches(
             self.device.built, patches, places, self.device.options.seed, is_near, self.settings.is_diffuse, self.tuning
         )
-        return light_patches(self.settings, params, on_device, MaskQuery(self.masks, wall_tiles), shape.lasers)
+        return light_patches(self.settings, params, on_device, MaskQuery(self.masks, wall_tiles), shape.lasers, lit_by)
 
     def _wall_tiles(self, batch: Batch | Pilot, regions: list[int] | None = None) -> WallTiles:
         """Return what patches are seen from: all points, or the sensor points of some regions."""

@@ -15,6 +15,7 @@ from scipy.spatial import cKDTree
 
 from nlosrender.capture.grids import Capture, PointGrid
 from nlosrender.engine.launch.facing_triangles import facing_triangles
+from nlosrender.engine.launch.flat_mirrors import FlatMirrors
 from nlosrender.engine.virtual_lights.elements.struct_of_arrays import StructOfArrays
 from nlosrender.engine.virtual_lights.elements.triangles import (
     centroids,
@@ -22,7 +23,8 @@ from nlosrender.engine.virtual_lights.elements.triangles import (
     normals_and_areas,
     unit_vectors,
 )
-from nlosrender.scene.build import BuiltScene
+from nlosrender.scene.build import BuiltScene, wall_box
+from nlosrender.scene.loading.mitsuba_shapes import WALL_ID
 from nlosrender.scene.pose import Float64
 
 # Engine units, and what follows from float32.
@@ -31,6 +33,7 @@ MIN_DISTANCE = 1e-8  # elsewhere: float32 points on a wall of size 1 are 6e-8 ap
 HEIGHT_ROUNDING = 1e-7  # of a float32 point over a tilted plane
 GRID_TOLERANCE = 1e-9  # float64 points this close to those of a regular grid are that grid
 N_NEIGHBOURS = 8  # of a point of a mesh wall: more than share one of its triangles are searched for in vain
+WALL_PARTS = 8  # elements of a planar wall along each side, seen in a mirror only: chosen, not measured
 MIN_COSINE = 1e-5  # below it an element of the wall lies in the plane of a wall point: no light goes between them
 
 
@@ -135,9 +138,9 @@ class WallDistance:
         return distances[np.arange(len(points)), apart.argmax(axis=1)]
 
 
-def elements_of_mesh(built: BuiltScene, index: int, mesh: mi.Mesh) -> Elements:
-    """Return the triangles of shape ``index`` that the wall may see lit, with distances still to be found."""
-    corners, primitives = facing_triangles(built, mesh)
+def elements_of_mesh(built: BuiltScene, index: int, mesh: mi.Mesh, mirror: FlatMirrors | None = None) -> Elements:
+    """Return the triangles of shape ``index`` that the wall or its image may see lit, distances still to be found."""
+    corners, primitives = facing_triangles(built, mesh, None if mirror is None else mirror.images)
     count = len(corners)
     return Elements(
         corners=corners,
@@ -148,6 +151,23 @@ def elements_of_mesh(built: BuiltScene, index: int, mesh: mi.Mesh) -> Elements:
         sizes=longest_edges(corners),
         distances=np.zeros(count),
     )
+
+
+def wall_elements(built: BuiltScene) -> Elements:
+    """Return elements of a rectangular wall, of which ``shading`` and ``distances`` are not known."""
+    numbers = np.linspace(-1, 1, WALL_PARTS + 1)
+    x, y = (axis.ravel() for axis in np.meshgrid(numbers[:-1], numbers[:-1]))
+    step, none = 2 / WALL_PARTS, np.zeros_like(x)
+    low, right, up, far = (
+        np.stack([none, x + i * step, y + j * step], axis=1) for i, j in ((0, 0), (1, 0), (0, 1), (1, 1))
+    )
+    weights = np.concatenate([np.stack(corners, axis=1) for corners in ((low, right, far), (low, far, up))])
+    half = np.abs(wall_box(built.wall)[:, :2]).max(axis=0) / built.metres_per_engine_unit
+    corners = np.concatenate([weights[..., 1:] * half, 0 * weights[..., :1]], axis=2)
+    index = next(index for index, shape in enumerate(built.scene.shapes()) if shape.id() == WALL_ID)
+    count = len(weights)
+    shapes, primitives = np.full(count, index, np.uint32), np.zeros(count, np.uint32)
+    return Elements(corners, weights, 0 * corners, shapes, primitives, longest_edges(corners), np.zeros(count))
 
 
 def partition_by_size(

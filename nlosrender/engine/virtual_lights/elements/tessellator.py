@@ -17,6 +17,7 @@ import mitsuba as mi
 import numpy as np
 
 from nlosrender.capture.grids import Capture
+from nlosrender.engine.launch.flat_mirrors import FlatMirrors
 from nlosrender.engine.virtual_lights.elements.patches import Patches
 from nlosrender.engine.virtual_lights.elements.round_shapes import RoundShape
 from nlosrender.engine.virtual_lights.elements.sensor_regions import regions_of
@@ -44,6 +45,8 @@ class Tessellator:
         Bin width [engine units].
     may_divide
         Whether regions of the sensor grid may have patches of their own, where that is cheaper.
+    mirror
+        The only one, which may show the wall what turns away from it.
     tuning
         Sizes and limits.
     """
@@ -55,6 +58,7 @@ class Tessellator:
         bin_width: float,
         *,
         may_divide: bool = True,
+        mirror: FlatMirrors | None = None,
         tuning: VirtualLightTuning = DEFAULT_TUNING,
     ):
         self.built, self.capture, self.tuning = built, capture, tuning
@@ -73,7 +77,7 @@ class Tessellator:
             if not bool(shape.bsdf().flags() & mi.BSDFFlags.Smooth):  # a mirror alone: connections find nothing there
                 continue
             if shape.is_mesh():
-                triangles.append(elements_of_mesh(built, index, shape))
+                triangles.append(elements_of_mesh(built, index, shape, mirror))
             else:
                 self.round_shapes.append(RoundShape.of(index, shape))
         light = capture.laser_grid.positions.reshape(-1, 3).mean(axis=0) / built.metres_per_engine_unit
@@ -174,8 +178,9 @@ class Tessellator:
 
 
 def can_tessellate(built: BuiltScene) -> bool:
-    """Return whether every hidden shape is a mesh, a sphere or a cylinder."""
-    return all(shape.is_mesh() or shape.class_name() in ROUND_PLUGINS for shape in built.hidden_shapes)
+    """Return whether every hidden shape is a mesh, a sphere or a cylinder, or nothing but a mirror."""
+    shapes = [shape for shape in built.hidden_shapes if bool(shape.bsdf().flags() & mi.BSDFFlags.Smooth)]
+    return all(shape.is_mesh() or shape.class_name() in ROUND_PLUGINS for shape in shapes)
 
 
 def wall_sees_itself(built: BuiltScene) -> bool:

@@ -17,12 +17,13 @@ import mitsuba as mi
 import numpy as np
 
 from nlosrender.engine.launch.device_arrays import on_device
+from nlosrender.engine.launch.flat_mirrors import FlatMirrors, image_in, turned_in
 from nlosrender.engine.launch.launch_params import LaunchParams
 from nlosrender.engine.launch.passes import Passes, PassSize, Snapshot
 from nlosrender.engine.launch.wall_points import WallPoints
 from nlosrender.engine.virtual_lights.gather.delay_distribution import Delays, corner_delays, deposit_patch
 from nlosrender.engine.virtual_lights.gather.lighting import ROWS, GatherSettings, PackedPatches
-from nlosrender.engine.virtual_lights.visibility.shadow_rays import is_visible
+from nlosrender.engine.virtual_lights.visibility.shadow_rays import is_visible, mirrored_share
 
 if TYPE_CHECKING:
     from nlosrender.engine.virtual_lights.gather.block_histogram import BlockHistogram
@@ -52,7 +53,13 @@ class GatherPasses:
         self._size = PassSize(max(1, first_pairs // (histogram.shape.lanes * histogram.shape.lasers)))
 
     def gather(
-        self, params: LaunchParams, packed: PackedPatches, lane: mi.UInt32, slice_index: mi.UInt32, tile: mi.UInt64
+        self,
+        params: LaunchParams,
+        packed: PackedPatches,
+        lane: mi.UInt32,
+        slice_index: mi.UInt32,
+        tile: mi.UInt64,
+        mirror: FlatMirrors | None,
     ) -> None:
         """Gather the next group; parameters as for ``gather_third_bounce``."""
         group, self._group = self._group, self._group + 1
@@ -64,7 +71,7 @@ class GatherPasses:
             steps = min(self._size.steps, longest - done)
             self._size.begin()
             cut = (dr.opaque(mi.UInt32, number) for number in (done, steps))
-            gather_third_bounce(self._settings, params, packed, self._histogram, lane, slice_index, tile, *cut)
+            gather_third_bounce(self._settings, params, packed, self._histogram, lane, slice_index, tile, *cut, mirror)
             dr.eval(self._histogram.sums, self._histogram.outside)
             dr.sync_thread()
             self._size.end()
@@ -89,6 +96,7 @@ def gather_third_bounce(
     tile: mi.UInt64,
     skipped: mi.UInt32,
     most: mi.UInt32,
+    mirror: FlatMirrors | None,
 ) -> None:
     """Deposit the third bounce: lane by lane over ``most`` patches of its slice, after the first ``skipped`` ones.
 
@@ -106,6 +114,8 @@ def gather_third_bounce(
         The bit of the tile that its sensor point lies in, see ``WallTiles``.
     skipped, most
         Opaque.
+    mirror
+        By way of which the sensor points see the patches of Lambertian surfaces; None: straight.
     """
     built, sensors = params.built, params.sensors
     sensor, wall_bsdf = sensors.interaction, built.wall_bsdf
@@ -133,16 +143,20 @@ def gather_third_bounce(
             wall_bsdf,
             own_laser,
             tile,
+            mirror,
         ],
     ):
         # ---- The patch as the sensor point sees it ------------------------------------------------------------------
         rows = [dr.gather(mi.Vector4f, packed.packed, patch * ROWS + k) for k in range(ROWS)]
         a, b, c, centre, shown, offset = (mi.Point3f(row.x, row.y, row.z) for row in rows)
-        from_sensor = centre - sensor.p
         areas = mi.Vector3f(rows[0].w, rows[1].w, rows[2].w)
+        point = centre + shown
+        a, b, c, centre = (image_in(mirror, corner) for corner in (a, b, c, centre))
+        areas = turned_in(mirror, areas)
+        from_sensor = centre - sensor.p
         to_patch = from_sensor
         if dr.hint(packed.rounding_residual is not None, mode="scalar"):
-            to_patch = from_sensor + _rounding_residual(packed, patch)
+            to_patch = from_sensor + turned_in(mirror, _rounding_residual(packed, patch))
         distance2 = dr.squared_norm(to_patch)
         direction = to_patch * dr.rsqrt(distance2)
         received = wall_bsdf.eval(context, sensor, sensor.to_local(direction))
@@ -150,7 +164,7 @@ def gather_third_bounce(
         active = dr.any(weight > 0)
         cosine = mi.Float(0)
         if dr.hint(settings.is_diffuse, mode="scalar"):
-            cosine = -dr.dot(dr.gather(mi.Normal3f, packed.shading, patch), direction)
+            cosine = -dr.dot(turned_in(mirror, dr.gather(mi.Normal3f, packed.shading, patch)), direction)
             active &= cosine > 0
 
         is_cluster = None
@@ -158,7 +172,10 @@ def gather_third_bounce(
             is_cluster = rows[3].w > 0
 
         # ---- Visibility ---------------------------------------------------------------------------------------------
-        if dr.hint(settings.needs_visibility, mode="scalar"):
+        if dr.hint(mirror is not None, mode="scalar"):
+            weight *= mirrored_share(built, mirror, sensor, point, mi.Vector3f(offset), active)
+            active = dr.any(weight > 0)
+        elif dr.hint(settings.needs_visibility, mode="scalar"):
             # in front of the plane through the point that is looked at, not through the centre
             to_surface = from_sensor + shown
             mask = dr.select(dr.dot(areas, to_surface) < 0, dr.gather(mi.UInt64, packed.mask, patch), 0)

@@ -10,11 +10,12 @@ import mitsuba as mi
 import numpy as np
 
 from nlosrender.engine.launch.device_arrays import on_device
+from nlosrender.engine.launch.flat_mirrors import FlatMirrors, image_in, turned_in
 from nlosrender.engine.launch.launch_params import LaunchParams
 from nlosrender.engine.launch.wall_points import WallPoints
 from nlosrender.engine.virtual_lights.gather.delay_distribution import corner_delays
 from nlosrender.engine.virtual_lights.tuning import DEFAULT_TUNING
-from nlosrender.engine.virtual_lights.visibility.shadow_rays import is_visible
+from nlosrender.engine.virtual_lights.visibility.shadow_rays import is_visible, mirrored_share
 from nlosrender.scene.build import BuiltScene
 
 if TYPE_CHECKING:
@@ -103,9 +104,17 @@ class LitPatches:
 
 
 def light_patches(
-    settings: GatherSettings, params: LaunchParams, patches: DevicePatches, mask_query: MaskQuery, n_lasers: int
+    settings: GatherSettings,
+    params: LaunchParams,
+    patches: DevicePatches,
+    mask_query: MaskQuery,
+    n_lasers: int,
+    mirror: FlatMirrors | None = None,
 ) -> LitPatches:
-    """Light all patches of a scale by the ``n_lasers`` of a batch, and find their visibility masks."""
+    """Light all patches of a scale by the ``n_lasers`` of a batch, and find their visibility masks.
+
+    ``mirror``: by way of which the light comes; None: straight.
+    """
     count = dr.width(patches.areas)
     shadow_target, all_lit = patches.points(patches.number), dr.full(mi.Bool, True, count)
     dr.eval(shadow_target)
@@ -113,14 +122,19 @@ def light_patches(
     if settings.needs_visibility and not settings.has_one_laser:
         lit = lit.cleared(mask_query)
     if not settings.is_confocal:
-        lit = _light_by_lasers(settings, params, lit, mask_query, n_lasers)
+        lit = _light_by_lasers(settings, params, lit, mask_query, n_lasers, mirror)
     if settings.needs_visibility and settings.has_one_laser:
         lit = lit.cleared(mask_query)
     return lit
 
 
 def pack_patches(
-    settings: GatherSettings, params: LaunchParams, lit_patches: LitPatches, slices_per_region: int, n_lasers: int
+    settings: GatherSettings,
+    params: LaunchParams,
+    lit_patches: LitPatches,
+    slices_per_region: int,
+    n_lasers: int,
+    mirror: FlatMirrors | None = None,
 ) -> PackedPatches:
     """Return what the gather reads: the patches that are lit, sorted by slice (see ``PatchRegions.in_slices``)."""
     patches, laser_light, delays = lit_patches.patches, lit_patches.laser_light, mi.Float(0)
@@ -136,7 +150,7 @@ def pack_patches(
         index = dr.arange(mi.UInt32, dr.width(lit) * n_lasers)
         laser, patch = index // n_lit, dr.gather(mi.UInt32, lit, index % n_lit)
         laser_light = dr.gather(mi.Spectrum, laser_light, laser * dr.opaque(mi.UInt32, count) + patch)
-        points = dr.gather(mi.Point3f, params.lasers.interaction.p, laser)
+        points = image_in(mirror, dr.gather(mi.Point3f, params.lasers.interaction.p, laser))
         centre = dr.gather(mi.Point3f, patches.interaction.p, patch)
         is_cluster = dr.gather(mi.Vector4f, patches.members, patch).w > 0 if patches.has_clusters else None
         corners = _corners(patches, patch)
@@ -174,7 +188,12 @@ def pack_patches(
 
 
 def _light_by_lasers(
-    settings: GatherSettings, params: LaunchParams, dark: LitPatches, mask_query: MaskQuery, n_lasers: int
+    settings: GatherSettings,
+    params: LaunchParams,
+    dark: LitPatches,
+    mask_query: MaskQuery,
+    n_lasers: int,
+    mirror: FlatMirrors | None,
 ) -> LitPatches:
     """Light every patch by every laser: emission, distance, and the fraction of the patch that is not in shadow.
 
@@ -188,11 +207,13 @@ def _light_by_lasers(
     divisor = dr.opaque(mi.UInt32, n_patches)
     patch, laser = index % divisor, index // divisor
     lit = params.lasers.gather(laser).interaction
-    to_rounded = dr.gather(mi.Point3f, patches.interaction.p, patch) - lit.p
+    centre = dr.gather(mi.Point3f, patches.interaction.p, patch)
+    to_rounded = centre - image_in(mirror, lit.p)
     to_patch = to_rounded + dr.gather(mi.Vector3f, patches.rounding_residual, patch)
     distance2 = dr.squared_norm(to_patch)
     direction = to_patch * dr.rsqrt(distance2)
-    laser_light = built.wall_bsdf.eval(mi.BSDFContext(), lit, lit.to_local(direction)) / distance2
+    sent = lit.to_local(turned_in(mirror, direction))
+    laser_light = built.wall_bsdf.eval(mi.BSDFContext(), lit, sent) / distance2
     cosine = -dr.dot(dr.gather(mi.Normal3f, patches.interaction.sh_frame.n, patch), direction)
     active = dr.any(laser_light > 0)
     if settings.is_diffuse:
@@ -201,9 +222,13 @@ def _light_by_lasers(
     else:
         flags = dr.gather(mi.SurfaceInteraction3f, patches.interaction, patch).bsdf().flags()
         active &= (cosine > 0) | mi.has_flag(flags, mi.BSDFFlags.BackSide)
-    seen = mi.Float(1)
-    if settings.needs_visibility and settings.has_one_laser:
-        seen, shadow_target = _lit_fraction(settings, built, patches, lit, to_rounded, active)
+    seen = mi.Spectrum(1)
+    if settings.has_one_laser and (settings.needs_visibility or mirror is not None):
+        seen, shadow_target = _lit_fraction(settings, built, patches, lit, centre, active, mirror)
+    elif mirror is not None:
+        target = dr.gather(mi.Vector3f, shadow_target, patch)
+        offset = dr.gather(mi.Vector3f, patches.offset_at(shadow_target), patch)
+        seen = mirrored_share(built, mirror, lit, centre + target, offset, active)
     elif settings.needs_visibility:
         # the very point where the sensor points' rays end: what hides a part of a patch from both hides the same part
         to_surface = to_rounded + dr.gather(mi.Vector3f, shadow_target, patch)
@@ -211,7 +236,7 @@ def _light_by_lasers(
         tile = mask_query.wall_tiles.tile_bit(mi.UInt32(0), lit.p)
         is_before = dr.dot(dr.gather(mi.Vector3f, patches.areas, patch), to_surface) < 0  # the plane through that point
         mask = dr.select(is_before, dr.gather(mi.UInt64, dark.mask, patch), 0)
-        seen = dr.select(is_visible(built, lit, to_surface, offset, active, mask, tile), mi.Float(1), 0)
+        seen = dr.select(is_visible(built, lit, to_surface, offset, active, mask, tile), mi.Spectrum(1), 0)
     laser_light = dr.select(active, laser_light * seen, 0)
     brightest = dr.zeros(mi.Float, n_patches)
     dr.scatter_reduce(dr.ReduceOp.Max, brightest, dr.max(laser_light), patch)
@@ -225,24 +250,31 @@ def _lit_fraction(
     built: BuiltScene,
     patches: DevicePatches,
     laser: mi.SurfaceInteraction3f,
-    to_rounded: mi.Vector3f,
+    centre: mi.Point3f,
     active: mi.Bool,
-) -> tuple[mi.Float, mi.Vector3f]:
-    """Return the fraction of each patch that the only laser lights, and a lit point where sensor points' rays end.
+    mirror: FlatMirrors | None,
+) -> tuple[mi.Spectrum, mi.Vector3f]:
+    """Return the share of the only laser's light that each patch has, and a lit point where sensor points' rays end.
 
     The fractions that laser and sensor point see are not independent where one edge throws both shadows. One point,
     drawn among those in light by reservoir sampling, makes their product right on average: docs/virtual-lights.md, 5.
     """
-    n_seen, chosen = mi.UInt32(0), mi.Vector3f(0)
+    n_seen, chosen, share = mi.UInt32(0), mi.Vector3f(0), mi.Spectrum(0)
     for k in range(settings.laser_rays):
         index = patches.number * settings.laser_rays + k
         point = patches.points(index)
-        is_lit = is_visible(built, laser, to_rounded + point, patches.offset_at(point), active)
+        offset = patches.offset_at(point)
+        if mirror is None:
+            is_lit = is_visible(built, laser, centre - laser.p + point, offset, active)
+        else:
+            reflected = mirrored_share(built, mirror, laser, centre + point, offset, active)
+            share += reflected
+            is_lit = dr.any(reflected > 0)
         n_seen += dr.select(is_lit, mi.UInt32(1), 0)
         # reservoir of one: the n-th lit point replaces the one before with probability 1 / n
         takes = is_lit & (mi.sample_tea_float32(index, patches.start.x) * mi.Float(n_seen) < 1)
         chosen = dr.select(takes, point, chosen)
-    return mi.Float(n_seen) / settings.laser_rays, chosen
+    return (mi.Spectrum(n_seen) if mirror is None else share) / settings.laser_rays, chosen
 
 
 def _corners(patches: DevicePatches, index: mi.UInt32) -> tuple[mi.Point3f, mi.Point3f, mi.Point3f]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
+from nlosrender.engine.launch.flat_mirrors import FlatMirrors, image_in
 from nlosrender.engine.launch.ray_offsets import off_the_wall
 from nlosrender.scene.build import BuiltScene
 
@@ -30,3 +31,24 @@ def is_visible(
     asked = active if mask is None else active & ((mask & tile) == 0)
     ray = mi.Ray3f(origin, direction, mi.Float(1), mi.Float(0), [])
     return active & ~(asked & built.scene.ray_test(ray, coherent=False, active=asked))
+
+
+def mirrored_share(
+    built: BuiltScene,
+    mirror: FlatMirrors | None,
+    wall_point: mi.SurfaceInteraction3f,
+    point: mi.Point3f,
+    offset: mi.Vector3f,
+    active: mi.Bool,
+) -> mi.Spectrum:
+    """Return the share of light that a scene's only mirror sends from a point of a hidden surface to one of the wall.
+
+    0 where either does not see the mirror's image of the other; ``offset`` as for ``is_visible``. 1 without a mirror.
+    """
+    if mirror is None:
+        return mi.Spectrum(1)
+    number = mi.UInt32(0)
+    start = point + offset * dr.sign(dr.dot(offset, image_in(mirror, wall_point.p) - point))
+    active = active & mirror.may_reflect(number, wall_point.p, point)
+    found = mirror.reflected(built, number, wall_point, point, start, active)
+    return dr.select(found.active, found.value * dr.square(found.distance), 0)

@@ -11,18 +11,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nlosrender.engine.launch.device_arrays import on_device
+from nlosrender.engine.launch.flat_mirrors import FlatMirrors, image_in, turned_in
 from nlosrender.engine.launch.histogram import DeviceHistogram, HistogramShape
 from nlosrender.engine.launch.launch_params import LaunchParams
-from nlosrender.engine.launch.ray_offsets import off_the_surface
+from nlosrender.engine.launch.ray_offsets import WALL_OFFSET, off_the_surface
 from nlosrender.engine.virtual_lights.gather.device_patches import surface_at, to_points
 from nlosrender.engine.virtual_lights.gather.lighting import irradiance, perpendicular_irradiance
 from nlosrender.engine.virtual_lights.visibility.masks import Surface, VisibilityMasks, WallTiles
-from nlosrender.engine.virtual_lights.visibility.shadow_rays import is_visible
+from nlosrender.engine.virtual_lights.visibility.shadow_rays import is_visible, mirrored_share
 from nlosrender.scene.build import BuiltScene
 
 if TYPE_CHECKING:
     from nlosrender.engine.virtual_lights.vpls.sampler import Vpls
     from nlosrender.engine.virtual_lights.vpls.subpaths import VplContributions
+
+NO_SLOT = 0xFFFFFFFF  # of contributions to bounces that are not rendered
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,6 +72,7 @@ class VplTable:
         shading = mi.Normal3f(to_points(vpls.normals[used]))
         positions = vpls.positions[used]
         offset = off_the_surface(built, positions, vpls.normals[used], vpls.shapes[used]) - positions
+        offset[:, 2] = np.where(positions[:, 2] == 0, WALL_OFFSET, offset[:, 2])  # of a planar wall
         mask = mi.UInt64(0)
         if masks is not None:
             surface = Surface(to_points(vpls.positions[used]), mi.Vector3f(shading), mi.Vector3f(shading))
@@ -91,10 +95,12 @@ def gather_contributions(
     slots: mi.UInt32,
     shape: HistogramShape,
     histogram: DeviceHistogram,
+    mirror: FlatMirrors | None = None,
 ) -> None:
     """Deposit the contributions of VPLs: a lane loops over the VPLs of its replica and, for each, its contributions.
 
-    ``cut`` (opaque): how many VPLs of a replica are skipped, and how many are gathered at most.
+    ``cut`` (opaque): how many VPLs of a replica are skipped, and how many are gathered at most. ``mirror``: VPLs are
+    gathered by way of it instead. Contributions of ``NO_SLOT`` are left out.
     """
     built, sensors = params.built, params.sensors
     sensor, wall_bsdf, context = sensors.interaction, built.wall_bsdf, mi.BSDFContext()
@@ -110,23 +116,40 @@ def gather_contributions(
 
     while dr.hint(
         vpl < end,
-        exclude=[params, table, contributions, histogram, built, sensors, sensor, wall_bsdf, end, own_laser, tile],
+        exclude=[
+            params,
+            table,
+            contributions,
+            histogram,
+            built,
+            sensors,
+            sensor,
+            wall_bsdf,
+            end,
+            own_laser,
+            tile,
+            mirror,
+        ],
     ):
         # ---- Connect to the VPL -------------------------------------------------------------------------------------
         at = dr.gather(mi.Vector4f, table.packed, vpl * 2)
         by = dr.gather(mi.Vector4f, table.packed, vpl * 2 + 1)
         position, areas = mi.Point3f(at.x, at.y, at.z), mi.Vector3f(by.x, by.y, by.z)
-        to_vpl = position - sensor.p
+        to_vpl = image_in(mirror, position) - sensor.p
         distance2 = dr.squared_norm(to_vpl)
         distance = dr.sqrt(distance2)
         direction = to_vpl / distance
         weight = wall_bsdf.eval(context, sensor, sensor.to_local(direction))
-        facing = -dr.dot(areas, direction)
+        facing = -dr.dot(turned_in(mirror, areas), direction)
         if dr.hint(table.interaction is not None, mode="scalar"):
             facing = dr.abs(facing)
         weight *= dr.maximum(facing, 0) / distance2
         active = dr.any(weight > 0)
-        if dr.hint(needs_visibility, mode="scalar"):
+        if dr.hint(mirror is not None, mode="scalar"):
+            offset = dr.gather(mi.Vector3f, table.offset, vpl)
+            weight *= mirrored_share(built, mirror, sensor, position, offset, active)
+            active = dr.any(weight > 0)
+        elif dr.hint(needs_visibility, mode="scalar"):
             mask = dr.gather(mi.UInt64, table.mask, vpl)
             if dr.hint(table.interaction is not None, mode="scalar"):
                 mask = dr.select(dr.dot(areas, direction) < 0, mask, 0)
@@ -175,14 +198,15 @@ def gather_contributions(
                     to_laser = there.to_local(dr.normalize(own_laser.interaction.p - end_point))
                     value *= perpendicular_irradiance(built, own_laser, end_point)
                     value *= there.bsdf().eval(context, there, to_laser)
-                lit = dr.any(value > 0)
+                is_lit = dr.any(value > 0)
                 if dr.hint(needs_visibility, mode="scalar"):
                     end_offset = dr.gather(mi.Vector3f, contributions.offset, contribution)
-                    lit = is_visible(built, own_laser.interaction, end_point - own_laser.interaction.p, end_offset, lit)
+                    to_end = end_point - own_laser.interaction.p
+                    is_lit = is_visible(built, own_laser.interaction, to_end, end_offset, is_lit)
                 arrival = delay + dr.gather(mi.Float, contributions.delays, contribution) + own_laser.delay_fraction
                 arrival += dr.norm(end_point - own_laser.interaction.p) * scale
                 bins = mi.Int32(dr.floor(dr.minimum(arrival, 1e9))) + own_laser.delay_bins + sensors.delay_bins
-                histogram.deposit(lane, mi.UInt32(0), slot, bins, value, lit)
+                histogram.deposit(lane, mi.UInt32(0), slot, bins, value, is_lit & (slot != NO_SLOT))
             else:
                 laser = mi.UInt32(0)
                 while dr.hint(
@@ -194,7 +218,7 @@ def gather_contributions(
                     value = reflected * dr.gather(mi.Spectrum, contributions.values, entry)
                     arrival = delay + dr.gather(mi.Float, contributions.delays, entry) + points.delay_fraction
                     bins = mi.Int32(dr.floor(dr.minimum(arrival, 1e9))) + points.delay_bins + sensors.delay_bins
-                    histogram.deposit(lane, laser, slot, bins, value, dr.any(value > 0))
+                    histogram.deposit(lane, laser, slot, bins, value, dr.any(value > 0) & (slot != NO_SLOT))
                     laser += 1
             contribution += 1
         vpl += 1

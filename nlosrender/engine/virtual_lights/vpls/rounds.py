@@ -19,12 +19,12 @@ from nlosrender.engine.interface import Budget
 from nlosrender.engine.launch.device_arrays import on_device
 from nlosrender.engine.launch.device_capture import DeviceCapture
 from nlosrender.engine.launch.energy_contrasts import RoundContrasts
-from nlosrender.engine.launch.histogram import DeviceHistogram, Histogram
+from nlosrender.engine.launch.histogram import DeviceHistogram, Histogram, HistogramShape
 from nlosrender.engine.launch.passes import Passes, PassSize, Snapshot
 from nlosrender.engine.launch.pilot_points import Pilot, spread
 from nlosrender.engine.launch.wall_points import laser_points
 from nlosrender.engine.virtual_lights.visibility.masks import VisibilityMasks, WallTiles
-from nlosrender.engine.virtual_lights.vpls.gather import VplTable, gather_contributions
+from nlosrender.engine.virtual_lights.vpls.gather import NO_SLOT, VplTable, gather_contributions
 from nlosrender.engine.virtual_lights.vpls.sampler import Vpls, VplSampler
 from nlosrender.engine.virtual_lights.vpls.subpaths import ProposalLasers, SubpathPlan, vpl_contributions
 
@@ -81,7 +81,7 @@ class VplBounces:
     @cached_property
     def sampler(self) -> VplSampler:
         """Sampler of VPL positions; made when it is needed, for it holds all elements."""
-        return VplSampler(self.tessellator, self.device.capture_gate)
+        return VplSampler(self.tessellator, self.device.capture_gate, self.device.mirrors)
 
     def plan(self, replicas: int) -> SubpathPlan:
         """Return the numbers of a round of ``replicas`` independent sets of VPLs."""
@@ -214,18 +214,16 @@ class VplBounces:
         generator = np.random.default_rng(state[0])
         vpls = Vpls.joined([self.sampler.sample(plan.vpls, generator) for _ in range(plan.replicas)])
         params = self.device.launch_params(batch, shape)
-        contributions = vpl_contributions(plan, params, vpls, self.proposal_lasers, int(state[1]))
+        mirror = self.device.mirrors
+        contributions = vpl_contributions(plan, params, vpls, self.proposal_lasers, int(state[1]), mirror)
         if not contributions.count:
             return
         wall_tiles = WallTiles.of(self.built, self.device.capture, batch)
         first_vpls = np.arange(plan.replicas + 1) * plan.vpls
         table = VplTable.of(self.built, vpls, first_vpls, contributions, self.masks, wall_tiles)
-        lowest = mi.UInt32(THIRD_BOUNCE + 1)
-        slots = (
-            dr.minimum(contributions.bounces - lowest, shape.slots - 1) if self.options.bounces.split else lowest * 0
-        )
-        slots = dr.full(mi.UInt32, 0, contributions.count) + slots
-        dr.eval(slots)
+        # straight, and by way of the mirror one bounce later
+        by_mirrors = [None] if mirror is None else [None, mirror]
+        ways = [(self._slots(contributions.bounces + more, shape), by) for more, by in enumerate(by_mirrors)]
         needs_visibility = self.masks is not None
         longest = int(np.diff(np.array(table.first)).max())
         pairs_per_step = shape.lanes * self.contributions_per_vpl * (shape.lasers + self.is_confocal)
@@ -235,10 +233,22 @@ class VplBounces:
             cut = tuple(dr.opaque(mi.UInt32, count) for count in (done, steps))
             size.begin()
             scene = params, needs_visibility, self.is_confocal, wall_tiles
-            gather_contributions(*scene, table, cut, contributions, slots, shape, histogram)
+            for slots, by in ways:
+                gather_contributions(*scene, table, cut, contributions, slots, shape, histogram, by)
             dr.eval(histogram.sums)
             dr.sync_thread()
             size.end()
             done += steps
             if done < longest:
                 report_progress(done)
+
+    def _slots(self, bounces: mi.UInt32, shape: HistogramShape) -> mi.UInt32:
+        """Return the slots of contributions; ``NO_SLOT`` for bounces that are not rendered here."""
+        lowest, highest = mi.UInt32(THIRD_BOUNCE + 1), self.options.bounces.max_bounces
+        slots = dr.minimum(bounces - lowest, shape.slots - 1) if self.options.bounces.split else bounces * 0
+        is_rendered = bounces >= lowest
+        if highest is not None:
+            is_rendered &= bounces <= highest
+        slots = dr.select(is_rendered, slots, NO_SLOT)
+        dr.eval(slots)
+        return slots

@@ -18,11 +18,13 @@ from nlosrender.engine.launch.sequences import recurrence_steps
 from nlosrender.engine.launch.time_gate import CaptureTimeGate
 from nlosrender.engine.virtual_lights.elements.patches import SurfacePoints
 from nlosrender.engine.virtual_lights.elements.round_shapes import onto_round_shapes
+from nlosrender.engine.virtual_lights.elements.subdivision import Elements, wall_elements
 from nlosrender.engine.virtual_lights.elements.triangles import longest_edges, normals_and_areas
 from nlosrender.scene.pose import Float64
 from nlosrender.scene.triangle_point import triangle_weights
 
 if TYPE_CHECKING:
+    from nlosrender.engine.launch.flat_mirrors import FlatMirrors
     from nlosrender.engine.virtual_lights.elements.tessellator import Tessellator
 
 # Barycentric coordinates of a triangle's centroid, and of the points between it and the corners.
@@ -38,19 +40,34 @@ class Vpls(SurfacePoints):
 
 
 class VplSampler:
-    """Draws VPLs on the elements of a scene; few on those beyond ``capture_gate``, if there is one."""
+    """Draws VPLs on the elements of a scene; few on those beyond ``capture_gate``, if there is one.
 
-    def __init__(self, tessellator: Tessellator, capture_gate: CaptureTimeGate | None = None):
+    On a planar wall, too, where a ``mirror`` shows it to its own points.
+    """
+
+    def __init__(
+        self,
+        tessellator: Tessellator,
+        capture_gate: CaptureTimeGate | None = None,
+        mirror: FlatMirrors | None = None,
+    ):
         elements, on_round = tessellator.elements, tessellator.round_elements()
         round_patches = [patches for _, patches in on_round]
         round_rows = [np.tile(shape.row, (len(patches), 1)) for shape, patches in on_round]
-        self._corners = np.concatenate([elements.corners, *(patches.corners for patches in round_patches)])
-        self._weights = np.concatenate([elements.weights, *(np.zeros((len(part), 3, 3)) for part in round_patches)])
-        self._shapes = np.concatenate([elements.shapes, *(patches.shapes for patches in round_patches)])
-        self._primitives = np.concatenate([elements.primitives, *(patches.primitives for patches in round_patches)])
-        self._round_rows = np.concatenate([np.zeros((len(elements), 7)), *round_rows])
+        on_wall = Elements.none()
+        if mirror is not None and mirror.shows_wall(tessellator.built):
+            on_wall = wall_elements(tessellator.built)
+        flat = Elements.joined([elements, on_wall])
+        self._corners = np.concatenate([flat.corners, *(patches.corners for patches in round_patches)])
+        self._weights = np.concatenate([flat.weights, *(np.zeros((len(part), 3, 3)) for part in round_patches)])
+        self._shapes = np.concatenate([flat.shapes, *(patches.shapes for patches in round_patches)])
+        self._primitives = np.concatenate([flat.primitives, *(patches.primitives for patches in round_patches)])
+        self._round_rows = np.concatenate([np.zeros((len(flat), 7)), *round_rows])
         self._normals, self._areas = normals_and_areas(self._corners)
         centres = self._corners.mean(axis=1)
+        if mirror is not None and len(on_wall):
+            seen = slice(len(elements), len(flat))
+            centres[seen] = mirror.images(centres[seen])
         # an element is no longer than its distance; half its size stands for the distance where it touches a point
         distances = np.maximum(tessellator.distance(centres), longest_edges(self._corners) / 2)
         self._reach = distances * (distances + tessellator.reach)

@@ -18,11 +18,12 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from nlosrender.capture.bounces import FIRST_BOUNCE
+from nlosrender.capture.bounces import FIRST_BOUNCE, THIRD_BOUNCE
 from nlosrender.engine.launch.device_arrays import on_device
+from nlosrender.engine.launch.flat_mirrors import FlatMirrors, image_in, turned_in
 from nlosrender.engine.launch.lane_random_state import LaneRandomness
 from nlosrender.engine.launch.launch_params import MAX_SURVIVAL, LaunchParams
-from nlosrender.engine.launch.ray_offsets import connection_segment, offset_origin
+from nlosrender.engine.launch.ray_offsets import connection_segment, off_the_wall, offset_origin
 from nlosrender.engine.launch.time_gate import CaptureTimeGate, TimeGate, time_gate_roulette
 from nlosrender.engine.launch.wall_points import WallPoints
 from nlosrender.engine.virtual_lights.gather.device_patches import normal_reflectance, surface_at
@@ -46,6 +47,29 @@ class ProposalLasers:
     are_all: bool  # whether the capture has no others; otherwise every vertex is given a chance
     untried_share: float = DEFAULT_TUNING.untried_share
 
+    def light(
+        self,
+        built: BuiltScene,
+        leaving: mi.Spectrum,
+        point: mi.Point3f,
+        shading: mi.Normal3f,
+        mirror: FlatMirrors | None = None,
+    ) -> mi.Float:
+        """Return the light expected, by way of ``mirror``, of a point that sends on a share ``leaving`` of it."""
+        lit, point, shading = mi.Float(0), image_in(mirror, point), mi.Normal3f(turned_in(mirror, shading))
+        for k in range(self.count):
+            laser = self.points.gather(mi.UInt32(k))
+            lit += dr.mean(leaving * irradiance(built, laser, point, shading)) / self.count
+        lit += self.untried(leaving, point)
+        return lit
+
+    def untried(self, leaving: mi.Spectrum, point: mi.Point3f) -> mi.Float:
+        """Return what no vertex has less of, for lasers that are not tried may light it."""
+        if self.are_all:
+            return mi.Float(0)
+        away = dr.squared_norm(point - self.points.gather(mi.UInt32(0)).interaction.p)
+        return self.untried_share * dr.mean(leaving) / away
+
 
 @dataclass(eq=False)  # not frozen: the state of a loop
 class SubpathVertex:
@@ -60,6 +84,7 @@ class SubpathVertex:
     bounce: mi.UInt32  # of a connection to the laser
     expected: mi.Float  # light expected of it
     interaction: mi.SurfaceInteraction3f | None  # None: all surfaces are Lambertian
+    by_mirror: mi.Bool  # the connection is by way of the mirror
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,12 +119,13 @@ def trace_subpaths(
     max_bounces: int | None,
     time_gate: TimeGate | None,
     randomness: LaneRandomness,
+    mirror: FlatMirrors | None,
 ) -> tuple[SubpathVertex, mi.Float]:
     """Trace one subpath per lane from ``vpls`` until roulette, escape or ``max_bounces`` (None: no limit) ends it.
 
     The first ``direction`` is one of the VPL's frame.
 
-    Returns one vertex of each, and the light expected of all of them.
+    Returns one vertex of each, and the light expected of all of them; by way of the scene's only ``mirror``, too.
     """
     scene, wall, context = built.scene, mi.ShapePtr(built.wall_shape), mi.BSDFContext()
     generator = mi.PCG32(randomness.generator)
@@ -116,11 +142,15 @@ def trace_subpaths(
     bounce = mi.UInt32(FIRST_BOUNCE + 1)  # of a connection from the last vertex
     nowhere = None if is_diffuse else dr.zeros(mi.SurfaceInteraction3f)
     none = mi.Normal3f(0), mi.Normal3f(0), wall, mi.Spectrum(0), mi.Float(0), mi.UInt32(0), mi.Float(0)
-    vertex = SubpathVertex(mi.Point3f(0), *none, nowhere)
+    vertex = SubpathVertex(mi.Point3f(0), *none, nowhere, mi.Bool(False))
     total = mi.Float(0)  # light expected of all vertices so far
+    if mirror is not None:  # what VPLs on a planar wall receive by way of it, patches of hidden surfaces do not tell
+        vertex = dr.select((vpls.shape == wall) & built.wall.is_planar, _on_wall(vpls, reflectance), vertex)
+        vertex.expected = proposal_lasers.light(built, vertex.carried, vertex.position, vertex.shading, mirror)
+        total = mi.Float(vertex.expected)
     is_past_gate = mi.Bool(False)  # all light still to be found comes too late; survived that roulette
 
-    while dr.hint(alive, exclude=[built, scene, proposal_lasers, vpls, time_gate]):
+    while dr.hint(alive, exclude=[built, scene, proposal_lasers, vpls, time_gate, mirror]):
         # ---- Intersect ----------------------------------------------------------------------------------------------
         si = scene.ray_intersect(ray, mi.RayFlags.All, coherent=False, active=alive)
         alive = alive & si.is_valid()
@@ -137,34 +167,41 @@ def trace_subpaths(
         hidden = mi.Bool(alive)
         if dr.hint(is_diffuse, mode="scalar"):
             hidden &= mi.Frame3f.cos_theta(si.wi) > 0
+        front = mi.Bool(hidden)
         if dr.hint(built.wall.is_planar, mode="scalar"):
             hidden &= si.shape != wall
-        leaving = mi.Spectrum(throughput)
+        leaving, lit = mi.Spectrum(throughput), mi.Float(0)
         if dr.hint(is_diffuse, mode="scalar"):
             upright = mi.SurfaceInteraction3f(si)
             upright.wi = mi.Vector3f(0, 0, 1)
-            leaving *= bsdf.eval(context, upright, mi.Vector3f(0, 0, 1), hidden)
-        lit = mi.Float(0)
-        for k in range(proposal_lasers.count):
-            point = proposal_lasers.points.gather(mi.UInt32(k))
-            if dr.hint(is_diffuse, mode="scalar"):
-                lit += dr.mean(leaving * irradiance(built, point, si.p, si.sh_frame.n)) / proposal_lasers.count
-            else:
+            leaving *= bsdf.eval(context, upright, mi.Vector3f(0, 0, 1), hidden if mirror is None else front)
+            lit = proposal_lasers.light(built, leaving, si.p, si.sh_frame.n)
+        else:
+            for k in range(proposal_lasers.count):
+                point = proposal_lasers.points.gather(mi.UInt32(k))
                 to_laser = si.to_local(dr.normalize(point.interaction.p - si.p))
                 reflected = bsdf.eval(context, si, to_laser, hidden) * perpendicular_irradiance(built, point, si.p)
                 lit += dr.mean(throughput * reflected) / proposal_lasers.count
-        if dr.hint(not proposal_lasers.are_all, mode="scalar"):
-            away = dr.squared_norm(si.p - proposal_lasers.points.gather(mi.UInt32(0)).interaction.p)
-            lit += proposal_lasers.untried_share * dr.mean(leaving) / away
+            lit += proposal_lasers.untried(leaving, si.p)
+        lit = dr.select(hidden, lit, 0)
         if dr.hint(time_gate is not None, mode="scalar"):
             lit = dr.select(is_past_gate, lit * gate_survival, lit)
-        lit = dr.select(hidden, lit, 0)
         # reservoir sampling: of the vertices so far, each is chosen in proportion to its light
         total += lit
         pick = (lit > 0) & (generator.next_float32(alive) * total < lit)
-        interaction = None if is_diffuse else si
-        found = SubpathVertex(si.p, si.n, mi.Normal3f(si.sh_frame.n), si.shape, leaving, opl, bounce, lit, interaction)
+        straight, shading, interaction = mi.Bool(False), mi.Normal3f(si.sh_frame.n), None if is_diffuse else si
+        found = SubpathVertex(si.p, si.n, shading, si.shape, leaving, opl, bounce, lit, interaction, straight)
         vertex = dr.select(pick, found, vertex)
+        if dr.hint(mirror is not None, mode="scalar"):
+            lit = dr.select(front, proposal_lasers.light(built, leaving, si.p, si.sh_frame.n, mirror), 0)
+            if dr.hint(time_gate is not None, mode="scalar"):
+                lit = dr.select(is_past_gate, lit * gate_survival, lit)
+            if dr.hint(max_bounces is not None, mode="scalar"):
+                lit = dr.select(bounce < max_bounces, lit, 0)
+            total += lit
+            pick = (lit > 0) & (generator.next_float32(alive) * total < lit)
+            by_mirror = SubpathVertex(si.p, si.n, shading, si.shape, leaving, opl, bounce + 1, lit, None, ~straight)
+            vertex = dr.select(pick, by_mirror, vertex)
 
         # ---- Sample the next direction ------------------------------------------------------------------------------
         if dr.hint(max_bounces is not None, mode="scalar"):
@@ -182,6 +219,13 @@ def trace_subpaths(
     return vertex, total
 
 
+def _on_wall(vpls: mi.SurfaceInteraction3f, reflectance: mi.Spectrum) -> SubpathVertex:
+    """Return VPLs as ends of subpaths of no length that are connected by mirror."""
+    place = vpls.p, mi.Normal3f(vpls.n), mi.Normal3f(vpls.sh_frame.n), vpls.shape
+    bounce = mi.UInt32(THIRD_BOUNCE + 1)
+    return SubpathVertex(*place, reflectance * dr.inv_pi, mi.Float(0), bounce, mi.Float(0), None, mi.Bool(True))
+
+
 @dataclass(frozen=True, eq=False)
 class SubpathPlan:
     """How many subpaths are traced for a capture, and how many contributions are kept."""
@@ -197,7 +241,12 @@ class SubpathPlan:
 
 
 def vpl_contributions(
-    plan: SubpathPlan, params: LaunchParams, vpls: Vpls, proposal_lasers: ProposalLasers, seed: int
+    plan: SubpathPlan,
+    params: LaunchParams,
+    vpls: Vpls,
+    proposal_lasers: ProposalLasers,
+    seed: int,
+    mirror: FlatMirrors | None = None,
 ) -> VplContributions:
     """Trace subpaths from ``vpls``, one replica after the other, and return what the batch's lasers send back."""
     built = params.built
@@ -232,6 +281,7 @@ def vpl_contributions(
         plan.max_bounces,
         time_gate,
         randomness,
+        mirror,
     )
     dr.eval(ends, expected)
     subpath, copies, share = _resample(expected.numpy(), vpls, plan, np.random.default_rng(seed))
@@ -240,7 +290,7 @@ def vpl_contributions(
     end, scale = on_device(mi.UInt32, subpath), on_device(mi.Float, copies * share)
     n_lasers = 1 if plan.is_confocal else params.lasers_per_lane
     values, delays, lit = (
-        _unconnected(params, ends, end, scale) if plan.is_confocal else _connect(params, ends, end, scale)
+        _unconnected(params, ends, end, scale) if plan.is_confocal else _connect(params, ends, end, scale, mirror)
     )
     saved = dr.compress(lit)
     n_kept = dr.width(saved)
@@ -349,7 +399,7 @@ def _unconnected(
 
 
 def _connect(
-    params: LaunchParams, ends: SubpathVertex, end: mi.UInt32, scale: mi.Float
+    params: LaunchParams, ends: SubpathVertex, end: mi.UInt32, scale: mi.Float, mirror: FlatMirrors | None
 ) -> tuple[mi.Spectrum, mi.Float, mi.Bool]:
     """Connect chosen ends to every laser; return values and delays (laser * n + end), and which bring any light."""
     built, n = params.built, dr.width(end)
@@ -361,17 +411,29 @@ def _connect(
     si = _surface_of(ends, end)
     to_laser = lasers.interaction.p - si.p
     distance = dr.norm(to_laser)
-    value = dr.gather(mi.Spectrum, ends.carried, end) / dr.gather(mi.Float, ends.expected, end)
+    carried = dr.gather(mi.Spectrum, ends.carried, end) / dr.gather(mi.Float, ends.expected, end)
+    facing = dr.gather(mi.Normal3f, ends.shading, end)
     if ends.interaction is None:
-        value *= irradiance(built, lasers, si.p, dr.gather(mi.Normal3f, ends.shading, end))
+        value = carried * irradiance(built, lasers, si.p, facing)
     else:
-        value *= perpendicular_irradiance(built, lasers, si.p)
+        value = carried * perpendicular_irradiance(built, lasers, si.p)
         value *= si.bsdf().eval(mi.BSDFContext(), si, si.to_local(to_laser / distance))
     value *= dr.gather(mi.Float, scale, entry)
     active = dr.any(value > 0)
+    if mirror is not None:
+        active &= ~dr.gather(mi.Bool, ends.by_mirror, end)
     segment = connection_segment(built, si, to_laser / distance, lasers.interaction)
     active &= ~built.scene.ray_test(segment, coherent=False, active=active)
     value = dr.select(active, value, 0)
+    if mirror is not None:
+        lit, number = lasers.interaction, mi.UInt32(0)
+        by_mirror = dr.gather(mi.Bool, ends.by_mirror, end) & mirror.may_reflect(number, si.p, lit.p)
+        found = mirror.reflected(built, number, si, lit.p, off_the_wall(built, lit), by_mirror)
+        carried *= found.value * (dr.maximum(dr.dot(facing, found.direction), 0) * dr.gather(mi.Float, scale, entry))
+        carried *= built.wall_bsdf.eval(mi.BSDFContext(), lit, lit.to_local(found.from_lit))
+        value = dr.select(found.active, carried, value)
+        distance = dr.select(found.active, found.distance, distance)
+        active = dr.any(value > 0)
     delays = (dr.gather(mi.Float, ends.opl, end) + distance) * params.bins_per_unit
     lit = dr.zeros(mi.UInt32, n)
     dr.scatter(lit, mi.UInt32(1), entry, active)  # lasers write the same 1; a reduction would have ``n`` in its kernel
