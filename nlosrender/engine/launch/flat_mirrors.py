@@ -17,7 +17,7 @@ from scipy import sparse
 
 from nlosrender.engine.launch.device_arrays import on_device
 from nlosrender.engine.launch.facing_triangles import facing_triangles
-from nlosrender.engine.launch.ray_offsets import offset_origin
+from nlosrender.engine.launch.ray_offsets import offset_origin, ray_offset
 from nlosrender.scene.build import BuiltScene, wall_box
 from nlosrender.scene.pose import Float64
 
@@ -34,6 +34,43 @@ ROWS = 3  # of four numbers each, aligned loads: what the quick test reads of a 
 
 
 @dataclass(frozen=True, eq=False)
+class PlainMirror:
+    """A mirror without textures that is a triangle or fills its rectangle: coordinates tell where it is, not rays."""
+
+    limit: float  # of either coordinate
+    front: float  # 1, or -1 where the plane's normal points to the back
+    bsdf: mi.BSDF
+    lobes: tuple[int, int]  # components, as bits, of front and back
+
+    @classmethod
+    def of(cls, shape: mi.Shape, triangles: Float64, around: Float64) -> PlainMirror | None:
+        """Return a mirror of ``triangles`` (n, 3, 3) with a triangle (3, 3) around it; None: it is not plain."""
+        parts = mi.traverse(shape.bsdf()).hierarchy
+        has_picture = any(isinstance(part, mi.Texture) and part.is_spatially_varying() for part in parts)
+        sizes = np.linalg.norm(np.cross(*np.moveaxis(np.diff(triangles, axis=1), 1, 0)), axis=1)
+        normal = np.cross(around[1] - around[0], around[2] - around[0])
+        share = sizes.sum() / np.linalg.norm(normal)
+        limit = 1.0 if len(triangles) == 1 else 0.5
+        if has_picture or shape.class_name() == "Disk" or abs(share - limit) > COPLANAR:
+            return None
+        outer = np.ravel(shape.sample_position(0.0, mi.Point2f(0.5)).n)
+        return cls(limit, float(np.sign(normal @ outer)), shape.bsdf(), delta_lobes(shape.bsdf()))
+
+    def share(self, cosine: mi.Float, active: mi.Bool) -> mi.Spectrum:
+        """Return the share of light that is reflected, by the cosine of incidence, negative on the plane's back."""
+        si, result = dr.zeros(mi.SurfaceInteraction3f), mi.Spectrum(0)
+        cosine = cosine * self.front
+        si.wi = mi.Vector3f(dr.safe_sqrt(1 - dr.square(cosine)), 0, cosine)
+        for bits, is_side in zip(self.lobes, (cosine > 0, cosine < 0), strict=True):
+            for component in (k for k in range(32) if bits >> k & 1):
+                context = mi.BSDFContext()
+                context.component = component
+                _, value = self.bsdf.sample(context, si, 0.5, mi.Point2f(0.5), active & is_side)
+                result += dr.select(is_side, value, 0)
+        return result
+
+
+@dataclass(frozen=True, eq=False)
 class FlatMirrors:
     """The flat mirrors of a scene on the device."""
 
@@ -46,6 +83,7 @@ class FlatMirrors:
     components: tuple[int, ...]  # that any of them has
     first_facet: mi.UInt32  # by number of a shape's pointer: where its facets begin in ``mirror_of``; NO_MIRROR
     mirror_of: mi.UInt32  # mirror of each facet; NO_MIRROR for those that no point of the wall sees
+    plain: PlainMirror | None  # of the only one
 
     def is_alone(self, built: BuiltScene) -> bool:
         """Return whether one flat mirror is all that has delta lobes, and has no others: no two are met in a row."""
@@ -75,6 +113,7 @@ class FlatMirrors:
         number = {shape: int(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))[0]) for shape in shapes}
         first_facet = np.full(max(number.values(), default=0) + 1, NO_MIRROR, np.uint32)
         n_mirrors = n_facets = 0
+        plain = None
         for shape in shapes:
             triangles, primitives = _facets(built, shape)
             mirror, bounds = _mirrors_of(triangles)
@@ -85,6 +124,7 @@ class FlatMirrors:
             facets.append(mirror_of)
             lobes.append(np.tile(np.array(delta_lobes(shape.bsdf()), np.uint32), (len(bounds), 1)))
             n_mirrors, n_facets = n_mirrors + len(bounds), n_facets + len(mirror_of)
+            plain = PlainMirror.of(shape, triangles, bounds[0]) if n_mirrors == len(bounds) == 1 else None
         bits = np.concatenate(lobes)
         used = int(np.bitwise_or.reduce(bits, axis=None))
         mirrors = cls(
@@ -95,6 +135,7 @@ class FlatMirrors:
             tuple(k for k in range(32) if used >> k & 1),
             on_device(mi.UInt32, first_facet),
             on_device(mi.UInt32, np.concatenate(facets)),
+            plain,
         )
         dr.eval(mirrors.packed, mirrors.lobes, mirrors.first_facet, mirrors.mirror_of)
         return mirrors
@@ -121,7 +162,31 @@ class FlatMirrors:
         # the point of reflection divides the distance between the feet in the ratio of the heights
         u = above * _affine(one, point) + height * _affine(one, laser)
         v = above * _affine(other, point) + height * _affine(other, laser)
-        return is_before & (u >= 0) & (v >= 0) & (u + v <= height + above)
+        is_inside = (u >= 0) & (v >= 0) & (u + v <= height + above)
+        if self.plain is not None:
+            is_inside &= dr.maximum(u, v) <= self.plain.limit * (height + above)
+        return is_before & is_inside
+
+    def share(
+        self, built: BuiltScene, si: mi.SurfaceInteraction3f, lit: mi.Point3f, start: mi.Point3f, active: mi.Bool
+    ) -> mi.Spectrum:
+        """Return the share of light that the only mirror sends on between points; as for ``reflected``."""
+        number = mi.UInt32(0)
+        active = active & self.may_reflect(number, si.p, lit)
+        if self.plain is None:
+            found = self.reflected(built, number, si, lit, start, active)
+            return dr.select(found.active, found.value * dr.square(found.distance), 0)
+        plane = dr.gather(mi.Vector4f, self.packed, number)
+        normal, height, above = mi.Normal3f(plane.x, plane.y, plane.z), _affine(plane, si.p), _affine(plane, lit)
+        to_image = lit - si.p - (2 * above) * normal
+        place = si.p + to_image * (height / (height + above))
+        # ends before the mirror, which it would meet else
+        place += normal * dr.mulsign(ray_offset(built) * (1 + dr.max(dr.abs(place))), height)
+        for origin in (offset_origin(built, si, to_image), start):
+            way = mi.Ray3f(origin, place - origin, mi.Float(1), mi.Float(0), [])
+            active &= ~built.scene.ray_test(way, coherent=False, active=active)
+        cosine = -dr.dot(to_image, normal) * dr.rsqrt(dr.squared_norm(to_image))
+        return dr.select(active, self.plain.share(cosine, active), 0)
 
     def reflected(
         self,
@@ -305,14 +370,18 @@ def _triangle_around(triangles: Float64, areas: Float64) -> Float64:
     normal, weights = areas.sum(axis=0), np.linalg.norm(areas, axis=1)
     normal /= np.linalg.norm(normal)
     middle = np.average(triangles.mean(axis=1), axis=0, weights=weights)
-    along = triangles[0, 1] - triangles[0, 0]
-    along -= (along @ normal) * normal
-    along /= np.linalg.norm(along)
-    across = np.cross(normal, along)
-    places = (triangles.reshape(-1, 3) - middle) @ np.stack([along, across], axis=1)
-    low, size = places.min(axis=0), np.ptp(places, axis=0)
-    corner = middle + low[0] * along + low[1] * across
-    return np.stack([corner, corner + 2 * size[0] * along, corner + 2 * size[1] * across])
+    found = []
+    for k in range(3):
+        along = triangles[0, k] - triangles[0, k - 1]
+        along -= (along @ normal) * normal
+        along /= np.linalg.norm(along)
+        across = np.cross(normal, along)
+        places = (triangles.reshape(-1, 3) - middle) @ np.stack([along, across], axis=1)
+        low, size = places.min(axis=0), np.ptp(places, axis=0)
+        corner = middle + low[0] * along + low[1] * across
+        triangle = np.stack([corner, corner + 2 * size[0] * along, corner + 2 * size[1] * across])
+        found.append((float(size.prod()), k, triangle))
+    return min(found)[2]
 
 
 def _packed(triangles: Float64) -> Float64:

@@ -12,6 +12,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from nlosrender.capture.bounces import THIRD_BOUNCE
 from nlosrender.capture.plan import Batch
 from nlosrender.engine.launch.device_arrays import on_device
 from nlosrender.engine.launch.device_capture import DeviceCapture
@@ -110,7 +111,10 @@ class ThirdBounce:
                 batch, patch_scale, patches, passes.stage("sums", 0, 0.25 if self.mirror else 1)
             ).on_host()
             if self.mirror is not None:
-                values = np.concatenate([values, *self._mirrored(batch, patch_scale, patches, passes)], axis=1)
+                mirrored = self._mirrored(batch, patch_scale, patches, passes)
+                values = np.concatenate([values, *mirrored], axis=1)
+                if not self.device.options.bounces.split:
+                    values = values.sum(axis=1, keepdims=True)
         passes.finish(Snapshot({"values": values}))
         count = len(patches) if self.tessellator.regions is None else self.tessellator.count(patch_scale)
         return Gathered(values, max(count, 1), patch_scale)  # 1: nothing may face the wall
@@ -119,13 +123,15 @@ class ThirdBounce:
         self, batch: Batch | Pilot, patch_scale: float, patches: Patches, passes: Passes
     ) -> Iterator[NDArray[np.float64]]:
         """Yield bounces 4 and 5: what laser, sensor point, or both of them see by way of the mirror."""
-        ways = {"sensor by mirror": (False, True), "laser by mirror": (True, False), "both by mirror": (True, True)}
-        values = []
-        for part, (name, way) in enumerate(ways.items(), 1):
-            stage = passes.stage(name, part / 4, (part + 1) / 4)
-            values.append(self._sums(batch, patch_scale, patches, stage, way=way).on_host())
-        yield values[0] + values[1]
-        yield values[2]
+
+        def sums(part: int, lit_by_mirror: bool, seen_by_mirror: bool) -> NDArray[np.float64]:
+            stage, way = passes.stage(f"by mirror {part}", part / 4, (part + 1) / 4), (lit_by_mirror, seen_by_mirror)
+            return self._sums(batch, patch_scale, patches, stage, way=way).on_host()
+
+        yield sums(1, False, True) + sums(2, True, False)
+        highest = self.device.options.bounces.max_bounces
+        if highest is None or highest > THIRD_BOUNCE + 1:
+            yield sums(3, True, True)
 
     @property
     def tuning(self) -> VirtualLightTuning:

@@ -47,8 +47,5 @@ def mirrored_share(
     """
     if mirror is None:
         return mi.Spectrum(1)
-    number = mi.UInt32(0)
     start = point + offset * dr.sign(dr.dot(offset, image_in(mirror, wall_point.p) - point))
-    active = active & mirror.may_reflect(number, wall_point.p, point)
-    found = mirror.reflected(built, number, wall_point, point, start, active)
-    return dr.select(found.active, found.value * dr.square(found.distance), 0)
+    return mirror.share(built, wall_point, point, start, active)
