@@ -204,6 +204,44 @@ def test_a_spot_sends_the_light_of_its_points() -> None:
     assert found.error_estimate < 0.02
 
 
+@pytest.mark.parametrize("kinds", [("matt", "mirror"), ("pane", "matt"), ("mirror", "pane")])
+def test_blends_of_white_bsdfs_are_white(kinds: tuple[str, str]) -> None:
+    """Every sample of a blend of BSDFs that lose no light has weight 1; its parts come up as often as they weigh."""
+    white = {"matt": {"type": "diffuse", "reflectance": 1.0}, "mirror": MIRROR, "pane": {"type": "thindielectric"}}
+    parts = dict(zip("ab", (white[kind] for kind in kinds), strict=True))
+    stage = Stage.of(flat_wall(plate(*TILTED, {"type": "blendbsdf", "weight": 0.3, **parts}), engine="path"))
+    import drjit as dr
+    import mitsuba as mi
+
+    si, n = dr.zeros(mi.SurfaceInteraction3f), 1000
+    si.wi = mi.Vector3f(0.6, 0, 0.8)
+    number = (dr.arange(mi.Float, n) + 0.5) / n
+    bsdf = stage.engine.built.hidden_shapes[0].bsdf()
+    bs, weight = bsdf.sample(mi.BSDFContext(), si, number, mi.Point2f(0.3, 0.4))
+    np.testing.assert_allclose(np.array(weight), 1, rtol=1e-5)
+    second = int(bsdf.component_count() - (2 if kinds[1] == "pane" else 1))
+    assert math.isclose((np.array(bs.sampled_component) >= second).mean(), 0.3, abs_tol=1.5 / n)
+
+
+def test_blended_mirrors_have_their_share_before_and_after_what_is_matt() -> None:
+    """Half a mirror over black halves the light that meets it once, whether on its way to a plate or back."""
+    black = {"type": "diffuse", "reflectance": 0.0}
+    half = {"type": "blendbsdf", "weight": 0.5, "a": black, "b": MIRROR}
+    lit, at = (
+        plate((-0.5, 0.0, 1.2), (0.3, 0.0, -1.0), (1.0, 1.0), 0.7),
+        ((0.6, 0.0, 0.9), (-1.0, 0.0, -0.4), (0.9, 0.9)),
+    )
+    settings: dict[str, Any] = {"max_bounces": 4, "spp": 2**15, "bins": (0.0, 0.2, 40)}
+    whole, part = (render(flat_wall(lit, plate(*at, kind), **settings), replicas=16) for kind in (MIRROR, half))
+    energies, variances = (
+        [values(one).sum() for one in (whole, part)]
+        for values in (lambda one: one.bounce(4), lambda one: one.bounce_variance(4))
+    )
+    deviation = math.sqrt(variances[0] / 4 + variances[1])
+    assert abs(energies[1] - energies[0] / 2) < 5 * deviation
+    assert deviation < 0.005 * energies[1]
+
+
 def box(length: float, end: Any) -> list[Scene]:
     """Return a room of 2 x 2 m and a ``length`` before the wall, from x = -1; its far end is made of ``end``."""
     x = length / 2 - 1

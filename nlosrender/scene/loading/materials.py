@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nlosrender.errors import ConfigError
+from nlosrender.scene.loading import exact_blend
 from nlosrender.scene.loading.image_size import check_image, image_files
 from nlosrender.scene.surfaces import Radiance
 from nlosrender.scene.transforms import transform_matrix
@@ -50,10 +51,11 @@ def mitsuba_value(value: object) -> object:
     if isinstance(value, Mapping):
         if value.get("type") == "rgb":
             return {"type": "rgb", "value": [float(channel) for channel in value["value"]]}
-        return {
+        loaded = {
             key: mi.ScalarTransform4f(transform_matrix(item)) if key in TRANSFORMS else mitsuba_value(item)
             for key, item in value.items()
         }
+        return loaded | ({"type": exact_blend.NAME} if value.get("type") == exact_blend.MITSUBA_NAME else {})
     if isinstance(value, (tuple, list)):
         if len(value) == 3 and all(isinstance(item, (int, float)) for item in value):
             return {"type": "rgb", "value": [float(item) for item in value]}

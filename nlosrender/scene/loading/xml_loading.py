@@ -17,6 +17,7 @@ from nlosrender.config.xml_shapes import named, placement, shape_parameters
 from nlosrender.config.xml_tree import numbered_text, place_of
 from nlosrender.errors import ConfigError
 from nlosrender.scene.bounding_box import box_corners
+from nlosrender.scene.loading import exact_blend
 from nlosrender.scene.loading.image_size import check_image
 from nlosrender.scene.loading.materials import first_line
 from nlosrender.scene.loading.mitsuba_shapes import load_flat_serialized, shape_bounds, triangles_of
@@ -79,6 +80,9 @@ def load_xml_scene(path: Path) -> tuple[mi.Scene, tuple[MeshReport, ...], tuple[
 def _loaded(root: Element, path: Path) -> tuple[mi.Scene, tuple[str, ...]]:
     """Return the scene, and a sentence for each plugin with parameters that it does not have, which are left out."""
     warnings: list[str] = []
+    for element in root.iter("bsdf"):
+        if element.get("type") == exact_blend.MITSUBA_NAME:
+            element.set("type", exact_blend.NAME)
     while True:
         text, elements = numbered_text(root)
         try:
