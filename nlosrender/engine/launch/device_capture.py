@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 from nlosrender.capture.bounces import FIRST_BOUNCE, THIRD_BOUNCE
 from nlosrender.engine.launch.device_arrays import on_device
 from nlosrender.engine.launch.energy_contrasts import no_contrasts
-from nlosrender.engine.launch.flat_mirrors import FlatMirrors, has_flat_mirrors
+from nlosrender.engine.launch.flat_mirrors import FlatMirrors
 from nlosrender.engine.launch.histogram import DeviceHistogram, Histogram, HistogramShape
 from nlosrender.engine.launch.launch_params import LaunchParams
-from nlosrender.engine.launch.mirror_connections import deposit_mirrored_bounce
+from nlosrender.engine.launch.mirror_connections import Mirrors, deposit_mirrored_bounce, mirrors_of
 from nlosrender.engine.launch.morton import morton_order
 from nlosrender.engine.launch.schedule import DEFAULT_SCHEDULE, ScheduleTuning
 from nlosrender.engine.launch.second_bounce import deposit_second_bounce
@@ -145,26 +145,31 @@ class DeviceCapture:
         )
 
     @cached_property
-    def mirrors(self) -> FlatMirrors | None:
-        """Flat mirrors by way of which light of the lasers is looked for; None where there are none."""
+    def mirrors(self) -> tuple[Mirrors, ...]:
+        """Mirrors by way of which light of the lasers is looked for."""
         highest = self.options.bounces.max_bounces
-        if highest is not None and highest < THIRD_BOUNCE:
-            return None
-        return FlatMirrors.of(self.built) if any(map(has_flat_mirrors, self.built.scene.shapes())) else None
+        return () if highest is not None and highest < THIRD_BOUNCE else mirrors_of(self.built)
+
+    @cached_property
+    def lone_mirror(self) -> FlatMirrors | None:
+        """The flat mirror that alone has delta lobes, and no others; None: there are others, or none is looked for."""
+        flat = self.mirrors[0] if len(self.mirrors) == 1 else None
+        return flat if isinstance(flat, FlatMirrors) and flat.is_alone(self.built) else None
 
     def exact_light(self, batch: Batch | Pilot) -> Iterator[tuple[int, NDArray[np.float64]]]:
         """Yield bounces and their light (channel, 1, laser, sensor, row) that is exact: one replica computes it.
 
-        The second bounce, of which a planar wall has none, and the third of laser points by way of flat mirrors.
+        The second bounce, of which a planar wall has none, and the third of laser points by way of mirrors.
         """
         shape = replace(self.shape(batch, 1), replicas=1)
         if not self.built.wall.is_planar:
             histogram = DeviceHistogram(shape)
             deposit_second_bounce(self.launch_params(batch, shape), histogram)
             yield FIRST_BOUNCE, histogram.on_host(histogram.total(self.scale))
-        if self.mirrors is not None and self.capture.laser_spot_radius == 0:
+        if self.mirrors and self.capture.laser_spot_radius == 0:
             histogram = DeviceHistogram(shape)
-            deposit_mirrored_bounce(self.launch_params(batch, shape), self.mirrors, histogram)
+            for mirrors in self.mirrors:
+                deposit_mirrored_bounce(self.launch_params(batch, shape), mirrors, histogram)
             yield THIRD_BOUNCE, histogram.on_host(histogram.total(self.scale))
 
     def exact_squares(self, batch: Batch | Pilot) -> float:

@@ -150,6 +150,10 @@ class FlatMirrors:
         known &= first != NO_MIRROR
         return dr.select(known, dr.gather(mi.UInt32, self.mirror_of, first + si.prim_index, known), NO_MIRROR)
 
+    def is_met(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Bool:
+        """Return whether rays met a mirror."""
+        return self.number_at(si, active) != NO_MIRROR
+
     def may_reflect(self, number: mi.UInt32, point: mi.Point3f, laser: mi.Point3f) -> mi.Bool:
         """Return whether mirrors can reflect the light of a laser point to a point: no ray is traced.
 
@@ -211,13 +215,7 @@ class FlatMirrors:
         from_laser = direction - (2 * dr.dot(direction, normal)) * normal
         side = dr.select(mi.Frame3f.cos_theta(hit.wi) > 0, 0, 1)
         lobes = dr.gather(mi.UInt32, self.lobes, number * 2 + mi.UInt32(side), active)
-        weight = mi.Spectrum(0)
-        for component in self.components:
-            context = mi.BSDFContext()
-            context.component = component
-            has_lobe = active & ((lobes >> component & 1) == 1)
-            bs, value = hit.bsdf().sample(context, hit, 0.5, mi.Point2f(0.5), has_lobe)
-            weight += dr.select(has_lobe & mi.has_flag(bs.sampled_type, mi.BSDFFlags.DeltaReflection), value, 0)
+        weight = lobe_weight(hit, lobes, self.components, active)
         active &= dr.any(weight > 0)
         segment = mi.Ray3f(start, offset_origin(built, hit, from_laser) - start, mi.Float(1), mi.Float(0), [])
         active &= ~built.scene.ray_test(segment, coherent=False, active=active)
@@ -284,19 +282,33 @@ def turned_in(mirror: FlatMirrors | None, vector: mi.Vector3f) -> mi.Vector3f:
     return vector - (2 * dr.dot(vector, normal)) * normal
 
 
+def lobe_weight(
+    hit: mi.SurfaceInteraction3f, lobes: mi.UInt32, components: tuple[int, ...], active: mi.Bool
+) -> mi.Spectrum:
+    """Return the weight of those delta reflection ``components`` whose bits ``lobes`` has."""
+    weight = mi.Spectrum(0)
+    for component in components:
+        context = mi.BSDFContext()
+        context.component = component
+        has_lobe = active & ((lobes >> component & 1) == 1)
+        bs, value = hit.bsdf().sample(context, hit, 0.5, mi.Point2f(0.5), has_lobe)
+        weight += dr.select(has_lobe & mi.has_flag(bs.sampled_type, mi.BSDFFlags.DeltaReflection), value, 0)
+    return weight
+
+
 def has_flat_mirrors(shape: mi.Shape) -> bool:
     """Return whether a shape has flat facets with delta reflection lobes, all of them about the facets' normals."""
     if mi.is_polarized:
         return False
     is_flat = not shape.has_vertex_normals() if shape.is_mesh() else shape.class_name() in FLAT_PLUGINS
-    return is_flat and any(delta_lobes(shape.bsdf())) and _are_known(shape.bsdf())
+    return is_flat and any(delta_lobes(shape.bsdf())) and has_known_lobes(shape.bsdf())
 
 
-def _are_known(bsdf: mi.BSDF) -> bool:
+def has_known_lobes(bsdf: mi.BSDF) -> bool:
     """Return whether ``delta_lobes`` has all delta reflection components of a BSDF."""
     parts = _parts(bsdf)
     if not parts or bsdf.class_name() in ("TwoSidedBRDF", "BlendBSDF"):
-        return all(map(_are_known, parts))
+        return all(map(has_known_lobes, parts))
     return not bool(bsdf.flags() & mi.BSDFFlags.DeltaReflection)
 
 

@@ -7,10 +7,14 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from nlosrender.engine.launch.flat_mirrors import FlatMirrors
+from nlosrender.engine.launch.flat_mirrors import FlatMirrors, has_flat_mirrors
 from nlosrender.engine.launch.histogram import DeviceHistogram
 from nlosrender.engine.launch.launch_params import LaunchParams
 from nlosrender.engine.launch.ray_offsets import off_the_wall
+from nlosrender.engine.launch.round_mirrors import RoundMirrors
+from nlosrender.scene.build import BuiltScene
+
+Mirrors = FlatMirrors | RoundMirrors
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,7 +30,13 @@ class MirroredVertex:
     in_spot: mi.Vector3f | None  # from the laser point to the point of its spot, in the wall's frame; None: no spot
 
 
-def deposit_mirrored_bounce(params: LaunchParams, mirrors: FlatMirrors, histogram: DeviceHistogram) -> None:
+def mirrors_of(built: BuiltScene) -> tuple[Mirrors, ...]:
+    """Return the flat and the round mirrors of a scene, if there are any."""
+    flat = FlatMirrors.of(built) if any(map(has_flat_mirrors, built.scene.shapes())) else None
+    return tuple(mirrors for mirrors in (flat, RoundMirrors.of(built)) if mirrors is not None)
+
+
+def deposit_mirrored_bounce(params: LaunchParams, mirrors: Mirrors, histogram: DeviceHistogram) -> None:
     """Deposit the third bounce by way of one mirror, for every lane and each of its lasers; exact.
 
     As ``deposit_second_bounce``.
@@ -38,7 +48,7 @@ def deposit_mirrored_bounce(params: LaunchParams, mirrors: FlatMirrors, histogra
 
 @dr.syntax
 def deposit_reflections(
-    params: LaunchParams, mirrors: FlatMirrors, histogram: DeviceHistogram, vertex: MirroredVertex, active: mi.Bool
+    params: LaunchParams, mirrors: Mirrors, histogram: DeviceHistogram, vertex: MirroredVertex, active: mi.Bool
 ) -> None:
     """Deposit what mirrors reflect to vertices from every laser of their lanes."""
     laser = mi.UInt32(0)
@@ -59,7 +69,7 @@ def deposit_reflections(
 @dr.syntax
 def _connect(
     params: LaunchParams,
-    mirrors: FlatMirrors,
+    mirrors: Mirrors,
     histogram: DeviceHistogram,
     vertex: MirroredVertex,
     laser: mi.UInt32,

@@ -17,10 +17,10 @@ from nlosrender.engine.interface import Budget, OmittedWork, PilotSeconds, TimeE
 from nlosrender.engine.launch.accumulation import Accumulation, lane_randomness
 from nlosrender.engine.launch.cost_pilot import sampled_batch_bytes, sampling_estimate
 from nlosrender.engine.launch.device_capture import DeviceCapture
-from nlosrender.engine.launch.flat_mirrors import FlatMirrors
 from nlosrender.engine.launch.hidden_aabb import HiddenAabb
 from nlosrender.engine.launch.histogram import DeviceHistogram, Histogram, HistogramShape
 from nlosrender.engine.launch.lane_random_state import LaneRandomness
+from nlosrender.engine.launch.mirror_connections import Mirrors
 from nlosrender.engine.launch.near_surfaces import rare_light_warnings
 from nlosrender.engine.launch.occlusion import nothing_occludes
 from nlosrender.engine.launch.omissions import omitted_by_time_gate, omitted_triangles, omitted_visibility
@@ -95,17 +95,17 @@ class PathEngine:
             needs_visibility=not nothing_occludes(self.built),
             has_transmission=any(bool(flag & mi.BSDFFlags.Transmission) for flag in flags),
             is_plain_diffuse=is_plain_diffuse(self.built),
-            has_mirrors=self.mirrors is not None,
+            has_mirrors=bool(self.mirrors),
             # with a mirrored spot every path adds what its sensor point sees of it
-            max_tries=0 if has_spot and self.mirrors is not None else self.tuning.max_tries,
+            max_tries=0 if has_spot and self.mirrors else self.tuning.max_tries,
         )
 
     @property
-    def mirrors(self) -> FlatMirrors | None:
-        """Flat mirrors by way of which vertices are connected to lasers: from bounce 4 on, with a spot from 3 on."""
+    def mirrors(self) -> tuple[Mirrors, ...]:
+        """Mirrors by way of which vertices are connected to lasers: from bounce 4 on, with a spot from 3 on."""
         highest, has_spot = self.options.bounces.max_bounces, self.capture.laser_spot_radius > 0
         is_needed = has_spot or highest is None or highest > THIRD_BOUNCE
-        return self.device.mirrors if is_needed and self.options.laser_sampling else None
+        return self.device.mirrors if is_needed and self.options.laser_sampling else ()
 
     @cached_property
     def hidden_aabb(self) -> HiddenAabb | None:

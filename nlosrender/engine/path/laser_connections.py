@@ -71,26 +71,24 @@ def connect_by_mirrors(
     active: mi.Bool,
     in_spot: mi.Vector3f | None = None,
 ) -> None:
-    """Connect a vertex to every laser of the lane by way of flat mirrors and deposit, one bounce later than directly.
+    """Connect a vertex to every laser of the lane by way of mirrors and deposit, one bounce later than directly.
 
-    By way of ``mirrors_per_vertex`` from a random one on, with the weight that makes up for the others; of all of them
-    where the point of the spot is given. docs/virtual-lights.md, 11.2.
+    By way of ``mirrors_per_vertex`` of either kind from a random one on, with the weight that makes up for the others;
+    of all of them where the point of the spot is given. docs/virtual-lights.md, 11.2.
     """
-    mirrors, bounce = params.mirrors, vertex.bounce + 1
-    if mirrors is None:
+    if not params.mirrors:
         return
+    bounce, takes_all = vertex.bounce + 1, in_spot is not None
     active = active & settings.is_deposited(bounce)
-    count = mirrors.count
-    if in_spot is None:
-        count = dr.minimum(count, params.mirrors_per_vertex)
-        if settings.finds_spot:
-            in_spot = _on_disk(generator, active) * settings.spot_radius
-    first = mi.UInt32(generator.next_float32(active & (count < mirrors.count)) * mi.Float(mirrors.count))
-    first = dr.select(count < mirrors.count, dr.minimum(first, mirrors.count - 1), 0)
-    throughput = vertex.throughput * (mi.Float(mirrors.count) / mi.Float(count))
-    slot = settings.slot(bounce)
-    start = MirroredVertex(vertex.si, throughput, vertex.opl, slot, first, count, in_spot)
-    deposit_reflections(params, mirrors, histogram, start, active)
+    if settings.finds_spot and in_spot is None:
+        in_spot = _on_disk(generator, active) * settings.spot_radius
+    for mirrors in params.mirrors:
+        count = mirrors.count if takes_all else dr.minimum(mirrors.count, params.mirrors_per_vertex)
+        first = mi.UInt32(generator.next_float32(active & (count < mirrors.count)) * mi.Float(mirrors.count))
+        first = dr.select(count < mirrors.count, dr.minimum(first, mirrors.count - 1), 0)
+        throughput = vertex.throughput * (mi.Float(mirrors.count) / mi.Float(count))
+        start = MirroredVertex(vertex.si, throughput, vertex.opl, settings.slot(bounce), first, count, in_spot)
+        deposit_reflections(params, mirrors, histogram, start, active)
 
 
 def _connect(

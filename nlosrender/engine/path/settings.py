@@ -8,9 +8,9 @@ import drjit as dr
 import mitsuba as mi
 
 from nlosrender.capture.bounces import FIRST_BOUNCE, THIRD_BOUNCE, BounceAxis
-from nlosrender.engine.launch.flat_mirrors import FlatMirrors
 from nlosrender.engine.launch.hidden_aabb import HiddenAabb
 from nlosrender.engine.launch.launch_params import LaunchParams
+from nlosrender.engine.launch.mirror_connections import Mirrors
 from nlosrender.engine.path.tuning import PathTuning
 
 
@@ -27,7 +27,7 @@ class PathSettings:
     needs_visibility: bool  # something may occlude a vertex from a laser or sensor point
     has_transmission: bool  # some BSDF refracts: the optical path length needs the medium's index
     is_plain_diffuse: bool  # flat surfaces of one reflectance each: only normals matter to their BSDFs
-    has_mirrors: bool = False  # vertices are connected to the lasers by way of flat mirrors, too
+    has_mirrors: bool = False  # vertices are connected to the lasers by way of mirrors, too
     max_tries: int = PathTuning.max_tries  # see ``PathTuning``
 
     @property
@@ -90,5 +90,5 @@ class PathParams(LaunchParams):
 
     hidden_aabb: HiddenAabb | None  # None: few rays from the wall miss it
     continuation_period: mi.UInt32  # n: one path in n continues after bounce 3; opaque
-    mirrors: FlatMirrors | None  # None: vertices are not connected by way of mirrors
+    mirrors: tuple[Mirrors, ...]  # by way of which vertices are connected
     mirrors_per_vertex: mi.UInt32  # how many of them a vertex is connected by way of, drawn at random; opaque

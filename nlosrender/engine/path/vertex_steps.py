@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING
 import drjit as dr
 import mitsuba as mi
 
-from nlosrender.engine.launch.flat_mirrors import NO_MIRROR
 from nlosrender.engine.launch.launch_params import MAX_SURVIVAL
 from nlosrender.engine.launch.ray_offsets import leg_to_tangent_plane, offset_origin
 
@@ -34,7 +33,7 @@ class Departure:
     bsdf_density: mi.Float  # share of BSDF sampling in the direction's density [1/sr]; 1 for delta lobes
     hidden_density: mi.Float  # share of hidden geometry sampling, before the Jacobian [1/area]
     is_delta: mi.Bool  # the direction comes from a delta lobe
-    is_imaged: mi.Bool  # that of a flat mirror, and the direction before from none: connections by way of it find more
+    is_imaged: mi.Bool  # that of a mirror, and the direction before from none: connections by way of it find more
     has_target: mi.Bool  # it was sent to a sampled point of the hidden geometry: the next three
     target: mi.Point3f
     target_shape: mi.ShapePtr
@@ -185,12 +184,13 @@ def leave(
 def is_imaged(
     params: PathParams, vertex: mi.SurfaceInteraction3f, before: Departure, way: Departure, active: mi.Bool
 ) -> mi.Bool:
-    """Return whether a vertex is a flat mirror that reflects a scattered ray: ``before`` the ray to it, ``way`` on."""
-    if params.mirrors is None:
-        return mi.Bool(False)
+    """Return whether a vertex is a mirror that reflects a scattered ray: ``before`` the ray to it, ``way`` on."""
     is_reflected = mi.Frame3f.cos_theta(vertex.wi) * dr.dot(vertex.sh_frame.n, way.ray.d) > 0
     is_first = active & way.is_delta & ~before.is_delta & is_reflected
-    return is_first & (params.mirrors.number_at(vertex, is_first) != NO_MIRROR)
+    found = mi.Bool(False)
+    for mirrors in params.mirrors:
+        found |= mirrors.is_met(vertex, is_first)
+    return is_first & found
 
 
 def turns_away(params: PathParams, sample: SurfaceSample, origin: mi.Point3f) -> mi.Bool:

@@ -2,7 +2,7 @@
 
 Rays whose first hit has a delta lobe (S) are followed until they scatter at a vertex that a sensor point sees. Nothing
 is rendered: the result is which surfaces send light along paths that no technique samples, see ``unsampled_paths``.
-What a flat mirror sends from the laser to a surface that scatters is none of it: connections find it (``FlatMirrors``).
+What one mirror, flat or convex, sends from the laser to a surface that scatters is none of it: connections find it.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from nlosrender.capture.arrivals import sampled_indices
 from nlosrender.capture.grids import Capture
 from nlosrender.capture.time_axis import TimeAxis
 from nlosrender.engine.launch.device_arrays import columns
-from nlosrender.engine.launch.flat_mirrors import NO_MIRROR, FlatMirrors
+from nlosrender.engine.launch.mirror_connections import Mirrors, mirrors_of
 from nlosrender.engine.launch.ray_offsets import offset_origin
 from nlosrender.engine.launch.surface_sampler import SAMPLEABLE_PLUGINS
 from nlosrender.engine.launch.wall_points import laser_points
@@ -76,7 +76,7 @@ def light_after_laser(
     emitted = built.wall_bsdf.eval(mi.BSDFContext(), lit, lit.to_local(direction))
     sent = dr.any(mi.unpolarized_spectrum(emitted) > 0)
     rays = _Rays(_ray(built, lit, direction, sent), False)
-    return list(_followed(built, capture, time_axis, rays, max_bounces, 1, FlatMirrors.of(built)))
+    return list(_followed(built, capture, time_axis, rays, max_bounces, 1, mirrors_of(built)))
 
 
 def light_mirrored_by_wall(
@@ -122,7 +122,7 @@ def _followed(
     start: _Rays,
     max_bounces: int | None,
     interactions: int,
-    mirrors: FlatMirrors | None = None,
+    mirrors: tuple[Mirrors, ...] = (),
 ) -> Iterator[SpecularLight]:
     """Follow rays that had ``interactions`` surface interactions; yield the specular light of the surfaces met first.
 
@@ -138,7 +138,7 @@ def _followed(
     ) / built.metres_per_engine_unit
     first = np.zeros(n_rays, dtype=np.int64)  # twice the number of the first surface, plus 1 if it reflected the ray
     lowest: dict[int, int] = {}  # bounce by ``first``
-    is_imaged = np.zeros(n_rays, dtype=bool)  # the first surface is a flat mirror that reflected the ray
+    is_imaged = np.zeros(n_rays, dtype=bool)  # the first surface is a mirror that reflected the ray
     for event in range(MAX_EVENTS):
         count = interactions + event + 1  # interactions up to the surface that is met now
         if max_bounces is not None and count > max_bounces:
@@ -153,8 +153,8 @@ def _followed(
             crossing = mi.Frame3f.cos_theta(si.wi) * mi.Frame3f.cos_theta(bs.wo)
             first = 2 * np.array(dr.reinterpret_array(mi.UInt32, si.shape), dtype=np.int64) + np.array(crossing > 0)
             hit &= is_delta | start.is_specular
-            if mirrors is not None:
-                is_imaged = np.array((mirrors.number_at(si, mi.Bool(hit)) != NO_MIRROR) & (crossing > 0), dtype=bool)
+            for kind in mirrors:
+                is_imaged |= np.array(kind.is_met(si, mi.Bool(hit)) & (crossing > 0), dtype=bool)
         if event == 1:
             hit &= is_delta | ~is_imaged
         if event > 0 or start.is_specular:

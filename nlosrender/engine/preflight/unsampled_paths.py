@@ -7,7 +7,7 @@ wall's own D. What the techniques sample:
 - Paths start at the sensor. BSDF sampling follows every S and D, hidden geometry sampling every D of the wall.
 - Laser sampling connects a vertex straight to the laser point. The BSDF of the connection is evaluated at both of its
   ends, and what lies between stops it: an S at either end, or a pane or mask between, is never found.
-- Flat mirrors show an image of the laser, which vertices are connected to: ``L D S D ...``.
+- Flat and convex mirrors show an image of the laser, which vertices are connected to: ``L D S D ...``.
 - A laser spot (``capture.laser_spot_radius``) is an area which BSDF sampling finds by chance, through any S.
 - Before a camera, emitters with an area are found by BSDF sampling; points, spots and suns by connections alone.
 

@@ -72,7 +72,7 @@ class VirtualLightEngine:
         all_lambertian = self.settings.is_diffuse and is_lambertian(built.wall_shape.bsdf())
         reciprocal = is_reciprocal(built, capture, self.time_axis.n_bins, is_lambertian=all_lambertian, tuning=tuning)
         has_vpls = self.has_further_bounces and self._mirrors_once
-        mirror = device.mirrors if has_vpls else None
+        mirror = device.lone_mirror if has_vpls else None
         bin_width = self.time_axis.bin_width_opl / built.metres_per_engine_unit
         self.tessellator = Tessellator(built, capture, bin_width, mirror=mirror, tuning=tuning)
         reciprocal = reciprocal and mirror is None
@@ -88,15 +88,15 @@ class VirtualLightEngine:
     @property
     def _mirrors_once(self) -> bool:
         """Whether VPLs find all light of mirrors: none is there, or one that shows a wall which may have VPLs."""
-        built, mirrors = self.built, self.device.mirrors
+        built, mirror = self.built, self.device.lone_mirror
         if not any(_has_delta_lobe(shape.bsdf()) for shape in built.scene.shapes()):
             return True
-        if mirrors is None or self.settings.is_confocal or not (self.settings.is_diffuse and mirrors.is_alone(built)):
+        if mirror is None or self.settings.is_confocal or not self.settings.is_diffuse:
             return False
         if not built.wall.is_planar:
             return wall_sees_itself(built)
         has_vpls = built.wall_shape.class_name() == "Rectangle" and is_lambertian(built.wall_bsdf)
-        return has_vpls or not mirrors.shows_wall(built)
+        return has_vpls or not mirror.shows_wall(built)
 
     def set_up(self) -> None:
         """Make what all resolutions and batches share, else made when it is first needed: it grows with the triangles.

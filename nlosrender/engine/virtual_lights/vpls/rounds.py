@@ -81,7 +81,7 @@ class VplBounces:
     @cached_property
     def sampler(self) -> VplSampler:
         """Sampler of VPL positions; made when it is needed, for it holds all elements."""
-        return VplSampler(self.tessellator, self.device.capture_gate, self.device.mirrors)
+        return VplSampler(self.tessellator, self.device.capture_gate, self.device.lone_mirror)
 
     def plan(self, replicas: int) -> SubpathPlan:
         """Return the numbers of a round of ``replicas`` independent sets of VPLs."""
@@ -214,7 +214,7 @@ class VplBounces:
         generator = np.random.default_rng(state[0])
         vpls = Vpls.joined([self.sampler.sample(plan.vpls, generator) for _ in range(plan.replicas)])
         params = self.device.launch_params(batch, shape)
-        mirror = self.device.mirrors
+        mirror = self.device.lone_mirror
         contributions = vpl_contributions(plan, params, vpls, self.proposal_lasers, int(state[1]), mirror)
         if not contributions.count:
             return
