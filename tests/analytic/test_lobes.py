@@ -213,32 +213,32 @@ def test_linear_light_is_spread_over_bins_as_over_the_triangle() -> None:
             np.bincount((np.array(delays) @ weights).astype(int), weights=np.array(light) @ weights, minlength=BLOCK)
             / n**2
         )
-        cdf = _DelayCdf(Delays.of_lit_triangle(mi.Vector3f(delays), mi.Vector3f(light)))
+        cdf = _DelayCdf(Delays.of_triangle(mi.Vector3f(delays), mi.Vector3f(light)))
         fractions, end = cdf.bin_fractions(mi.Float(0))
         # a line of equal delay misplaces less than 2 n of n^2 / 2 cells by its cells' halves
         np.testing.assert_allclose([fraction[0] for fraction in fractions], shares, atol=2e-3)
         assert float(dr.slice(end)) == pytest.approx(1, abs=1e-5)
 
 
-def test_the_mean_delay_of_a_patch_is_right_to_the_third_order() -> None:
-    """Half the patch's size leaves a tenth of the error: without the shift a quarter, h^2 / (4 d) for both legs."""
+def test_the_mean_delay_of_a_patch_is_right_and_none_is_before_the_shortest_way() -> None:
+    """Without the centre the mean is h^2 / (4 d) late."""
     start_backend("llvm")
     import mitsuba as mi
 
-    from nlosrender.engine.virtual_lights.gather.delay_distribution import corner_delays
+    from nlosrender.engine.virtual_lights.gather.delay_distribution import Delays, PatchDelays
 
     rng = np.random.default_rng(3)
     weights = rng.dirichlet([1, 1, 1], 400_000)
     corners = np.array([[-0.3, -0.2, 1.0], [0.3, -0.2, 0.9], [0.0, 0.4, 1.1]])
-    centre, point = corners.mean(axis=0), np.array([0.2, 0.1, 0.0])
-    errors = []
-    for size in (1.0, 0.5):
-        ends = centre + size * (corners - centre)
-        along = np.linalg.norm(weights @ ends - point, axis=1)
-        linear = weights @ np.linalg.norm(ends - point, axis=1)
-        delays = corner_delays(mi.Point3f(point), mi.Point3f(centre), tuple(map(mi.Point3f, ends)), mi.Float(1), None)
-        moved = np.mean([delays.x[0], delays.y[0], delays.z[0]]) - np.mean(np.linalg.norm(ends - point, axis=1))
-        late = float((linear - along).mean())
-        errors.append((abs(late + moved), late))
-    assert errors[0][0] < 0.02 * errors[0][1]
-    assert errors[1][0] < 0.005 * errors[1][1]
+    centre = corners.mean(axis=0)
+    for point in ([0.9, 0.1, 0.0], [0.0, 0.0, 0.0], [-0.2, -2.0, 0.0]):
+        for size, share in ((1.0, 0.05), (0.5, 0.02)):
+            ends = centre + size * (corners - centre)
+            true, at_corners = (np.linalg.norm(points - point, axis=1) for points in (weights @ ends, ends))
+            late = (weights @ at_corners - true).mean()
+            on_device = [mi.Point3f(values) for values in (point, centre, *ends)]
+            legs = PatchDelays.from_point(on_device[0], on_device[1], tuple(on_device[2:]), mi.Float(1))
+            delays = Delays.of_patch(legs, None)
+            mean = (delays.t0[0] + delays.t1[0] + delays.t3[0]) / 3
+            assert abs(mean - true.mean()) < share * late
+            assert delays.first[0] >= min(true.min(), at_corners.min()) - 1e-6

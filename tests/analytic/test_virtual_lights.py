@@ -253,15 +253,15 @@ def spread_shares(delays: tuple[float, ...], is_cluster: bool | None, n_bins: in
 
     from nlosrender.engine.launch.histogram import HistogramShape
     from nlosrender.engine.virtual_lights.gather.block_histogram import BlockHistogram
-    from nlosrender.engine.virtual_lights.gather.delay_distribution import Delays, deposit_patch
+    from nlosrender.engine.virtual_lights.gather.delay_distribution import Delays, PatchDelays, deposit_patch
 
     histogram = BlockHistogram(HistogramShape(1, 1, 1, 1, 1, n_bins), np.zeros(1, np.int64))
     # opaque: one kernel per window serves all
-    corners = [dr.opaque(mi.Float, delay) for delay in delays]
-    if is_cluster is None:
-        covered = Delays.of_triangle(*corners)
-    else:
-        covered = Delays.of_patch(mi.Vector4f(*corners), dr.opaque(mi.Bool, is_cluster), None)
+    corners = [dr.opaque(mi.Float, delay) for delay in (*delays, 0.0)[:4]]
+    # a plane far away: the linear delay is right on average
+    middle = dr.opaque(mi.Float, float(np.mean(delays[:4] if is_cluster else delays[:3])))
+    is_parallelogram = None if is_cluster is None else dr.opaque(mi.Bool, is_cluster)
+    covered = Delays.of_patch(PatchDelays(mi.Vector4f(*corners), middle), is_parallelogram)
     zero = mi.UInt32(0)
     deposit_patch(histogram, zero, zero, covered, dr.opaque(mi.Int32, whole), mi.Spectrum(2.0), mi.Bool(True))
     return histogram.on_host().ravel()

@@ -102,8 +102,10 @@ def refined_to(
         # with the coarser one that the render itself will have
         coarse, fine = gather(coarser_scale(tessellator, patch_scale)), gather(patch_scale)
         error = estimated_error(coarse, fine, known_squares)
-        earlier = next((error for count, error in reversed(levels) if count <= fine.n_patches / 2), math.inf)
-        is_stuck = tuning.stagnation * earlier < error and fine.n_patches > 2 * coarse.n_patches
+        earlier = next(
+            (error for count, error in reversed(levels) if count <= fine.n_patches / tuning.stagnation_ratio), math.inf
+        )
+        is_stuck = tuning.stagnation * earlier < error
         is_beyond = fine.n_patches * error / target > tuning.max_patches
         in_vain = error < tuning.max_regular_error and (is_stuck or is_beyond)
         if error <= target or in_vain or 2 * fine.n_patches > tuning.max_patches:

@@ -27,6 +27,30 @@ MIN_WIDTH = 1e-3  # bins: below it the patch's delay counts as one number; float
 MIN_RAMP = 1e-6  # bins, of the rise and the fall: guards quotients
 
 
+@dataclass(frozen=True, eq=False)
+class PatchDelays:
+    """Delays from wall points to patches [bins]."""
+
+    corners: mi.Vector4f  # successive ones of a parallelogram; of a triangle the first three
+    middle: mi.Float  # to the centre on the true surface
+
+    @classmethod
+    def from_point(
+        cls,
+        point: mi.Point3f,
+        centre: mi.Point3f,
+        corners: tuple[mi.Point3f, mi.Point3f, mi.Point3f],
+        bins_per_unit: mi.Float,
+    ) -> PatchDelays:
+        """Return the delays from one wall point; ``corners``: three successive ones of a parallelogram."""
+        a, b, c = corners
+        ends = mi.Vector4f(*(dr.norm(end - point) * bins_per_unit for end in (a, b, c, a + (c - b))))
+        return cls(ends, dr.norm(centre - point) * bins_per_unit)
+
+    def __add__(self, other: PatchDelays) -> PatchDelays:
+        return PatchDelays(self.corners + other.corners, self.middle + other.middle)
+
+
 @dataclass(eq=False)  # not frozen: the state of a loop
 class Delays:
     """Corners of the density of a patch's delays [bins], ascending."""
@@ -35,92 +59,69 @@ class Delays:
     t1: mi.Float
     t2: mi.Float | None  # None: no patch is a parallelogram, t2 = t1
     t3: mi.Float
+    first: mi.Float  # what the density has before arrives then
     light: mi.Vector3f | None = None  # per area, at t0, t1 and t3 of triangles, mean 1; None: even over all patches
 
     @classmethod
-    def of_triangle(cls, a: mi.Float, b: mi.Float, c: mi.Float) -> Delays:
-        """Return the density's corners of a triangle; parameters are the delays of its corners."""
-        middle = dr.maximum(dr.minimum(a, b), dr.minimum(dr.maximum(a, b), c))
-        return cls(dr.minimum(a, dr.minimum(b, c)), middle, None, dr.maximum(a, dr.maximum(b, c)))
+    def of_triangle(cls, delays: mi.Vector3f, light: mi.Vector3f | None = None) -> Delays:
+        """Return those of triangles with ``delays`` at the corners.
 
-    @classmethod
-    def of_lit_triangle(cls, delays: mi.Vector3f, light: mi.Vector3f) -> Delays:
-        """Return those of light that is linear over a triangle; ``light``: per area at the corners, mean 1."""
-        (a, b, c), (p, q, r) = delays, light
+        ``light``: per area at the corners, linear between them, mean 1; None: even.
+        """
+        (a, b, c) = delays
         low, high = dr.minimum(a, b), dr.maximum(a, b)
-        at_low, at_high = dr.select(a > b, q, p), dr.select(a > b, p, q)
-        first, last = c < low, c > high
-        return cls(
-            t0=dr.select(first, c, low),
-            t1=dr.select(first, low, dr.select(last, high, c)),
-            t2=None,
-            t3=dr.select(last, c, high),
-            light=mi.Vector3f(
+        t0, t1, t3 = dr.minimum(low, c), dr.maximum(low, dr.minimum(high, c)), dr.maximum(high, c)
+        sorted_light = None
+        if light is not None:
+            (p, q, r) = light
+            at_low, at_high = dr.select(a > b, q, p), dr.select(a > b, p, q)
+            first, last = c < low, c > high
+            sorted_light = mi.Vector3f(
                 dr.select(first, r, at_low),
                 dr.select(first, at_low, dr.select(last, at_high, r)),
                 dr.select(last, r, at_high),
-            ),
-        )
+            )
+        return cls(t0, t1, None, t3, t0, sorted_light)
 
     @classmethod
     def of_parallelogram(cls, a: mi.Float, b: mi.Float, c: mi.Float, d: mi.Float) -> Delays:
         """Return the density's corners of a parallelogram; parameters are the delays of its successive corners.
 
-        The best linear function through four corners is their mean in the middle.
+        Of all linear delays, the one nearest to theirs is taken: half their differences along the sides, and their
+        mean in the middle.
         """
-        one, other = dr.abs(b - a + c - d) / 2, dr.abs(d - a + c - b) / 2
+        one, other = dr.abs((b - a) + (c - d)) / 2, dr.abs((d - a) + (c - b)) / 2
         short, long = dr.minimum(one, other), dr.maximum(one, other)
-        t0 = (a + b + c + d) / 4 - (short + long) / 2
-        return cls(t0, t0 + short, t0 + long, t0 + short + long)
+        t0 = ((a + b) + (c + d)) / 4 - (short + long) / 2
+        return cls(t0, t0 + short, t0 + long, t0 + short + long, t0)
 
     @classmethod
-    def of_patch(cls, delays: mi.Vector4f, is_parallelogram: mi.Bool | None, light: mi.Vector3f | None) -> Delays:
+    def of_patch(
+        cls, delays: PatchDelays, is_parallelogram: mi.Bool | None, light: mi.Vector3f | None = None
+    ) -> Delays:
         """Return those of patches with four corners, of triangles the first three.
 
-        ``is_parallelogram`` None: no patch is one; their light is even. ``light``: see ``of_lit_triangle``.
+        Between its corners a linear delay is later than the true one. Cubature with the corners and the centre, exact
+        for quadratic functions, tells by how much on average: weights 1/12 and 3/4 over a triangle, 1/12 and 2/3 over
+        a parallelogram. All delays are moved by that, and none before the earliest of them
+        (docs/virtual-lights.md, 2.1).
+
+        ``is_parallelogram`` None: no patch is one; their light is even. ``light``: see ``of_triangle``.
         """
-        a, b, c, d = delays
-        triangle = cls.of_triangle(a, b, c) if light is None else cls.of_lit_triangle(delays.xyz, light)
-        if is_parallelogram is None:
-            return triangle
-        other = replace(cls.of_parallelogram(a, b, c, d), light=None if light is None else mi.Vector3f(1))
-        return dr.select(is_parallelogram, other, replace(triangle, t2=triangle.t1))
+        (a, b, c, d), middle = delays.corners, delays.middle
+        patch = cls.of_triangle(mi.Vector3f(a, b, c), light)
+        late = 0.75 * ((a + b + c) / 3 - middle)
+        if is_parallelogram is not None:
+            other = replace(cls.of_parallelogram(a, b, c, d), light=None if light is None else mi.Vector3f(1))
+            patch = dr.select(is_parallelogram, other, replace(patch, t2=patch.t1))
+            late = dr.select(is_parallelogram, (2 / 3) * (dr.mean(delays.corners) - middle), late)
+        moved = patch.later(-late)
+        return replace(moved, first=dr.maximum(moved.t0, dr.minimum(patch.t0, middle)))
 
     def later(self, delay: mi.Float | int) -> Delays:
         """Return the delays that begin so much later."""
         t2 = None if self.t2 is None else self.t2 + delay
-        return Delays(self.t0 + delay, self.t1 + delay, t2, self.t3 + delay, self.light)
-
-
-def corner_delays(
-    point: mi.Point3f,
-    centre: mi.Point3f,
-    corners: tuple[mi.Point3f, mi.Point3f, mi.Point3f],
-    bins_per_unit: mi.Float,
-    is_parallelogram: mi.Bool | None,
-) -> mi.Vector4f:
-    """Return the delays from ``point`` to the four corners of patches, moved by one delay so that their mean is right.
-
-    Between its corners the linear delay is later than the true one. Cubature with the corners and the centre, exact for
-    quadratic functions, tells by how much on average: weights 1/12 and 3/4 over a triangle, 1/12 and 2/3 over a
-    parallelogram (docs/virtual-lights.md, 2.1).
-
-    Parameters
-    ----------
-    point, centre, corners
-        A wall point; a patch's centre, on the true surface; its corners, successive ones of a parallelogram.
-    bins_per_unit
-        Bins per engine unit.
-    is_parallelogram
-        None: no patch is one.
-    """
-    a, b, c = corners
-    delays = mi.Vector4f(*(dr.norm(end - point) * bins_per_unit for end in (a, b, c, a + (c - b))))
-    middle = dr.norm(centre - point) * bins_per_unit
-    shift = 0.75 * (middle - (delays.x + delays.y + delays.z) / 3)
-    if is_parallelogram is not None:
-        shift = dr.select(is_parallelogram, (2 / 3) * (middle - dr.mean(delays)), shift)
-    return dr.maximum(delays + shift, 0)  # of a patch around the point itself, the shift may exceed the least delay
+        return Delays(self.t0 + delay, self.t1 + delay, t2, self.t3 + delay, self.first + delay, self.light)
 
 
 class _DelayCdf:
@@ -141,7 +142,7 @@ class _DelayCdf:
 
     def __call__(self, delay: mi.Float | int) -> mi.Float:
         t0, t1, t2, t3 = self.delays.t0, self.delays.t1, self.delays.t2, self.delays.t3
-        since, until = dr.maximum(delay - t0, 0), dr.maximum(t3 - delay, 0)
+        since, until = delay - t0, dr.maximum(t3 - delay, 0)
         up, down = dr.square(since) * self.rising, dr.square(until) * self.falling
         if self.delays.light is not None:
             up *= self.delays.light.x + self.more * since
@@ -149,7 +150,7 @@ class _DelayCdf:
         down = 1 - down
         if t2 is not None:
             down = dr.select(delay < t2, ((delay - t0) + (delay - t1)) * self.height, down)
-        return dr.select(delay < t1, up, down)
+        return dr.select(delay > self.delays.first, dr.select(delay < t1, up, down), 0)
 
     def bin_fractions(self, below: mi.Float) -> tuple[list[mi.Float], mi.Float]:
         """Return the fractions of the bins of a block that begins at 0, and the CDF at its end; ``below``: at 0."""
@@ -168,7 +169,7 @@ def deposit_patch(
     active: mi.Bool,
 ) -> None:
     """Deposit ``value`` over the bins that a patch covers: those of its ``delays`` [bins] plus ``whole`` bins."""
-    base = dr.floor(delays.t0)
+    base = dr.floor(delays.first)
     first = mi.Int32(base) + whole
     last = first + mi.Int32(delays.t3 - base)
     block = dr.maximum(first, 0) // BLOCK

@@ -21,7 +21,7 @@ from nlosrender.engine.launch.flat_mirrors import FlatMirrors, image_in, turned_
 from nlosrender.engine.launch.launch_params import LaunchParams
 from nlosrender.engine.launch.passes import Passes, PassSize, Snapshot
 from nlosrender.engine.launch.wall_points import WallPoints
-from nlosrender.engine.virtual_lights.gather.delay_distribution import Delays, corner_delays, deposit_patch
+from nlosrender.engine.virtual_lights.gather.delay_distribution import Delays, PatchDelays, deposit_patch
 from nlosrender.engine.virtual_lights.gather.lighting import ROWS, GatherSettings, PackedPatches
 from nlosrender.engine.virtual_lights.visibility.shadow_rays import is_visible, mirrored_share
 
@@ -182,17 +182,17 @@ def gather_third_bounce(
             active = is_visible(built, sensor, to_surface, mi.Vector3f(offset), active, mask, tile)
 
         # ---- Reflect towards the lasers and deposit -----------------------------------------------------------------
-        delays = corner_delays(sensor.p, centre, (a, b, c), params.bins_per_unit, is_cluster) + sensors.delay_fraction
+        delays = PatchDelays.from_point(sensor.p, centre, (a, b, c), params.bins_per_unit)
         seen = _SeenPatch(patch, weight, is_cluster, (a, b, c), to_patch - from_sensor, active)
         if dr.hint(settings.is_confocal, mode="scalar"):
             light = wall_bsdf.eval(context, sensor, sensor.to_local(direction)) / distance2
             if dr.hint(settings.is_diffuse, mode="scalar"):
                 light *= dr.gather(mi.Spectrum, packed.reflectance, patch) * cosine
-            delays = 2 * delays + (own_laser.delay_fraction - sensors.delay_fraction)
+            delays += delays
             _deposit(settings, packed, histogram, sensors, own_laser, lane, mi.UInt32(0), light, delays, seen)
         elif dr.hint(params.lasers_per_lane == 1, mode="scalar"):
             light, legs = packed.from_laser(patch)
-            delays += legs + own_laser.delay_fraction
+            delays += legs
             _deposit(settings, packed, histogram, sensors, own_laser, lane, mi.UInt32(0), light, delays, seen)
         else:
             laser = mi.UInt32(0)
@@ -201,8 +201,7 @@ def gather_third_bounce(
             ):
                 points = params.lasers.gather(laser)
                 light, legs = packed.from_laser(laser * count + patch)
-                legs += delays + points.delay_fraction
-                _deposit(settings, packed, histogram, sensors, points, lane, laser, light, legs, seen)
+                _deposit(settings, packed, histogram, sensors, points, lane, laser, light, legs + delays, seen)
                 laser += 1
         patch += 1
 
@@ -228,10 +227,10 @@ def _deposit(
     lane: mi.UInt32,
     laser: mi.UInt32,
     light: mi.Spectrum,
-    delays: mi.Vector4f,
+    delays: PatchDelays,
     seen: _SeenPatch,
 ) -> None:
-    """Deposit what a patch sends on of the ``light`` from one laser; ``delays`` [bins] of its corners."""
+    """Deposit what a patch sends on of the ``light`` from one laser; ``delays``: of the ways within the scene."""
     value = seen.weight * light
     lit = seen.active & dr.any(value > 0)
     distribution = None
@@ -240,6 +239,7 @@ def _deposit(
         value *= reflected
         lit &= dr.any(value > 0)
     covered = Delays.of_patch(delays, seen.is_cluster, distribution)
+    covered = covered.later(laser_points.delay_fraction + sensors.delay_fraction)
     deposit_patch(histogram, lane, laser, covered, laser_points.delay_bins + sensors.delay_bins, value, lit)
 
 

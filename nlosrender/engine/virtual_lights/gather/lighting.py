@@ -13,7 +13,7 @@ from nlosrender.engine.launch.device_arrays import on_device
 from nlosrender.engine.launch.flat_mirrors import FlatMirrors, image_in, turned_in
 from nlosrender.engine.launch.launch_params import LaunchParams
 from nlosrender.engine.launch.wall_points import WallPoints
-from nlosrender.engine.virtual_lights.gather.delay_distribution import corner_delays
+from nlosrender.engine.virtual_lights.gather.delay_distribution import PatchDelays
 from nlosrender.engine.virtual_lights.tuning import DEFAULT_TUNING
 from nlosrender.engine.virtual_lights.visibility.shadow_rays import is_visible, mirrored_share
 from nlosrender.scene.build import BuiltScene
@@ -58,13 +58,15 @@ class PackedPatches:
     # that leaves; empty for confocal captures
     laser_light: mi.Spectrum
     delays: mi.Float  # four an index: from the laser point to each corner [bins]
+    middle_delays: mi.Float  # to the centre
     has_clusters: bool
     count: mi.UInt32  # of lit patches, opaque
     first: mi.UInt32  # of slice k: its patches are first[k] to first[k + 1]
 
-    def from_laser(self, entry: mi.UInt32) -> tuple[mi.Spectrum, mi.Vector4f]:
-        """Return ``laser_light`` and the delays [bins] of corners of pairs of laser and patch."""
-        return dr.gather(mi.Spectrum, self.laser_light, entry), dr.gather(mi.Vector4f, self.delays, entry)
+    def from_laser(self, entry: mi.UInt32) -> tuple[mi.Spectrum, PatchDelays]:
+        """Return ``laser_light`` and delays of pairs of laser and patch."""
+        delays = PatchDelays(dr.gather(mi.Vector4f, self.delays, entry), dr.gather(mi.Float, self.middle_delays, entry))
+        return dr.gather(mi.Spectrum, self.laser_light, entry), delays
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,7 +139,8 @@ def pack_patches(
     mirror: FlatMirrors | None = None,
 ) -> PackedPatches:
     """Return what the gather reads: the patches that are lit, sorted by slice (see ``PatchRegions.in_slices``)."""
-    patches, laser_light, delays = lit_patches.patches, lit_patches.laser_light, mi.Float(0)
+    patches, laser_light = lit_patches.patches, lit_patches.laser_light
+    delays, middle_delays = mi.Float(0), mi.Float(0)
     count = dr.width(patches.areas)
     lit = dr.compress(lit_patches.is_lit)
     if not dr.width(lit):
@@ -152,9 +155,8 @@ def pack_patches(
         laser_light = dr.gather(mi.Spectrum, laser_light, laser * dr.opaque(mi.UInt32, count) + patch)
         points = image_in(mirror, dr.gather(mi.Point3f, params.lasers.interaction.p, laser))
         centre = dr.gather(mi.Point3f, patches.interaction.p, patch)
-        is_cluster = dr.gather(mi.Vector4f, patches.members, patch).w > 0 if patches.has_clusters else None
-        corners = _corners(patches, patch)
-        delays = dr.ravel(corner_delays(points, centre, corners, params.bins_per_unit, is_cluster))
+        legs = PatchDelays.from_point(points, centre, _corners(patches, patch), params.bins_per_unit)
+        delays, middle_delays = dr.ravel(legs.corners), legs.middle
     a, b, c = _corners(patches, lit)
     areas = dr.gather(mi.Vector3f, patches.areas, lit)
     interaction = dr.gather(mi.SurfaceInteraction3f, patches.interaction, lit)
@@ -179,6 +181,7 @@ def pack_patches(
         reflectance=dr.gather(mi.Spectrum, patches.reflectance, lit) * dr.inv_pi,
         laser_light=laser_light,
         delays=delays,
+        middle_delays=middle_delays,
         has_clusters=patches.has_clusters,
         count=n_lit,
         first=first,
