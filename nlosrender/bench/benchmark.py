@@ -107,7 +107,7 @@ def scene_curves(loaded: LoadedScene, peer: Peer | None, seconds: float) -> Repo
     timer, scene = Timer(), loaded.scene
     reference = find_reference(loaded, REFERENCE_SHARE * seconds)
     contenders: list[Contender] = own_contenders(loaded)
-    if peer is not None:
+    if peer is not None and not any(surface.bsdf["type"] == "retroreflector" for surface in loaded.built.surfaces):
         contenders += peer_contenders(peer, loaded)
     curves = race(contenders, reference, max(seconds - timer.read()[0], seconds / 2), scene.target, matched)
     # the energy of a peer, whose unit is its own, is compared with that of its unbiased setting

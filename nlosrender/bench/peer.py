@@ -144,8 +144,7 @@ def describe_scene(loaded: LoadedScene, folder: Path) -> dict[str, Any]:
             write_ply(mesh, surface.shape.vertices, surface.shape.faces)
         else:
             raise TypeError(f"{scene.name}: peers render triangle meshes, not {type(surface.shape).__name__}")
-        reflectance = surface.bsdf["reflectance"]
-        surfaces.append({"mesh": str(mesh), "to_world": to_world.tolist(), "reflectance": reflectance})
+        surfaces.append({"mesh": str(mesh), "to_world": to_world.tolist(), "bsdf": surface.bsdf})
     confocal = loaded.capture.scan_type == "confocal"  # every sensor point has a laser point of its own
     return {
         "wall": [loaded.built.wall.width, loaded.built.wall.height],

@@ -2,15 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
 import yaml
 
+from nlosrender.bench.paper.room_meshes import write_furniture
 from nlosrender.config.document import Config
 from nlosrender.config.load import parse_config
+
+# (bounces, error whose time is reported, BSDF); ``material: none`` is a metal that absorbs nothing
+SHINY: Mapping[str, tuple[int, float, Mapping[str, Any]]] = {
+    "ggx-0.2": (3, 0.01, {"type": "roughconductor", "material": "none", "distribution": "ggx", "alpha": 0.2}),
+    "ggx-0.05": (3, 0.01, {"type": "roughconductor", "material": "none", "distribution": "ggx", "alpha": 0.05}),
+    "plastic": (5, 0.02, {"type": "plastic", "diffuse_reflectance": 0.6}),
+    "principled": (5, 0.02, {"type": "principled", "base_color": 0.6, "roughness": 0.3, "metallic": 0.5}),
+    "mirror": (3, 0.01, {"type": "conductor", "material": "none"}),
+    "retroreflector": (3, 0.01, {"type": "retroreflector", "width": 2.0}),
+}
 
 Truth = Literal["quadrature", "refined", "long run"]
 
@@ -35,6 +46,7 @@ class BenchScene:
     sections: Mapping[str, Any]  # scene, capture, time_axis
     max_bounces: int | None = 3
     weight: float = 1.0  # its share of the time is in proportion
+    write_mesh: Callable[[], None] | None = None  # called before the first configuration
 
     def config(self, **render: Any) -> Config:
         """Return the configuration; ``render`` are keys of its ``render`` section.
@@ -44,11 +56,13 @@ class BenchScene:
         ConfigError
             A mesh is missing, or a key of ``render`` is wrong.
         """
+        if self.write_mesh is not None:
+            self.write_mesh()
         text = yaml.safe_dump({**self.sections, "render": {"max_bounces": self.max_bounces, **render}})
         return parse_config(text, f"{self.name}.yaml", Path.cwd())
 
 
-def built_in_scenes(mesh: Path | None = None) -> dict[str, BenchScene]:
+def built_in_scenes(mesh: Path | None = None, folder: Path = Path("out")) -> dict[str, BenchScene]:
     """Return the scenes by name.
 
     Parameters
@@ -56,11 +70,14 @@ def built_in_scenes(mesh: Path | None = None) -> dict[str, BenchScene]:
     mesh
         A mesh about 0.8 m high, y up, centred at its origin, such as the Stanford bunny; without one its scenes
         are left out.
+    folder
+        Where the furniture of a room is written, when that scene is first loaded.
     """
     scenes = [plate(), letters()]
     if mesh is not None:
         scenes += [bunny(mesh), bunny(mesh, "confocal"), bunny(mesh, max_bounces=None)]
-    scenes.append(closed_room())
+        scenes += [shiny_bunny(mesh, name) for name in SHINY]
+    scenes += [closed_room(), mirror_room(), furnished_room(folder / "bench-furniture.ply")]
     return {scene.name: scene for scene in scenes}
 
 
@@ -93,12 +110,50 @@ def bunny(mesh: Path, scan: str = "single", max_bounces: int | None = 3) -> Benc
     return BenchScene("bunny" if scan == "single" else "bunny-confocal", title, 0.01, "refined", sections)
 
 
+def shiny_bunny(mesh: Path, name: str) -> BenchScene:
+    """The mesh at 1 m with a BSDF of ``SHINY``; a retroreflector confocal, where it sends its light."""
+    max_bounces, target, bsdf = SHINY[name]
+    scan = "confocal" if name == "retroreflector" else "single"
+    item = _item("mesh", filename=str(mesh.absolute()), translate=[0.0, 0.0, 1.0], face_normals=True, bsdf=dict(bsdf))
+    sections = _sections([item], 64, bins=(1.3, 0.003, 700), scan=scan)
+    title = f"{mesh.stem} at 1 m, {name}, {scan}, {max_bounces} bounces, 64 x 64 sensor points, 700 bins of 3 mm"
+    truth: Truth = "refined" if max_bounces == 3 else "long run"
+    return BenchScene(f"bunny-{name}", title, target, truth, sections, max_bounces)
+
+
 def closed_room(n: int = 32, max_bounces: int | None = None) -> BenchScene:
     """A closed cube of 2 m, the relay wall one of its sides, albedo 0.5 everywhere: light goes on for long."""
     item = _item("room", size=[2.0, 2.0, 2.0], bsdf=_diffuse(0.5))
     sections = _sections([item], n, bins=(0.0, 0.03, 500), wall_reflectance=0.5)
     title = f"closed room of 2 m, albedo 0.5, all bounces, {n} x {n} sensor points, 500 bins of 3 cm"
     return BenchScene("room", title, 0.03, "long run", sections, max_bounces, weight=1.5)
+
+
+def mirror_room(n: int = 32) -> BenchScene:
+    """The closed room with a mirror before one of its sides; light that meets it twice in a row is not sampled."""
+    mirror = _item("rectangle", width=1.9, height=1.9, center=[0.98, 0.0, 1.0], normal=[-1, 0, 0])
+    mirror |= {"name": "mirror", "bsdf": {"type": "conductor", "material": "none"}}
+    item = _item("room", size=[2.0, 2.0, 2.0], bsdf=_diffuse(0.5))
+    sections = _sections([item, mirror], n, bins=(0.0, 0.03, 500), wall_reflectance=0.5)
+    title = f"closed room of 2 m, one side a mirror, all bounces, {n} x {n} sensor points, 500 bins of 3 cm"
+    return BenchScene("room-mirror", title, 0.03, "long run", sections, None, weight=1.5)
+
+
+def furnished_room(mesh: Path, n: int = 64) -> BenchScene:
+    """A closed room with furniture of 1.2 million triangles, which is written to ``mesh``."""
+
+    def write() -> None:
+        if not mesh.is_file():
+            mesh.parent.mkdir(parents=True, exist_ok=True)
+            write_furniture(mesh, 1_200_000)
+
+    furniture = _item("mesh", filename=str(mesh.absolute()), face_normals=True, bsdf=_diffuse(0.6)) | {
+        "name": "furniture"
+    }
+    item = _item("room", size=[2.0, 2.0, 2.2], bsdf=_diffuse(0.5))
+    sections = _sections([item, furniture], n, bins=(0.0, 0.03, 400), wall_reflectance=0.5)
+    title = f"room of 2 m, furniture of 1.2 million triangles, all bounces, {n} x {n} sensor points, 400 bins of 3 cm"
+    return BenchScene("room-furnished", title, 0.05, "long run", sections, None, weight=3.0, write_mesh=write)
 
 
 def wavy_sheet(mesh: Path, n: int = 32) -> BenchScene:

@@ -25,7 +25,7 @@ def bench(
     mesh: Annotated[
         Path | None,
         typer.Option(
-            help="Mesh about 0.8 m high, such as the Stanford bunny: adds the bunny's three scenes.", readable=False
+            help="Mesh about 0.8 m high, such as the Stanford bunny: adds the bunny's nine scenes.", readable=False
         ),
     ] = None,
     peer: Annotated[
@@ -48,7 +48,7 @@ def bench(
 
     if mesh is not None and not mesh.is_file():
         raise typer.BadParameter(f"{mesh}: there is no such file", param_hint="--mesh")
-    known = built_in_scenes(mesh)
+    known = built_in_scenes(mesh, output.parent)
     # a real mesh tells more than the letters, which stand in for one
     names = scene or [name for name in known if mesh is None or name != "letters"]
     scenes = [known[one_of(name, known, "--scene", _remark(name))] for name in names]

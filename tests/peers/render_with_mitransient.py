@@ -53,7 +53,7 @@ def load_scene(mi, scene: dict, settings: dict):
 
     ``scene``: wall [width, height], wall_reflectance, scan (single or confocal), sensors [rows, columns],
     laser_point [x, y], bins [start_opl, bin_width_opl, n_bins], max_bounces (or null), surfaces: a list of
-    {mesh: .ply file, to_world: 4 x 4, reflectance}.
+    {mesh: .ply file, to_world: 4 x 4, bsdf}.
     """
     transform = mi.ScalarTransform4f
     rows, columns = scene["sensors"]
@@ -95,7 +95,7 @@ def load_scene(mi, scene: dict, settings: dict):
             "filename": surface["mesh"],
             "to_world": transform(np.array(surface["to_world"])),
             "face_normals": True,
-            "bsdf": {"type": "diffuse", "reflectance": surface["reflectance"]},
+            "bsdf": surface["bsdf"],
         }
         for index, surface in enumerate(scene["surfaces"])
     }
