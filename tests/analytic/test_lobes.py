@@ -187,6 +187,18 @@ def test_further_bounces_agree_on_every_lobe(name: str, scan: str, turned: bool)
         assert abs(energies[0].sum() - energies[1].sum()) <= 4 * sigma.sum()
 
 
+def test_laser_and_sensor_points_may_be_exchanged() -> None:
+    """H(l, s) = H(s, l) per bin, to what is stated: neither cubature nor VPLs are the same from either side."""
+    bsdf = {"type": "roughconductor", "alpha": 0.15}
+    grid = {"nx": 3, "ny": 3, "width": 0.8, "height": 0.8}
+    common = {"scan": "exhaustive", "bins": (1.0, 0.1, 20), "color": "grey", "spp": None, "target_error": 0.01}
+    capture = {"sensor_grid": grid, "laser_grid": grid}
+    result = render(flat_wall(PLACE | {"bsdf": bsdf}, engine="virtual_lights", capture=capture, **common))
+    pairs = result.total.reshape(9, 9, -1)
+    error = relative_l2(pairs - pairs.swapaxes(0, 1), pairs)
+    assert 1e-6 < error < 2 * np.sqrt(2) * result.error_estimate
+
+
 def test_linear_light_is_spread_over_bins_as_over_the_triangle() -> None:
     """Shares of light per bin where light is linear over a triangle, in any order of the corners, against cells."""
     start_backend("llvm")

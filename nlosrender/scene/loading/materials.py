@@ -152,7 +152,8 @@ def _innermost(bsdf: mi.BSDF) -> Iterator[mi.BSDF]:
             yield mi.load_dict({"type": "null"})
     elif bsdf.class_name() == "BlendBSDF":
         low, high = _extremes(bsdf, "weight")  # of the second one
-        parts = [part for part, is_met in zip(parts, (low < 1, high > 0), strict=True) if is_met]
+        both = (parts[0], low < 1), (parts[-1], high > 0)  # two that are equal are one object
+        parts = [part for part, is_met in both if is_met]
     elif not parts:
         yield bsdf
     for part in parts:

@@ -156,6 +156,7 @@ def upload_patches(
     interaction.sh_frame = dr.select(is_cluster > 0, own, frame)
     start = mi.Vector2u(*mi.sample_tea_32(mi.UInt32(seed), mi.UInt32(0)))
     dr.make_opaque(start)
+    curvature = Curvature.of(built, patches)
     offset = off_the_surface(built, patches.members, patches.member_normals, patches.shapes) - patches.members
     result = DevicePatches(
         regions=regions,
@@ -164,12 +165,12 @@ def upload_patches(
         rounding_residual=to_vectors(patches.centres - np.array(interaction.p, np.float64).T),
         is_near=is_near,
         corners=[to_vectors(patches.corners[:, k] - patches.centres) for k in range(3)],
-        curvature=Curvature.of(built, patches),
+        curvature=curvature,
         members=mi.Vector4f(*to_points(patches.members - patches.centres), is_cluster),
         has_clusters=bool(patches.is_cluster.any()),
         areas=to_vectors(patches.normals * patches.areas[:, None]),
         interaction=interaction,
-        middles=[] if is_diffuse else _middles(built, patches, interaction, is_cluster > 0),
+        middles=[] if is_diffuse else _middles(built, patches, interaction, is_cluster > 0, curvature),
         reflectance=reflectance,
         member_normals=to_vectors(patches.member_normals),
         offset=to_vectors(offset),
@@ -196,7 +197,11 @@ def surface_at(built: BuiltScene, points: SurfacePoints) -> mi.SurfaceInteractio
 
 
 def _middles(
-    built: BuiltScene, patches: Patches, centre: mi.SurfaceInteraction3f, is_cluster: mi.Bool
+    built: BuiltScene,
+    patches: Patches,
+    centre: mi.SurfaceInteraction3f,
+    is_cluster: mi.Bool,
+    curvature: Curvature | None,
 ) -> list[mi.SurfaceInteraction3f]:
     """Return the surface in the middle of the edge opposite each corner; of clusters ``centre``.
 
@@ -212,6 +217,8 @@ def _middles(
         weights = np.tile(0.5 - 0.5 * np.eye(3)[corner], (len(patches), 1))
         weights[chosen] = np.take_along_axis(random, (np.arange(3) - corner + least) % 3, axis=1)
         middle = surface_at(built, patches.mixed(weights))
+        place = to_vectors(patches.corners[:, [corner - 1, corner - 2]].mean(axis=1) - patches.centres)
+        middle.p = centre.p + (place if curvature is None else curvature.onto_surface(place))
         result.append(dr.select(is_cluster, centre, middle))
         dr.eval(result[-1])
     return result

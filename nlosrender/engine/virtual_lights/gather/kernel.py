@@ -183,7 +183,7 @@ def gather_third_bounce(
 
         # ---- Reflect towards the lasers and deposit -----------------------------------------------------------------
         delays = PatchDelays.from_point(sensor.p, centre, (a, b, c), params.bins_per_unit)
-        seen = _SeenPatch(patch, weight, is_cluster, (a, b, c), to_patch - from_sensor, active)
+        seen = _SeenPatch(patch, weight, is_cluster, to_patch - from_sensor, active)
         if dr.hint(settings.is_confocal, mode="scalar"):
             light = wall_bsdf.eval(context, sensor, sensor.to_local(direction)) / distance2
             if dr.hint(settings.is_diffuse, mode="scalar"):
@@ -213,7 +213,6 @@ class _SeenPatch:
     number: mi.UInt32
     weight: mi.Spectrum  # wall's BSDF and the geometry between; of patches that are not Lambertian without their BSDF
     is_cluster: mi.Bool | None  # None: no patch is
-    corners: tuple[mi.Point3f, mi.Point3f, mi.Point3f]
     residual: mi.Vector3f  # what float32 rounds off its place
     active: mi.Bool
 
@@ -251,11 +250,10 @@ def _reflected(
     The BSDF is evaluated at the middles of the three edges, whose mean is exact for quadratic functions. The linear
     function through them tells the light per area at the corners, mean 1: docs/virtual-lights.md, 2.5.
     """
-    a, b, c = (corner + seen.residual for corner in seen.corners)
     interactions, to_laser = [], []
-    for number, (one, other) in enumerate(((b, c), (c, a), (a, b))):
-        middle = (one + other) / 2
-        si = dr.gather(mi.SurfaceInteraction3f, packed.middles[number], seen.number)
+    for middles in packed.middles:
+        si = dr.gather(mi.SurfaceInteraction3f, middles, seen.number)
+        middle = si.p + seen.residual
         si.wi = dr.normalize(si.to_local(sensor - middle))
         interactions.append(si)
         to_laser.append(dr.normalize(si.to_local(laser - middle)))
