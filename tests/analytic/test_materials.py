@@ -258,7 +258,7 @@ def test_glass_delays_by_its_index() -> None:
         capture={"laser_spot_radius": radius, "laser_point": [0.0, 0.0]},
         max_bounces=7,
         bins=(1.6, 0.05, 8),
-        spp=2**22,
+        spp=2**20,
         russian_roulette=False,
     )
     result = render(config, replicas=64, p_hidden_sampling=0.0)
@@ -266,7 +266,7 @@ def test_glass_delays_by_its_index() -> None:
     distance = 2 * (z - t + t / n)
     expected = 0.96**4 / np.pi**2 / distance**2
     sigma = float(np.sqrt(result.bounce_variance(7).sum()))
-    assert sigma < 0.01 * expected
+    assert sigma < 0.02 * expected
     arrival = int((2 * z + 2 * (n - 1) * t - 1.6) / 0.05 + 1e-6)  # 1.700 m to 1.708 m; later: by way of the relay wall
     assert abs(seventh[arrival] - expected) < 4 * sigma + 0.005 * expected
     assert seventh[:arrival].sum() == 0

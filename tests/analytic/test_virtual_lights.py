@@ -115,7 +115,9 @@ def test_a_sphere_is_round(scan: str) -> None:
     assert_honest(result, estimate, truth, target=0.01, floor=2 * QUADRATURE[scan])
 
 
-@pytest.mark.parametrize("scan", ["single", pytest.param("confocal", marks=pytest.mark.slow), "exhaustive"])
+@pytest.mark.parametrize(
+    "scan", ["single", *(pytest.param(scan, marks=pytest.mark.slow) for scan in ("confocal", "exhaustive"))]
+)
 def test_shadow_edges_converge(scan: str) -> None:
     """A black screen hides parts of the plate from laser and sensor points; partly hidden patches count in part."""
     cells = rectangle_cells(0.8, 0.6, PLATE["center"], PLATE["normal"], n=CELLS[scan])

@@ -157,6 +157,7 @@ def test_walks_take_all_the_time_there_is(bounces: str, takes_all: bool) -> None
     assert (plan["seconds_estimate"] >= 1000) == takes_all  # the start counts, too
 
 
+@pytest.mark.slow
 def test_the_impossible_takes_years() -> None:
     """A target of 1e-12: plan states the years, what to do, and why it is never reached."""
     changes = ["--set", "render.engine=path", "--set", "render.target_error=1e-12"]
