@@ -231,7 +231,7 @@ def test_blended_mirrors_have_their_share_before_and_after_what_is_matt() -> Non
         plate((-0.5, 0.0, 1.2), (0.3, 0.0, -1.0), (1.0, 1.0), 0.7),
         ((0.6, 0.0, 0.9), (-1.0, 0.0, -0.4), (0.9, 0.9)),
     )
-    settings: dict[str, Any] = {"max_bounces": 4, "spp": 2**15, "bins": (0.0, 0.2, 40)}
+    settings: dict[str, Any] = {"max_bounces": 4, "spp": 2**13, "bins": (0.0, 0.2, 40)}
     whole, part = (render(flat_wall(lit, plate(*at, kind), **settings), replicas=16) for kind in (MIRROR, half))
     energies, variances = (
         [values(one).sum() for one in (whole, part)]
@@ -239,7 +239,7 @@ def test_blended_mirrors_have_their_share_before_and_after_what_is_matt() -> Non
     )
     deviation = math.sqrt(variances[0] / 4 + variances[1])
     assert abs(energies[1] - energies[0] / 2) < 5 * deviation
-    assert deviation < 0.005 * energies[1]
+    assert deviation < 0.01 * energies[1]
 
 
 def box(length: float, end: Any) -> list[Scene]:
@@ -287,15 +287,15 @@ def test_virtual_lights_in_a_mirror_are_those_of_twice_the_length() -> None:
     assert stage.engine.further is not None
     from nlosrender.engine.interface import Budget
 
-    lights = stage.repeated(stage.engine.calibrate(Budget(target_error=0.04)), range(8)).means[:, 0, 0, 0]
+    lights = stage.repeated(stage.engine.calibrate(Budget(target_error=0.04)), range(6)).means[:, 0, 0, 0]
     mean, variance = (values.reshape(POINTS**2, -1) for values in unfolded_room())
-    own = lights.var(axis=0, ddof=1) / 8
+    own = lights.var(axis=0, ddof=1) / 6
     # all points share patches, VPLs, and their errors: each alone
     for sums in (
         lambda values: values.sum(axis=(-1, -2)),
         lambda values: values.sum(axis=-2).reshape(*values.shape[:-2], 10, 6).sum(axis=-1),
     ):
         seeds, expected = sums(lights), sums(mean)
-        deviation = np.sqrt(seeds.var(axis=0, ddof=1) / 8 + sums(variance))
+        deviation = np.sqrt(seeds.var(axis=0, ddof=1) / 6 + sums(variance))
         assert (np.abs(seeds.mean(axis=0) - expected) <= 6 * deviation + 0.002 * expected).all()
     assert np.sqrt(own.sum()) < 0.03 * np.linalg.norm(mean)

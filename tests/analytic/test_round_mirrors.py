@@ -62,7 +62,7 @@ def image_light(shape: Scene, laser: Array, sensor: Array) -> tuple[float, float
     def way(free: Array) -> float:
         return float(np.linalg.norm(place(free) - laser) + np.linalg.norm(place(free) - sensor))
 
-    grid = [np.array([a, b]) for a in np.linspace(-3, 3, 40) for b in np.linspace(-1, 1 if axis.any() else 3, 41)]
+    grid = [np.array([a, b]) for a in np.linspace(-3, 3, 20) for b in np.linspace(-1, 1 if axis.any() else 3, 21)]
     found = optimize.minimize(way, min(grid, key=way), method="BFGS", options={"gtol": 1e-11})
     point, length = place(found.x), float(found.fun)
     normal = normals(shape, point[None])[0]
@@ -83,7 +83,7 @@ def image_light(shape: Scene, laser: Array, sensor: Array) -> tuple[float, float
 def test_a_round_mirror_spreads_the_light_of_an_image(kind: str) -> None:
     """Time and strength of the third bounce are those of the shortest way, and of the spread of rays about it."""
     shape = ROUND[kind]
-    settings: dict[str, Any] = {"bins": (0.5, 0.05, 60), "sensors": (5, 4), "engine": "path", "spp": 16}
+    settings: dict[str, Any] = {"bins": (0.5, 0.05, 60), "sensors": (4, 3), "engine": "path", "spp": 16}
     stage = Stage.of(flat_wall(shape, **settings))
     light = dict(stage.engine.device.exact_light(stage.batch))[3][0, 0, 0]
     capture, axis = stage.engine.capture, stage.engine.time_axis
@@ -92,7 +92,7 @@ def test_a_round_mirror_spreads_the_light_of_an_image(kind: str) -> None:
     for row, sensor in zip(expected, capture.sensor_grid.positions.reshape(-1, 3), strict=True):
         value, length = image_light(shape, laser, sensor)
         row[int((length - axis.start_opl) / axis.bin_width_opl)] += value
-    assert (expected.any(axis=-1)).sum() >= (20 if kind == "sphere" else 8)
+    assert (expected.any(axis=-1)).sum() >= (12 if kind == "sphere" else 4)
     # Fermat's point is good to 1e-7, differences of rays to 1e-6
     assert np.abs(light - expected).max() < 1e-5 * expected.max()
 

@@ -82,7 +82,8 @@ class VirtualLightEngine:
             masks = self.third.masks if self.settings.needs_visibility else None
             self.further = VplBounces(device, self.tessellator, masks, self.settings.is_diffuse)
         surfaces = "Lambertian" if self.settings.is_diffuse else "diffuse and rough"
-        self.reason = f"{surfaces} surfaces before a {'planar' if built.wall.is_planar else 'curved'} wall"
+        surfaces += " surfaces and a mirror" if mirror is not None else " surfaces"
+        self.reason = f"{surfaces} before a {'planar' if built.wall.is_planar else 'curved'} wall"
         self._calibrated: dict[Budget, Budget] = {}
 
     @property
