@@ -369,31 +369,44 @@ def _mirrors_of(triangles: Float64) -> tuple[NDArray[np.intp], Float64]:
     one, other = one[turned < COPLANAR], other[turned < COPLANAR]
     links = sparse.coo_matrix((np.ones(len(one)), (one, other)), shape=(len(triangles), len(triangles)))
     n_mirrors, mirror = sparse.csgraph.connected_components(links, directed=False)
-    sizes = np.bincount(mirror, minlength=n_mirrors)
     around = np.zeros((n_mirrors, 3, 3))
-    around[mirror] = triangles  # of those with several facets replaced below
-    for number in np.flatnonzero(sizes > 1):
-        around[number] = _triangle_around(triangles[mirror == number], areas[mirror == number])
+    around[mirror] = triangles
+    several = np.bincount(mirror, minlength=n_mirrors)[mirror] > 1
+    if several.any():
+        order = np.flatnonzero(several)[np.argsort(mirror[several], kind="stable")]
+        numbers, first = np.unique(mirror[order], return_index=True)
+        around[numbers] = _triangles_around(triangles[order], areas[order], first)
     return mirror, around
 
 
-def _triangle_around(triangles: Float64, areas: Float64) -> Float64:
-    """Return a triangle (3, 3) around triangles in a plane: half of it is their rectangle, along an edge of theirs."""
-    normal, weights = areas.sum(axis=0), np.linalg.norm(areas, axis=1)
-    normal /= np.linalg.norm(normal)
-    middle = np.average(triangles.mean(axis=1), axis=0, weights=weights)
-    found = []
+def _triangles_around(triangles: Float64, areas: Float64, first: NDArray[np.intp]) -> Float64:
+    """Return triangles (m, 3, 3) around mirrors of several triangles (n, 3, 3), which begin at ``first`` (m,).
+
+    Half of each is the rectangle around the mirror along an edge of its first triangle, the smallest of three.
+    """
+    mirror = np.repeat(np.arange(len(first)), np.diff(np.append(first, len(triangles))))
+    weights = np.linalg.norm(areas, axis=1)[:, None]
+    normals = np.add.reduceat(areas, first)
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    middle = np.add.reduceat(triangles.mean(axis=1) * weights, first) / np.add.reduceat(weights, first)
+    places = triangles - middle[mirror, None]
+    best, smallest = np.empty((len(first), 3, 3)), np.full(len(first), np.inf)
     for k in range(3):
-        along = triangles[0, k] - triangles[0, k - 1]
-        along -= (along @ normal) * normal
-        along /= np.linalg.norm(along)
-        across = np.cross(normal, along)
-        places = (triangles.reshape(-1, 3) - middle) @ np.stack([along, across], axis=1)
-        low, size = places.min(axis=0), np.ptp(places, axis=0)
-        corner = middle + low[0] * along + low[1] * across
-        triangle = np.stack([corner, corner + 2 * size[0] * along, corner + 2 * size[1] * across])
-        found.append((float(size.prod()), k, triangle))
-    return min(found)[2]
+        along = triangles[first, k] - triangles[first, k - 1]
+        along -= np.einsum("mx,mx->m", along, normals)[:, None] * normals
+        along /= np.linalg.norm(along, axis=1, keepdims=True)
+        axes = along, np.cross(normals, along)
+        spans = [np.einsum("nkx,nx->nk", places, axis[mirror]) for axis in axes]
+        low = [np.minimum.reduceat(span.min(axis=1), first)[:, None] for span in spans]
+        size = [
+            np.maximum.reduceat(span.max(axis=1), first)[:, None] - start
+            for span, start in zip(spans, low, strict=True)
+        ]
+        corner = middle + low[0] * axes[0] + low[1] * axes[1]
+        area = (size[0] * size[1])[:, 0]
+        found = np.stack([corner, corner + 2 * size[0] * axes[0], corner + 2 * size[1] * axes[1]], axis=1)
+        best[area < smallest], smallest = found[area < smallest], np.minimum(area, smallest)
+    return best
 
 
 def _packed(triangles: Float64) -> Float64:
