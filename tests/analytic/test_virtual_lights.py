@@ -166,10 +166,14 @@ def test_further_bounces_come_on_top(max_bounces: int | None) -> None:
     scene = (PLATE, BALL | {"center": [-0.45, 0.2, 0.7], "radius": 0.25})
     config = flat_wall(*scene, bins=(0.6, 0.08, 80), spp=60000, max_bounces=max_bounces)
     paths: Rendering = render(config, replicas=32)
+    from dataclasses import replace
+
     from nlosrender.engine.interface import Budget
 
     _, _, _, plan, engine = start(config | {"render": {"max_bounces": max_bounces, "engine": "virtual_lights"}})
-    histogram = engine.render(plan.batches[0], Budget(target_error=0.005))
+    # bins share VPLs: their sums err by more than the bins tell, 4 % of bounce 5 in one round
+    budget = replace(engine.calibrate(Budget(target_error=0.005)), rounds=64)
+    histogram = engine.render(plan.batches[0], budget)
     for bounce in range(3, paths.bounces.n_slots + 2):
         slot = paths.bounces.slot(bounce)
         ours = histogram.mean[0, slot].reshape(paths.bounce(bounce).shape)
@@ -181,7 +185,7 @@ def test_further_bounces_come_on_top(max_bounces: int | None) -> None:
             ours,
             replicas=32,
             reference_variance=own_noise,
-            floor=0.01 if bounce == 3 else 0.0,
+            floor=0.01,
             share=0.2,
         )
 

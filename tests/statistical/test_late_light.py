@@ -243,6 +243,7 @@ def share_in_time(has_time_gate: bool) -> float:
     from nlosrender.engine.virtual_lights.vpls import rounds as further_bounces
 
     engine = with_options(stage.engine, has_time_gate=has_time_gate)
+    engine.further.shares_subpaths = False  # else all are kept, and not of the same light
     shares, vpl_contributions = [], further_bounces.vpl_contributions
 
     def recorded(plan: Any, params: Any, vpls: Any, *rest: Any) -> Any:

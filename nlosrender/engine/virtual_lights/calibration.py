@@ -10,6 +10,8 @@ import time
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from nlosrender.engine.interface import Budget
 from nlosrender.engine.launch.pilot_points import Pilot, pilot_of
 from nlosrender.engine.launch.schedule import DEFAULT_TARGET
@@ -39,12 +41,16 @@ def calibrated_lights(third: ThirdBounce, further: VplBounces | None, budget: Bu
         return replace(budget, patch_scale=patch_scale)
     goal, squares = tuning.rest_share_of_many * target, gathered.squares * (pilot.sensors.size / few.sensors.size)
     squares += device.exact_squares(pilot)
-    histogram = further.histogram(pilot, max(2, tuning.pilot_lanes // pilot.sensors.size // 2 * 2))
+    histogram = further.histogram(pilot, further.pilot_replicas(pilot.sensors.size))
     done, error = 0, math.inf
     while done < tuning.max_pilot_rounds and error > tuning.max_pilot_error * goal:
         further.accumulate(pilot, histogram, done)
         done += 1
-        error = histogram.relative_error(done, squares)
+        mixed = 0.0  # in the square of the sum of all bounces
+        if few is pilot and not device.options.bounces.split:
+            mean = histogram.on_host(histogram.statistics(done)[0])
+            mixed = 2 * float(np.einsum("csltb,csltb->", mean[..., :-1], gathered.values[..., :-1]))
+        error = histogram.relative_error(done, squares + mixed)
     share = further.share_of_third(gathered.n_patches, error * math.sqrt(done) / target)
     if share < tuning.third_shares[0]:
         patch_scale, _, of_third = _refined(third, few, share * target)

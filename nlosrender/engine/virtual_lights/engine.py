@@ -80,7 +80,8 @@ class VirtualLightEngine:
         self.further: VplBounces | None = None  # else ``paths``, where further bounces are asked for
         if has_vpls:
             masks = self.third.masks if self.settings.needs_visibility else None
-            self.further = VplBounces(device, self.tessellator, masks, self.settings.is_diffuse)
+            may_share = all_lambertian and mirror is None and capture.n_lasers == 1 and not self.settings.is_confocal
+            self.further = VplBounces(device, self.tessellator, masks, self.settings.is_diffuse, may_share)
         surfaces = "Lambertian" if self.settings.is_diffuse else "diffuse and rough"
         surfaces += " surfaces and a mirror" if mirror is not None else " surfaces"
         self.reason = f"{surfaces} before a {'planar' if built.wall.is_planar else 'curved'} wall"

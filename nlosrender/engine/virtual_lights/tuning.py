@@ -139,6 +139,16 @@ class VirtualLightTuning:
     # The same where surfaces are glossy: contributions cost more. CPU s times squared error of 4 rounds (1e-4) 27.7 /
     # 10.4 / 8.3 at 16 / 64 / 256 (bunny, principled), 23.7 / 10.9 / 8.0 (GGX 0.2).
     max_glossy_subpaths: int = 256
+    # Single-laser captures: VPLs that share subpaths, all replicas together, 1 to ``max_units`` times as many a round.
+    # Room 25 / 17 / 17, plates 3.5 / 2.5 / 2.6, bunny 370 / 246 / 187 at 1 / 4 / 8 units: large rounds err less.
+    sharing_vpls: int = 512
+    max_units: int = 8
+    # Subpaths of such a VPL, one per 8 sensor points. Room 18.9 / 18.3 / 19.0 at 128 / 192 / 256; before 64 x 64
+    # points 56 / 51 / 52, bunny 231 / 202 / 219 at 128 / 256 / 512.
+    max_shared_subpaths: int = 256
+    groups_at_once: int = 4  # of a replica: 256 histograms
+    max_histogram_values: int = 2**24  # of them together: 0.13 GB
+    histogram_cost: int = 16  # for a sensor point to add one, in patches: 0.2 us and 15 ns (room)
     max_contribution_values: int = 2**24  # of a round, times lasers: 0.3 GB
     max_rounds: int = 2**20  # of a target that is out of reach
 

@@ -49,7 +49,7 @@ class VplTable:
         masks: VisibilityMasks | None,
         wall_tiles: WallTiles,
     ) -> VplTable:
-        """Return the VPLs that any contribution leaves.
+        """Return the VPLs that any contribution leaves; all, where they share subpaths.
 
         Parameters
         ----------
@@ -62,8 +62,8 @@ class VplTable:
         masks, wall_tiles
             What may lie between wall and hidden surfaces; None: nothing may.
         """
-        used, starts = np.unique(contributions.vpls, return_index=True)
-        ends = np.append(starts[1:], contributions.count)
+        used = np.unique(contributions.vpls) if contributions.firsts is None else np.arange(len(vpls))
+        starts, ends = (np.searchsorted(contributions.vpls, used, side=side) for side in ("left", "right"))
         first = np.searchsorted(used, first_vpls)
         as_float = np.stack([starts, ends]).astype(np.uint32).view(np.float32)
         rows = np.zeros((len(used), 8), np.float32)
@@ -81,6 +81,55 @@ class VplTable:
         packed, first_vpl = on_device(mi.Float, rows.ravel()), on_device(mi.UInt32, first)
         interaction = None if contributions.directions is None else surface_at(built, vpls.select(used))
         return cls(packed, mi.Vector3f(to_points(offset)), shading, mask, first_vpl, interaction)
+
+
+@dataclass(frozen=True, eq=False)
+class VplConnection:
+    """The connection of each sensor point to a VPL."""
+
+    weight: mi.Spectrum  # radiance that the sensor point sends on per radiance of the VPL
+    direction: mi.Vector3f
+    distance: mi.Float
+    active: mi.Bool
+    first: mi.UInt32  # contribution of the VPL
+    end: mi.UInt32  # of its contributions; 0 where not active
+
+
+def connect_to_vpl(
+    params: LaunchParams,
+    needs_visibility: bool,
+    table: VplTable,
+    vpl: mi.UInt32,
+    tile: mi.UInt64,
+    mirror: FlatMirrors | None = None,
+) -> VplConnection:
+    """Connect sensor points to VPLs, by way of ``mirror``."""
+    built, sensor = params.built, params.sensors.interaction
+    at = dr.gather(mi.Vector4f, table.packed, vpl * 2)
+    by = dr.gather(mi.Vector4f, table.packed, vpl * 2 + 1)
+    position, areas = mi.Point3f(at.x, at.y, at.z), mi.Vector3f(by.x, by.y, by.z)
+    to_vpl = image_in(mirror, position) - sensor.p
+    distance2 = dr.squared_norm(to_vpl)
+    distance = dr.sqrt(distance2)
+    direction = to_vpl / distance
+    weight = built.wall_bsdf.eval(mi.BSDFContext(), sensor, sensor.to_local(direction))
+    facing = -dr.dot(turned_in(mirror, areas), direction)
+    if table.interaction is not None:
+        facing = dr.abs(facing)
+    weight *= dr.maximum(facing, 0) / distance2
+    active = dr.any(weight > 0)
+    if mirror is not None:
+        offset = dr.gather(mi.Vector3f, table.offset, vpl)
+        weight *= mirrored_share(built, mirror, sensor, position, offset, active)
+        active = dr.any(weight > 0)
+    elif needs_visibility:
+        mask = dr.gather(mi.UInt64, table.mask, vpl)
+        if table.interaction is not None:
+            mask = dr.select(dr.dot(areas, direction) < 0, mask, 0)
+        offset = dr.gather(mi.Vector3f, table.offset, vpl)
+        active = is_visible(built, sensor, to_vpl, offset, active, mask, tile)
+    first, end = dr.reinterpret_array(mi.UInt32, at.w), dr.reinterpret_array(mi.UInt32, by.w)
+    return VplConnection(weight, direction, distance, active, first, dr.select(active, end, 0))
 
 
 @dr.syntax
@@ -103,7 +152,7 @@ def gather_contributions(
     gathered by way of it instead. Contributions of ``NO_SLOT`` are left out.
     """
     built, sensors = params.built, params.sensors
-    sensor, wall_bsdf, context = sensors.interaction, built.wall_bsdf, mi.BSDFContext()
+    sensor, context = sensors.interaction, mi.BSDFContext()
     lane = dr.arange(mi.UInt32, shape.lanes)
     replica = lane // shape.sensors
     n_lasers = params.n_lasers
@@ -124,7 +173,6 @@ def gather_contributions(
             built,
             sensors,
             sensor,
-            wall_bsdf,
             end,
             own_laser,
             tile,
@@ -132,39 +180,17 @@ def gather_contributions(
         ],
     ):
         # ---- Connect to the VPL -------------------------------------------------------------------------------------
-        at = dr.gather(mi.Vector4f, table.packed, vpl * 2)
-        by = dr.gather(mi.Vector4f, table.packed, vpl * 2 + 1)
-        position, areas = mi.Point3f(at.x, at.y, at.z), mi.Vector3f(by.x, by.y, by.z)
-        to_vpl = image_in(mirror, position) - sensor.p
-        distance2 = dr.squared_norm(to_vpl)
-        distance = dr.sqrt(distance2)
-        direction = to_vpl / distance
-        weight = wall_bsdf.eval(context, sensor, sensor.to_local(direction))
-        facing = -dr.dot(turned_in(mirror, areas), direction)
-        if dr.hint(table.interaction is not None, mode="scalar"):
-            facing = dr.abs(facing)
-        weight *= dr.maximum(facing, 0) / distance2
-        active = dr.any(weight > 0)
-        if dr.hint(mirror is not None, mode="scalar"):
-            offset = dr.gather(mi.Vector3f, table.offset, vpl)
-            weight *= mirrored_share(built, mirror, sensor, position, offset, active)
-            active = dr.any(weight > 0)
-        elif dr.hint(needs_visibility, mode="scalar"):
-            mask = dr.gather(mi.UInt64, table.mask, vpl)
-            if dr.hint(table.interaction is not None, mode="scalar"):
-                mask = dr.select(dr.dot(areas, direction) < 0, mask, 0)
-            offset = dr.gather(mi.Vector3f, table.offset, vpl)
-            active = is_visible(built, sensor, to_vpl, offset, active, mask, tile)
+        connection = connect_to_vpl(params, needs_visibility, table, vpl, tile, mirror)
+        weight, direction = connection.weight, connection.direction
 
         # ---- Deposit its contributions ------------------------------------------------------------------------------
-        delay = distance * scale + sensors.delay_fraction
+        delay = connection.distance * scale + sensors.delay_fraction
         si: mi.SurfaceInteraction3f | None = None
         si = sensor  # not read
         if dr.hint(table.interaction is not None, mode="scalar"):
             si = dr.gather(mi.SurfaceInteraction3f, table.interaction, vpl)
             si.wi = si.to_local(-direction)
-        contribution = dr.reinterpret_array(mi.UInt32, at.w)
-        last = dr.select(active, dr.reinterpret_array(mi.UInt32, by.w), 0)
+        contribution, last = connection.first, connection.end
         while dr.hint(
             contribution < last,
             exclude=[

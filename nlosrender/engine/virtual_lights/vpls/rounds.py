@@ -20,13 +20,29 @@ from nlosrender.engine.launch.device_arrays import on_device
 from nlosrender.engine.launch.device_capture import DeviceCapture
 from nlosrender.engine.launch.energy_contrasts import RoundContrasts
 from nlosrender.engine.launch.histogram import DeviceHistogram, Histogram, HistogramShape
+from nlosrender.engine.launch.launch_params import LaunchParams
 from nlosrender.engine.launch.passes import Passes, PassSize, Snapshot
 from nlosrender.engine.launch.pilot_points import Pilot, spread
 from nlosrender.engine.launch.wall_points import laser_points
 from nlosrender.engine.virtual_lights.visibility.masks import VisibilityMasks, WallTiles
 from nlosrender.engine.virtual_lights.vpls.gather import NO_SLOT, VplTable, gather_contributions
+from nlosrender.engine.virtual_lights.vpls.light_histograms import (
+    GROUP,
+    PARTS,
+    BlockSums,
+    LightHistograms,
+    SharedContributions,
+    VplReceivers,
+    deposit_shared,
+    gather_histograms,
+)
 from nlosrender.engine.virtual_lights.vpls.sampler import Vpls, VplSampler
-from nlosrender.engine.virtual_lights.vpls.subpaths import ProposalLasers, SubpathPlan, vpl_contributions
+from nlosrender.engine.virtual_lights.vpls.subpaths import (
+    ProposalLasers,
+    SubpathPlan,
+    VplContributions,
+    vpl_contributions,
+)
 
 if TYPE_CHECKING:
     from nlosrender.engine.virtual_lights.elements.tessellator import Tessellator
@@ -45,10 +61,17 @@ class VplBounces:
         Tell what may lie between wall and hidden surfaces; None: nothing may.
     is_diffuse
         Whether all surfaces are Lambertian.
+    may_share
+        Whether VPLs may share subpaths: one laser, and the wall is Lambertian, too.
     """
 
     def __init__(
-        self, device: DeviceCapture, tessellator: Tessellator, masks: VisibilityMasks | None, is_diffuse: bool
+        self,
+        device: DeviceCapture,
+        tessellator: Tessellator,
+        masks: VisibilityMasks | None,
+        is_diffuse: bool,
+        may_share: bool = False,
     ):
         self.device, self.masks = device, masks
         self.built, self.options = device.built, device.options
@@ -77,22 +100,31 @@ class VplBounces:
         )
         most = tuning.max_subpaths if is_diffuse else tuning.max_glossy_subpaths
         self.subpaths = int(min(max(pairs / 32, tuning.min_subpaths), most))
+        self.max_units = 1  # of ``vpls_per_round`` VPLs, in one round
+        # of few sensor points every replica has few VPLs
+        has_groups = GROUP * self.options.replicas <= tuning.sharing_vpls * tuning.max_units
+        self.shares_subpaths = may_share and has_groups and self._groups_in_memory(self.options.replicas) > 0
+        if self.shares_subpaths:
+            self.vpls_per_round, self.max_units = tuning.sharing_vpls, tuning.max_units
+            self.subpaths = int(min(max(pairs / 8, tuning.min_subpaths), tuning.max_shared_subpaths))
 
     @cached_property
     def sampler(self) -> VplSampler:
         """Sampler of VPL positions; made when it is needed, for it holds all elements."""
         return VplSampler(self.tessellator, self.device.capture_gate, self.device.lone_mirror)
 
-    def plan(self, replicas: int) -> SubpathPlan:
+    def plan(self, replicas: int, units: int = 1) -> SubpathPlan:
         """Return the numbers of a round of ``replicas`` independent sets of VPLs."""
-        vpls = max(self.vpls_per_round // replicas, 16)
+        vpls = max(units * self.vpls_per_round // replicas, 16)
+        if self.shares_subpaths:
+            vpls = math.ceil(vpls / GROUP) * GROUP
         max_bounces = self.options.bounces.max_bounces
         confocal, capture_gate = self.is_confocal, self.device.capture_gate
         return SubpathPlan(
             replicas,
             vpls,
             self.subpaths,
-            self.contributions_per_vpl,
+            None if self.shares_subpaths else self.contributions_per_vpl,
             max_bounces,
             confocal,
             self.proposal_sensors,
@@ -102,7 +134,11 @@ class VplBounces:
     @property
     def contributions_per_round(self) -> int:
         """Contributions that every sensor point receives per round, at most."""
-        return self.vpls_per_round * self.contributions_per_vpl
+        return self.vpls_per_round * (self.subpaths if self.shares_subpaths else self.contributions_per_vpl)
+
+    def pilot_replicas(self, sensors: int) -> int:
+        """Return the replicas of a pilot of so many sensor points; groups that share must be as in the render."""
+        return self.options.replicas if self.shares_subpaths else max(2, self.tuning.pilot_lanes // sensors // 2 * 2)
 
     def share_of_third(self, patches: int, noise: float) -> float:
         """Return the one of ``third_shares`` that takes the fewest rays in all (docs/virtual-lights.md, 8).
@@ -119,6 +155,8 @@ class VplBounces:
             tuning.third_shares,
             self.vpls_per_round * (1 + self.contributions_per_vpl * self.is_confocal),
         )
+        if self.shares_subpaths:
+            rays_per_round *= tuning.histogram_cost
 
         def rays(share: float) -> float:
             finer = patches * (shares[0] / share) ** (4 / 3)
@@ -136,9 +174,12 @@ class VplBounces:
 
     def histogram(self, batch: Batch | Pilot, replicas: int) -> DeviceHistogram:
         """Return an empty histogram of a batch: bounce slots from the fourth bounce on."""
+        return DeviceHistogram(replace(self.device.shape(batch, self._n_slots), replicas=replicas))
+
+    @property
+    def _n_slots(self) -> int:
         bounces = self.options.bounces
-        slots = bounces.n_slots - bounces.slot(THIRD_BOUNCE + 1) if bounces.split else 1
-        return DeviceHistogram(replace(self.device.shape(batch, slots), replicas=replicas))
+        return bounces.n_slots - bounces.slot(THIRD_BOUNCE + 1) if bounces.split else 1
 
     def render(self, batch: Batch, budget: Budget, passes: Passes, known_squares: float = 0.0) -> Histogram:
         """Render bounces 2 and 4 and up of a batch; see ``SupplementaryEngine.render``."""
@@ -146,22 +187,24 @@ class VplBounces:
         histogram = self.histogram(batch, self.options.replicas)
         grid = self.device.capture.sensor_grid
         contrasts = RoundContrasts(histogram, self.device.sensor_indices(batch), (grid.nx, grid.ny))
-        done, skipped, before = 0, 0, 0.0
+        done, skipped, units, before = 0, 0, 1, 0.0
         if (earlier := passes.resumed("sums")) is not None:
             histogram.sums = on_device(mi.Float64, earlier.arrays["sums"])
             contrasts.restore(earlier.arrays["contrasts"], earlier.arrays["grouped"], earlier.numbers["groups"])
-            done, skipped, before = (earlier.numbers[name] for name in ("done", "skipped", "seconds"))
+            done, skipped, units, before = (earlier.numbers[name] for name in ("done", "skipped", "units", "seconds"))
         begun, share = time.perf_counter() - before, 0.0
 
         def report_progress(skipped: int) -> None:
-            numbers = {"done": done, "skipped": skipped, "seconds": time.perf_counter() - begun}
+            numbers = {"done": done, "skipped": skipped, "units": units, "seconds": time.perf_counter() - begun}
             numbers["groups"] = contrasts.groups
             saved = {"contrasts": contrasts.sums, "grouped": contrasts.grouped}
             passes.between(share, lambda: Snapshot({"sums": histogram.sums.numpy()} | saved, numbers))
 
         while True:
-            self.accumulate(batch, histogram, done, report_progress, skipped)
-            done, skipped = done + 1, 0
+            if not skipped:
+                units = self._units(budget, done, time.perf_counter() - begun)
+            self.accumulate(batch, histogram, done, report_progress, skipped, units)
+            done, skipped = done + units, 0
             if budget.rounds is not None:
                 share = done / budget.rounds
             else:
@@ -175,6 +218,13 @@ class VplBounces:
                 break
             report_progress(0)
         return self._result(batch, histogram, contrasts, done)
+
+    def _units(self, budget: Budget, done: int, seconds: float) -> int:
+        """Return the units of the next round: all that are left, as many as before, or fewer if time is short."""
+        left = done if budget.rounds is None else budget.rounds - done
+        if budget.rounds is None and budget.time_limit_s is not None:
+            left = int(done * min(budget.time_limit_s / max(seconds, 1e-9) - 1, 1))
+        return min(max(left, 1), self.max_units)
 
     def _result(self, batch: Batch, histogram: DeviceHistogram, contrasts: RoundContrasts, done: int) -> Histogram:
         bounces, scale = self.options.bounces, self.device.scale
@@ -194,20 +244,23 @@ class VplBounces:
         number: int,
         report_progress: Callable[[int], None] = lambda done: None,
         skipped: int = 0,
+        units: int = 1,
     ) -> None:
-        """Add round ``number`` to ``histogram``; a round is the same for every batch of a capture.
+        """Add a round to ``histogram``, the same for every batch of a capture, ``units`` times what it estimates.
 
         Parameters
         ----------
         batch, histogram, number
-            What is rendered, where to; which round.
+            What is rendered, where to; units of the rounds before.
         report_progress
             Called between kernels with the number of VPLs that every replica is done with.
         skipped
             VPLs that every replica is done with already.
+        units
+            Size of the round: VPLs of one round are stratified, and the error falls faster than with their number.
         """
         shape = histogram.shape
-        plan = self.plan(shape.replicas)
+        plan = self.plan(shape.replicas, units)
         if self.sampler.is_empty:
             return
         state = np.random.SeedSequence([self.options.seed, number]).generate_state(2)
@@ -218,9 +271,14 @@ class VplBounces:
         contributions = vpl_contributions(plan, params, vpls, self.proposal_lasers, int(state[1]), mirror)
         if not contributions.count:
             return
+        vpls = replace(vpls, areas=vpls.areas * units)
         wall_tiles = WallTiles.of(self.built, self.device.capture, batch)
         first_vpls = np.arange(plan.replicas + 1) * plan.vpls
         table = VplTable.of(self.built, vpls, first_vpls, contributions, self.masks, wall_tiles)
+        if self.shares_subpaths:
+            views = params, self.masks is not None, wall_tiles, table
+            self._add_shared(views, vpls, contributions, plan, histogram, report_progress, skipped, int(state[1]))
+            return
         # straight, and by way of the mirror one bounce later
         by_mirrors = [None] if mirror is None else [None, mirror]
         ways = [(self._slots(contributions.bounces + more, shape), by) for more, by in enumerate(by_mirrors)]
@@ -241,6 +299,57 @@ class VplBounces:
             done += steps
             if done < longest:
                 report_progress(done)
+
+    def _add_shared(
+        self,
+        scene: tuple[LaunchParams, bool, WallTiles, VplTable],
+        vpls: Vpls,
+        contributions: VplContributions,
+        plan: SubpathPlan,
+        histogram: DeviceHistogram,
+        report_progress: Callable[[int], None],
+        skipped: int,
+        seed: int,
+    ) -> None:
+        """Add VPLs that share subpaths, in chunks that are the same for every batch (docs/virtual-lights.md, 7.7)."""
+        (params, needs_visibility, *_), shape = scene, histogram.shape
+        receivers = VplReceivers.of(self.built, vpls)
+        shared = SharedContributions.of(self.built, receivers, contributions, needs_visibility)
+        lowest = dr.opaque(mi.UInt32, THIRD_BOUNCE + 1)
+        chunk = GROUP * min(self.tuning.groups_at_once, self._groups_in_memory(plan.replicas))
+        for begin in range(skipped, plan.vpls, chunk):
+            size = min(chunk, plan.vpls - begin)
+            numbers = np.arange(plan.replicas)[:, None] * plan.vpls + begin + np.arange(size)
+            index = on_device(mi.UInt32, numbers.ravel())
+            chosen = dr.gather(VplReceivers, receivers, index)
+            dr.eval(chosen)
+            sums = DeviceHistogram(
+                HistogramShape(1, numbers.size, 1, shape.slots, shape.channels, self._bins_of_vpls * PARTS)
+            )
+            deposit_shared(chosen, index, shared, params.bins_per_unit, lowest, sums)
+            dr.eval(sums.sums)
+            light = LightHistograms.of(sums, np.random.default_rng([seed, begin]))
+            first, block_sums = on_device(mi.UInt32, np.repeat(numbers[:, 0], shape.sensors)), BlockSums(shape)
+            gather_histograms(*scene, first, size, light, block_sums)
+            block_sums.add_to(histogram)
+            if begin + size < plan.vpls:
+                report_progress(begin + size)
+
+    @property
+    def _bins_of_vpls(self) -> int:
+        """Bins of a VPL's histogram: later light falls behind the window, whatever the sensor point.
+
+        Whole windows: another start of the window need not be another kernel.
+        """
+        capture, time_axis = self.device.capture, self.device.time_axis
+        legs = capture.sensor_legs.min() + capture.laser_legs.min()
+        before = math.ceil((time_axis.start_opl - legs) / time_axis.bin_width_opl) + 2
+        return max(1, 1 + math.ceil(before / time_axis.n_bins)) * time_axis.n_bins
+
+    def _groups_in_memory(self, replicas: int) -> int:
+        """Return how many groups of VPLs of every replica have histograms that memory holds."""
+        values = GROUP * replicas * self._bins_of_vpls * PARTS * self._n_slots * self.options.channels
+        return self.tuning.max_histogram_values // values
 
     def _slots(self, bounces: mi.UInt32, shape: HistogramShape) -> mi.UInt32:
         """Return the slots of contributions; ``NO_SLOT`` for bounces that are not rendered here."""

@@ -72,6 +72,15 @@ class ProposalLasers:
 
 
 @dataclass(eq=False)  # not frozen: the state of a loop
+class FirstHit:
+    """Where subpaths met their first surface; one lane per subpath."""
+
+    position: mi.Point3f  # moved off the surface, see ``offset_origin``
+    normal: mi.Normal3f  # geometric
+    shading: mi.Normal3f
+
+
+@dataclass(eq=False)  # not frozen: the state of a loop
 class SubpathVertex:
     """One vertex of every subpath, chosen in proportion to the light it is expected to bring; one lane per subpath."""
 
@@ -85,6 +94,7 @@ class SubpathVertex:
     expected: mi.Float  # light expected of it
     interaction: mi.SurfaceInteraction3f | None  # None: all surfaces are Lambertian
     by_mirror: mi.Bool  # the connection is by way of the mirror
+    first: FirstHit | None = None  # of subpaths that VPLs share
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,6 +116,8 @@ class VplContributions:
     # Of surfaces that are not Lambertian, whose BSDF ``values`` leave out; else None. (count,)
     directions: mi.Vector3f | None = None  # to where the light comes from, in the VPL's frame
     interaction: mi.SurfaceInteraction3f | None = None  # at the ends, in confocal captures
+    # (count,) of subpaths that VPLs share: ``values`` and ``delays`` end there; else None
+    firsts: FirstHit | None = None
 
 
 @dr.syntax
@@ -120,6 +132,8 @@ def trace_subpaths(
     time_gate: TimeGate | None,
     randomness: LaneRandomness,
     mirror: FlatMirrors | None,
+    *,
+    keeps_first: bool,
 ) -> tuple[SubpathVertex, mi.Float]:
     """Trace one subpath per lane from ``vpls`` until roulette, escape or ``max_bounces`` (None: no limit) ends it.
 
@@ -142,7 +156,8 @@ def trace_subpaths(
     bounce = mi.UInt32(FIRST_BOUNCE + 1)  # of a connection from the last vertex
     nowhere = None if is_diffuse else dr.zeros(mi.SurfaceInteraction3f)
     none = mi.Normal3f(0), mi.Normal3f(0), wall, mi.Spectrum(0), mi.Float(0), mi.UInt32(0), mi.Float(0)
-    vertex = SubpathVertex(mi.Point3f(0), *none, nowhere, mi.Bool(False))
+    first = FirstHit(mi.Point3f(0), mi.Normal3f(0), mi.Normal3f(0)) if keeps_first else None
+    vertex = SubpathVertex(mi.Point3f(0), *none, nowhere, mi.Bool(False), first)
     total = mi.Float(0)  # light expected of all vertices so far
     if mirror is not None:  # what VPLs on a planar wall receive by way of it, patches of hidden surfaces do not tell
         vertex = dr.select((vpls.shape == wall) & built.wall.is_planar, _on_wall(vpls, reflectance), vertex)
@@ -156,6 +171,10 @@ def trace_subpaths(
         alive = alive & si.is_valid()
         opl += dr.norm(si.p - origin)
         bounce += 1
+        if dr.hint(keeps_first, mode="scalar"):
+            position = mi.Point3f(offset_origin(built, si, mi.Vector3f(si.sh_frame.n)))
+            hit = FirstHit(position, si.n, mi.Normal3f(si.sh_frame.n))
+            first = dr.select(bounce == FIRST_BOUNCE + 2, hit, first)
 
         # ---- Roulette for what comes after the time window, once a subpath ------------------------------------------
         alive, is_past_gate, throughput = time_gate_roulette(
@@ -190,7 +209,7 @@ def trace_subpaths(
         total += lit
         pick = (lit > 0) & (generator.next_float32(alive) * total < lit)
         straight, shading, interaction = mi.Bool(False), mi.Normal3f(si.sh_frame.n), None if is_diffuse else si
-        found = SubpathVertex(si.p, si.n, shading, si.shape, leaving, opl, bounce, lit, interaction, straight)
+        found = SubpathVertex(si.p, si.n, shading, si.shape, leaving, opl, bounce, lit, interaction, straight, first)
         vertex = dr.select(pick, found, vertex)
         if dr.hint(mirror is not None, mode="scalar"):
             lit = dr.select(front, proposal_lasers.light(built, leaving, si.p, si.sh_frame.n, mirror), 0)
@@ -233,7 +252,7 @@ class SubpathPlan:
     replicas: int  # independent sets of VPLs
     vpls: int  # per round and replica
     subpaths: int  # per VPL
-    contributions: int  # kept per VPL, on average
+    contributions: int | None  # kept per VPL, on average; None: all, and VPLs share them
     max_bounces: int | None
     is_confocal: bool
     sensors: Float64 | None  # (k, 3) some sensor points; None: all surfaces are Lambertian
@@ -260,7 +279,9 @@ def vpl_contributions(
     square = mi.Point2f(mi.Float(randomness.sequence[0] >> 8), mi.Float(randomness.sequence[1] >> 8)) * 2.0**-24
     direction, from_vpl = mi.warp.square_to_cosine_hemisphere(square), dr.gather(mi.SurfaceInteraction3f, surface, vpl)
     is_diffuse = plan.sensors is None
-    if plan.sensors is None:
+    if plan.contributions is None:
+        reflectance = mi.Spectrum(1)
+    elif plan.sensors is None:
         reflectance = normal_reflectance(surface)
         dr.eval(reflectance)
         reflectance = dr.gather(mi.Spectrum, reflectance, vpl)
@@ -282,12 +303,19 @@ def vpl_contributions(
         time_gate,
         randomness,
         mirror,
+        keeps_first=plan.contributions is None,
     )
     dr.eval(ends, expected)
-    subpath, copies, share = _resample(expected.numpy(), vpls, plan, np.random.default_rng(seed))
+    light = expected.numpy()
+    if plan.contributions is None:
+        subpath = np.flatnonzero(light > 0)
+        scales = light[subpath] / plan.subpaths
+    else:
+        subpath, copies, share = _resample(light, vpls, plan, plan.contributions, np.random.default_rng(seed))
+        scales = copies * share
     if not len(subpath):
         return no_contributions()
-    end, scale = on_device(mi.UInt32, subpath), on_device(mi.Float, copies * share)
+    end, scale = on_device(mi.UInt32, subpath), on_device(mi.Float, scales)
     n_lasers = 1 if plan.is_confocal else params.lasers_per_lane
     values, delays, lit = (
         _unconnected(params, ends, end, scale) if plan.is_confocal else _connect(params, ends, end, scale, mirror)
@@ -310,17 +338,23 @@ def vpl_contributions(
         direction = dr.gather(mi.Vector3f, direction, end)
         density = dr.gather(mi.Float, response, end) * dr.abs(direction.z) * dr.inv_pi
         values *= dr.gather(mi.Float, dr.rcp(density), index % per_laser)
+    delays, firsts = dr.gather(mi.Float, delays, entry), None
+    if plan.contributions is None:
+        firsts = dr.gather(FirstHit, ends.first, end)
+        own = dr.gather(mi.Point3f, surface.p, on_device(mi.UInt32, chosen // plan.subpaths))
+        delays -= dr.norm(firsts.position - own) * params.bins_per_unit
     contributions = VplContributions(
         count=n_kept,
         vpls=chosen // plan.subpaths,
         bounces=dr.gather(mi.UInt32, ends.bounce, end),
         values=values,
-        delays=dr.gather(mi.Float, delays, entry),
+        delays=delays,
         ends=si.p,
         shading=shading,
         offset=mi.Vector3f(offset_origin(built, si, shading) - si.p),
         directions=None if is_diffuse else direction,
         interaction=si if plan.is_confocal and not is_diffuse else None,
+        firsts=firsts,
     )
     dr.eval(contributions)
     return contributions
@@ -363,15 +397,16 @@ def _surface_of(ends: SubpathVertex, index: mi.UInt32) -> mi.SurfaceInteraction3
 
 
 def _resample(
-    expected: NDArray[np.float32], vpls: Vpls, plan: SubpathPlan, generator: np.random.Generator
+    expected: NDArray[np.float32], vpls: Vpls, plan: SubpathPlan, kept: int, generator: np.random.Generator
 ) -> tuple[NDArray[np.int64], Float64, Float64]:
     """Choose subpaths in proportion to what they bring to the sensor points, by systematic resampling along the VPLs.
 
-    Returns subpaths (n,) ascending, how often each was chosen, and a choice's value: radiance per expected light.
+    ``kept`` per VPL. Returns subpaths (n,) ascending, how often each was chosen, and a choice's value: radiance per
+    expected light.
     """
     importance = np.repeat(vpls.importance, plan.subpaths)
     weights = expected.astype(np.float64) * importance
-    per_replica, count = plan.vpls * plan.subpaths, plan.contributions * plan.vpls
+    per_replica, count = plan.vpls * plan.subpaths, kept * plan.vpls
     subpaths, copies, shares = [np.zeros(0, np.int64)], [np.zeros(0)], [np.zeros(0)]
     for replica in range(plan.replicas):
         cumulative = np.cumsum(weights[replica * per_replica : (replica + 1) * per_replica])
