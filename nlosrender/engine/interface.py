@@ -180,7 +180,12 @@ class Engine(Protocol):
 
 
 class SupplementaryEngine(Engine, Protocol):
-    """An engine that adds its bounces to those of another one."""
+    """An engine that adds its bounces to those of another one.
+
+    ``only_specular``, set before the first use: of these only light that a delta lobe has reflected or let through.
+    """
+
+    only_specular: bool
 
     def calibrate(self, budget: Budget, seconds: float = math.inf, known_squares: float = 0.0) -> Budget:
         """Calibrate as ``Engine.calibrate``, with ``known_squares`` as for ``render`` over the pilot's points."""

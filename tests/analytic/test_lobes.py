@@ -92,6 +92,12 @@ LOBES: dict[str, dict[str, Any]] = {
         "first": {"type": "diffuse", "reflectance": 0.5},
         "second": {"type": "roughconductor", "alpha": 0.2},
     },
+    "half a mirror": {
+        "type": "blendbsdf",
+        "weight": 0.5,
+        "first": {"type": "diffuse", "reflectance": 0.5},
+        "second": {"type": "conductor"},
+    },
     "two sides": {"type": "twosided", "bsdf": {"type": "roughconductor", "alpha": 0.3}},
 }
 
@@ -159,9 +165,12 @@ def facing_plates(bsdf: dict[str, Any], *, turned: bool) -> tuple[dict[str, Any]
     return tuple({"type": "rectangle", "bsdf": bsdf} | place for place in (first, second))
 
 
-FURTHER = [("principled", "single", False), ("two sides", "confocal", True)]
+FURTHER = [("plastic", "single", False), ("two sides", "confocal", True)]
 FURTHER_SLOWLY = [
+    ("principled", "single", False),
     ("two sides", "single", True),
+    ("half a mirror", "confocal", False),
+    ("half a mirror", "exhaustive", False),
     ("brushed metal", "confocal", False),
     ("blend", "exhaustive", False),
     ("rough plastic", "exhaustive", False),

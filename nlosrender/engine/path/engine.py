@@ -51,6 +51,8 @@ class PathEngine:
         Why this engine renders the scene, in plain words.
     tuning
         Its numbers.
+    only_specular
+        Whether to compute only what delta lobes reflect or let through, for engines that know the rest.
     """
 
     name = "path"
@@ -61,7 +63,10 @@ class PathEngine:
         first_bounce: int = THIRD_BOUNCE,
         reason: str = "asked for",
         tuning: PathTuning = DEFAULT_TUNING,
+        *,
+        only_specular: bool = False,
     ):
+        self.only_specular = only_specular
         self.device, self.first_bounce, self.reason, self.tuning = device, first_bounce, reason, tuning
         self.built, self.capture, self.time_axis = device.built, device.capture, device.time_axis
         self.options, self.sampler = device.options, device.sampler
@@ -95,6 +100,7 @@ class PathEngine:
             needs_visibility=not nothing_occludes(self.built),
             has_transmission=any(bool(flag & mi.BSDFFlags.Transmission) for flag in flags),
             is_plain_diffuse=is_plain_diffuse(self.built),
+            only_specular=self.only_specular,
             has_mirrors=bool(self.mirrors),
             # with a mirrored spot every path adds what its sensor point sees of it
             max_tries=0 if has_spot and self.mirrors else self.tuning.max_tries,

@@ -119,6 +119,7 @@ def trace_paths(
     opl = mi.Float(0)  # optical path length from the sensor point [engine units]
     medium = mi.Float(1)  # refractive index along the ray
     is_past_gate = mi.Bool(False)  # the path can only bring light after the window, and has survived that roulette
+    is_specular = mi.Bool(False)  # a delta lobe is on the path
 
     # excluded: arrays that the loop reads but does not change
     while dr.hint(
@@ -141,7 +142,10 @@ def trace_paths(
         # ---- Connect to the lasers and deposit ----------------------------------------------------------------------
         if dr.hint(settings.laser_sampling, mode="scalar"):
             lit_vertex = PathVertex(there.si, way.origin, there.leg, opl, throughput, bounce)
-            connect_to_lasers(settings, params, histogram, generator, lit_vertex, hit & settings.is_deposited(bounce))
+            is_deposited = hit & settings.is_deposited(bounce)
+            if dr.hint(settings.only_specular, mode="scalar"):
+                is_deposited &= is_specular
+            connect_to_lasers(settings, params, histogram, generator, lit_vertex, is_deposited)
             connect_by_mirrors(settings, params, histogram, generator, lit_vertex, hit)
 
         # ---- Continue, or start the next path -----------------------------------------------------------------------
@@ -190,6 +194,8 @@ def trace_paths(
             )
             alive &= ~misses
         medium *= eta
+        if dr.hint(settings.only_specular, mode="scalar"):
+            is_specular = (is_specular & ~start) | way.is_delta
 
         # ---- Stop ---------------------------------------------------------------------------------------------------
         if dr.hint(settings.goes_on and settings.russian_roulette, mode="scalar"):

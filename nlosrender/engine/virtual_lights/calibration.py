@@ -22,19 +22,24 @@ if TYPE_CHECKING:
     from nlosrender.engine.virtual_lights.vpls.rounds import VplBounces
 
 
-def calibrated_lights(third: ThirdBounce, further: VplBounces | None, budget: Budget, *, is_alone: bool) -> Budget:
+MOST_OF_THIRD = 0.7  # of the squares that third bounce and VPLs share
+
+
+def calibrated_lights(
+    third: ThirdBounce, further: VplBounces | None, budget: Budget, *, share_squares: float
+) -> Budget:
     """Return ``budget`` with patch scale and rounds for its target error, or the patch scale for its time limit.
 
-    ``is_alone``: whether the third bounce is the highest that is asked for. ``further`` is None there, and where paths
-    give the further bounces.
+    ``further`` is None where the third bounce is the highest that is asked for. ``share_squares``: part of the target's
+    square that both may use.
     """
     device, tuning = third.device, third.tuning
     pilot, target = pilot_of(device.capture), budget.target_error or DEFAULT_TARGET
-    share = tuning.third_share_alone if is_alone else tuning.third_share_of_many
+    share = tuning.third_share_alone if further is None else tuning.third_share_of_many
     if budget.time_limit_s is not None:
         return replace(budget, patch_scale=_patch_scale_in_time(third, budget.time_limit_s, share * target))
     if further is not None:
-        share = tuning.third_shares[0]
+        share = max(share for share in tuning.third_shares if share**2 < share_squares * MOST_OF_THIRD)
     few = _pilot_of_patches(third, pilot)
     patch_scale, gathered, of_third = _refined(third, few, share * target)
     if further is None:
@@ -51,11 +56,12 @@ def calibrated_lights(third: ThirdBounce, further: VplBounces | None, budget: Bu
             mean = histogram.on_host(histogram.statistics(done)[0])
             mixed = 2 * float(np.einsum("csltb,csltb->", mean[..., :-1], gathered.values[..., :-1]))
         error = histogram.relative_error(done, squares + mixed)
-    share = further.share_of_third(gathered.n_patches, error * math.sqrt(done) / target)
-    if share < tuning.third_shares[0]:
+    finer = further.share_of_third(gathered.n_patches, share, share_squares, error * math.sqrt(done) / target)
+    if finer < share:
+        share = finer
         patch_scale, _, of_third = _refined(third, few, share * target)
     # patches come in steps: what they leave of their share is spent on rounds
-    left = math.sqrt(tuning.share_squares - min(share, of_third / target) ** 2) * target
+    left = math.sqrt(share_squares - min(share, of_third / target) ** 2) * target
     rounds = further.rounds_needed(error, done, left)
     return replace(budget, patch_scale=patch_scale, rounds=rounds)
 

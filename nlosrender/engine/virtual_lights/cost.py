@@ -100,10 +100,9 @@ def _light_seconds(engine: VirtualLightEngine, plan: Plan, pilot: Batch, calibra
         return per_batch * len(plan.batches) + per_point * sensor_visits(engine.capture, plan, pilot)
 
     engine.third.gather(pilot, scale)  # compiles
-    if engine.traces_paths:
-        return extrapolated(lambda batch: engine.third.pair(batch, scale))
-    # all that a render does, with one round of VPLs; the other rounds add up
-    once = replace(calibrated, rounds=1, target_error=None, time_limit_s=None)
+    # all that a render does, with one round of VPLs and a path; the others add up
+    spp = 1 if engine.traces_paths else None
+    once = replace(calibrated, rounds=1, spp=spp, target_error=None, time_limit_s=None)
     engine.render(quarter, once)  # compiles
     seconds = extrapolated(lambda batch: engine.render(batch, once))
     further, rounds = engine.further, calibrated.rounds or 0

@@ -77,13 +77,18 @@ class VirtualLightEngine:
         self.tessellator = Tessellator(built, capture, bin_width, mirror=mirror, tuning=tuning)
         reciprocal = reciprocal and mirror is None
         self.third = ThirdBounce(device, self.tessellator, self.settings, lanes, reciprocal, mirror)
-        self.further: VplBounces | None = None  # else ``paths``, where further bounces are asked for
-        if has_vpls:
+        self.further: VplBounces | None = None  # where further bounces are asked for
+        self.traces_paths = self.has_further_bounces and not has_vpls  # for light of delta lobes
+        if self.has_further_bounces:
             masks = self.third.masks if self.settings.needs_visibility else None
-            may_share = all_lambertian and mirror is None and capture.n_lasers == 1 and not self.settings.is_confocal
-            self.further = VplBounces(device, self.tessellator, masks, self.settings.is_diffuse, may_share)
+            is_diffuse = self.settings.is_diffuse
+            may_share = all_lambertian and has_vpls and mirror is None and capture.n_lasers == 1
+            may_share = may_share and not self.settings.is_confocal
+            self.further = VplBounces(device, self.tessellator, masks, is_diffuse, may_share, with_delta=has_vpls)
+            paths.only_specular = self.traces_paths
         surfaces = "Lambertian" if self.settings.is_diffuse else "diffuse and rough"
         surfaces += " surfaces and a mirror" if mirror is not None else " surfaces"
+        surfaces += " (light of mirrors by paths)" if self.traces_paths else ""
         self.reason = f"{surfaces} before a {'planar' if built.wall.is_planar else 'curved'} wall"
         self._calibrated: dict[Budget, Budget] = {}
 
@@ -116,11 +121,6 @@ class VirtualLightEngine:
         return highest is None or highest > THIRD_BOUNCE
 
     @property
-    def traces_paths(self) -> bool:
-        """Whether paths give the further bounces."""
-        return self.has_further_bounces and self.further is None
-
-    @property
     def has_masks(self) -> bool:
         """Whether visibility masks save rays."""
         return self.settings.needs_visibility and self.third.masks.pay_off(self.capture.n_sensors)
@@ -150,12 +150,15 @@ class VirtualLightEngine:
         if budget.patch_scale is not None:
             return budget
         if budget not in self._calibrated:
-            calibrated = calibrated_lights(self.third, self.further, budget, is_alone=not self.has_further_bounces)
+            tuning = self.third.tuning
+            of_paths = tuning.specular_share if self.traces_paths else 0.0
+            of_lights = tuning.share_squares - of_paths**2
+            calibrated = calibrated_lights(self.third, self.further, budget, share_squares=of_lights)
             if self.traces_paths:
                 squares = self.third.gather(
                     pilot_of(self.capture), calibrated.patch_scale or self.third.tuning.coarsest_scale
                 ).squares
-                goal = self.third.tuning.rest_share_of_many * (budget.target_error or DEFAULT_TARGET)
+                goal = of_paths * (budget.target_error or DEFAULT_TARGET)
                 paths = self.paths.calibrate(replace(budget, target_error=goal), seconds, squares)
                 calibrated = replace(calibrated, spp=paths.spp)
             if math.isfinite(seconds):
@@ -176,11 +179,7 @@ class VirtualLightEngine:
         left = budget.time_limit_s
         if left is not None:
             left = max(0.0, left - (time.perf_counter() - begun))
-        rest, budget = passes.stage("further bounces", shared, 1), replace(budget, time_limit_s=left)
-        if self.has_further_bounces:
-            result = (self.further or self.paths).render(batch, budget, rest, fine.squares)
-        else:
-            result = self.device.histogram_without_samples(batch)
+        result = self._further_bounces(batch, replace(budget, time_limit_s=left), passes, shared, fine.squares)
         if self.misses_light:
             missed = self.third.tuning.missed_light
             np.add(result.variance, np.square(missed * result.mean), out=result.variance)
@@ -198,6 +197,25 @@ class VirtualLightEngine:
             result.variance[:, slot] += np.square(in_window, out=in_window)
             result.outside[:, slot] += third[:, number, ..., -1]
         result.refuse_not_finite()
+        return result
+
+    def _further_bounces(
+        self, batch: Batch, budget: Budget, passes: Passes, begin: float, known_squares: float
+    ) -> Histogram:
+        """Return the second bounce and those above the third; ``begin``: share of the work that is done."""
+        if self.further is None:
+            return self.device.histogram_without_samples(batch)
+        if not self.traces_paths:
+            return self.further.render(batch, budget, passes.stage("further bounces", begin, 1), known_squares)
+        end, left = 0.8, budget.time_limit_s
+        of_lights, of_paths = (None, None) if left is None else (end * left, (1 - end) * left)
+        rest = passes.stage("further bounces", begin, end)
+        result = self.further.render(batch, replace(budget, time_limit_s=of_lights), rest, known_squares)
+        rest = passes.stage("light of mirrors", end, 1)
+        specular = self.paths.render(batch, replace(budget, time_limit_s=of_paths), rest, known_squares)
+        for name in ("mean", "variance", "outside", "contrasts"):
+            total = getattr(result, name)
+            np.add(total, getattr(specular, name), out=total)
         return result
 
     def _slots(self, count: int) -> list[int]:
@@ -221,7 +239,7 @@ class VirtualLightEngine:
             yield OmittedWork("half of the pairs of laser and sensor points", why)
         if self.further is not None:
             yield from omitted_by_time_gate(self.device)
-        elif self.traces_paths:
+        if self.traces_paths:
             yield from self.paths.omitted_path_work()
 
     def shared_samples(self) -> str:

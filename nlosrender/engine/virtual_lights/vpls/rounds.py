@@ -49,7 +49,7 @@ if TYPE_CHECKING:
 
 
 class VplBounces:
-    """Bounces above the third of a scene without delta lobes.
+    """Bounces above the third, of light that no delta lobe sends to a sensor point.
 
     Parameters
     ----------
@@ -63,6 +63,8 @@ class VplBounces:
         Whether all surfaces are Lambertian.
     may_share
         Whether VPLs may share subpaths: one laser, and the wall is Lambertian, too.
+    with_delta
+        Whether subpaths go on by way of delta lobes, and exact light is added; otherwise another engine adds both.
     """
 
     def __init__(
@@ -72,8 +74,10 @@ class VplBounces:
         masks: VisibilityMasks | None,
         is_diffuse: bool,
         may_share: bool = False,
+        *,
+        with_delta: bool = True,
     ):
-        self.device, self.masks = device, masks
+        self.device, self.masks, self.with_delta = device, masks, with_delta
         self.built, self.options = device.built, device.options
         tuning = self.tuning = tessellator.tuning
         built, capture, time_axis = device.built, device.capture, device.time_axis
@@ -127,6 +131,7 @@ class VplBounces:
             None if self.shares_subpaths else self.contributions_per_vpl,
             max_bounces,
             confocal,
+            self.with_delta,
             self.proposal_sensors,
             capture_gate,
         )
@@ -140,13 +145,15 @@ class VplBounces:
         """Return the replicas of a pilot of so many sensor points; groups that share must be as in the render."""
         return self.options.replicas if self.shares_subpaths else max(2, self.tuning.pilot_lanes // sensors // 2 * 2)
 
-    def share_of_third(self, patches: int, noise: float) -> float:
+    def share_of_third(self, patches: int, largest: float, share_squares: float, noise: float) -> float:
         """Return the one of ``third_shares`` that takes the fewest rays in all (docs/virtual-lights.md, 8).
 
         Parameters
         ----------
         patches
-            That the largest share takes: their number goes with the error to the power of -4/3 where shadows decide.
+            That the ``largest`` share takes: their number goes with the error to the power of -4/3.
+        share_squares
+            Part of the target's square that third bounce and VPLs share.
         noise
             Error of one round over the target error.
         """
@@ -159,10 +166,10 @@ class VplBounces:
             rays_per_round *= tuning.histogram_cost
 
         def rays(share: float) -> float:
-            finer = patches * (shares[0] / share) ** (4 / 3)
-            return finer * 4 / 3 + rays_per_round * max(1, math.ceil(noise**2 / (tuning.share_squares - share**2)))
+            finer = patches * (largest / share) ** (4 / 3)
+            return finer * 4 / 3 + rays_per_round * max(1, math.ceil(noise**2 / (share_squares - share**2)))
 
-        return min(shares, key=rays)
+        return min((share for share in shares if share <= largest), key=rays)
 
     def rounds_needed(self, error: float, done: int, target: float) -> int:
         """Return how many rounds bring the ``error`` after ``done`` rounds to ``target``: it falls as 1 / sqrt(rounds).
@@ -234,7 +241,8 @@ class VplBounces:
         errors = contrasts.result(scale / (done * self.options.replicas), slots)
         mean, variance = (histogram.on_host(values) for values in statistics)
         result = Histogram.of_rows(mean, variance, done * self.contributions_per_round, errors)
-        self.device.add_exact_light(batch, result)
+        if self.with_delta:
+            self.device.add_exact_light(batch, result)
         return result
 
     def accumulate(

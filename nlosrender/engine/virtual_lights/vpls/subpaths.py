@@ -127,6 +127,7 @@ def trace_subpaths(
     direction: mi.Vector3f,
     reflectance: mi.Spectrum,
     is_diffuse: bool,
+    with_delta: bool,
     proposal_lasers: ProposalLasers,
     max_bounces: int | None,
     time_gate: TimeGate | None,
@@ -137,11 +138,13 @@ def trace_subpaths(
 ) -> tuple[SubpathVertex, mi.Float]:
     """Trace one subpath per lane from ``vpls`` until roulette, escape or ``max_bounces`` (None: no limit) ends it.
 
-    The first ``direction`` is one of the VPL's frame.
+    The first ``direction`` is one of the VPL's frame. ``with_delta``: whether delta lobes are sampled.
 
     Returns one vertex of each, and the light expected of all of them; by way of the scene's only ``mirror``, too.
     """
     scene, wall, context = built.scene, mi.ShapePtr(built.wall_shape), mi.BSDFContext()
+    if not with_delta:
+        context.type_mask = int(mi.BSDFFlags.All) & ~int(mi.BSDFFlags.Delta)
     generator = mi.PCG32(randomness.generator)
     gate_survival = 1.0 if time_gate is None else time_gate.survival
 
@@ -255,6 +258,7 @@ class SubpathPlan:
     contributions: int | None  # kept per VPL, on average; None: all, and VPLs share them
     max_bounces: int | None
     is_confocal: bool
+    with_delta: bool  # subpaths go on by way of delta lobes
     sensors: Float64 | None  # (k, 3) some sensor points; None: all surfaces are Lambertian
     capture_gate: CaptureTimeGate | None  # None: no light comes too late
 
@@ -298,6 +302,7 @@ def vpl_contributions(
         direction,
         reflectance,
         is_diffuse,
+        plan.with_delta,
         proposal_lasers,
         plan.max_bounces,
         time_gate,
