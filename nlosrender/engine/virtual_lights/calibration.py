@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 import time
 from dataclasses import replace
+from functools import cache
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -15,7 +16,7 @@ import numpy as np
 from nlosrender.engine.interface import Budget
 from nlosrender.engine.launch.pilot_points import Pilot, pilot_of
 from nlosrender.engine.launch.schedule import DEFAULT_TARGET
-from nlosrender.engine.virtual_lights.refinement import Gathered, estimated_error, finer_scale, refined_to
+from nlosrender.engine.virtual_lights.refinement import estimated_error, finer_scale, refined_to
 
 if TYPE_CHECKING:
     from nlosrender.engine.virtual_lights.third_bounce import ThirdBounce
@@ -41,7 +42,9 @@ def calibrated_lights(
     if further is not None:
         share = max(share for share in tuning.third_shares if share**2 < share_squares * MOST_OF_THIRD)
     few = _pilot_of_patches(third, pilot)
-    patch_scale, gathered, of_third = _refined(third, few, share * target)
+    gather = cache(lambda scale: third.gather(few, scale))  # a smaller share goes on from these
+    known_squares = device.exact_squares(few)
+    patch_scale, gathered, of_third = refined_to(share * target, third.tessellator, gather, known_squares)
     if further is None:
         return replace(budget, patch_scale=patch_scale)
     goal, squares = tuning.rest_share_of_many * target, gathered.squares * (pilot.sensors.size / few.sensors.size)
@@ -59,16 +62,11 @@ def calibrated_lights(
     finer = further.share_of_third(gathered.n_patches, share, share_squares, error * math.sqrt(done) / target)
     if finer < share:
         share = finer
-        patch_scale, _, of_third = _refined(third, few, share * target)
+        patch_scale, _, of_third = refined_to(share * target, third.tessellator, gather, known_squares)
     # patches come in steps: what they leave of their share is spent on rounds
     left = math.sqrt(share_squares - min(share, of_third / target) ** 2) * target
     rounds = further.rounds_needed(error, done, left)
     return replace(budget, patch_scale=patch_scale, rounds=rounds)
-
-
-def _refined(third: ThirdBounce, pilot: Pilot, target: float) -> tuple[float, Gathered, float]:
-    known_squares = third.device.exact_squares(pilot)
-    return refined_to(target, third.tessellator, lambda scale: third.gather(pilot, scale), known_squares)
 
 
 def _pilot_of_patches(third: ThirdBounce, pilot: Pilot) -> Pilot:

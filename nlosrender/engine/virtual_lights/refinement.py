@@ -8,7 +8,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cache
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -90,12 +89,11 @@ def refined_to(
     target
         Relative L2 error of the second and third bounce together.
     tessellator, gather
-        Count the patches of a scale, and gather them on a few points of the capture.
+        Count the patches of a scale, and gather them on a few points of the capture; asked again for the same scale.
     known_squares
         Sum of the squares of exact light at these points [(engine unit)^-4].
     """
     tuning = tessellator.tuning
-    gather = cache(gather)
     levels: list[tuple[int, float]] = []  # numbers of patches and their errors, coarse to fine
     patch_scale = finer_scale(tessellator, tuning.coarsest_scale, tuning.refinement)
     while True:
