@@ -184,8 +184,8 @@ def test_further_bounces_agree_on_every_lobe(name: str, scan: str, turned: bool)
     """VPLs and paths, bounce by bounce, in every sensor point's energy and in all of it."""
     plates = facing_plates(LOBES[name], turned=turned)
     common = {"scan": scan, "sensors": (3, 2), "bins": (0.8, 0.2, 20), "color": "grey", "max_bounces": 5}
-    lights = render(flat_wall(*plates, spp=None, engine="auto", target_error=0.03, **common))
-    paths = render(flat_wall(*plates, spp=2**14, **common))
+    lights = render(flat_wall(*plates, spp=None, engine="auto", target_error=0.06, **common))
+    paths = render(flat_wall(*plates, spp=2**13, **common))
     assert lights.samples > 0
     for bounce in (4, 5):
         energies = [result.bounce(bounce).sum(axis=-1) for result in (lights, paths)]
