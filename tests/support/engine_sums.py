@@ -52,6 +52,7 @@ def group_sums(lights: Repeated, paths: Repeated, slot: int, is_third: bool) -> 
     ours, theirs, stated = (
         rows(values[:, :, slot]) for values in (lights.means, paths.means, np.sqrt(lights.variances))
     )
+    relative = float(np.linalg.norm(stated) / np.linalg.norm(ours))  # L2, what is stated
     columns: list[tuple[Array, Array, float]] = []
     for row in range(ours.shape[1]):
         both = ours[:, row].mean(axis=0) + theirs[:, row].mean(axis=0)
@@ -60,8 +61,8 @@ def group_sums(lights: Repeated, paths: Repeated, slot: int, is_third: bool) -> 
         labels = grouped(both, SHARE)
         for chosen in [*(labels == label for label in range(labels.max() + 1)), labels >= 0]:
             value, other = ours[:, row, chosen].sum(axis=1), theirs[:, row, chosen].sum(axis=1)
-            # the third bounce is as good as it says itself, bin by bin
-            floor = 2 * stated[:, row, chosen].mean(axis=0).sum() if is_third else 0.0
+            # the third bounce is as good as it says itself, bin by bin; over all where resolutions agree by chance
+            floor = 2 * max(stated[:, row, chosen].mean(axis=0).sum(), relative * other.mean()) if is_third else 0.0
             columns.append((value, other, max(floor, FURTHER_FLOOR * other.mean())))
     return Sums(*(np.array(column).T for column in zip(*columns, strict=True)))
 
