@@ -334,7 +334,7 @@ def delta_lobes(bsdf: mi.BSDF) -> tuple[int, int]:
     if bsdf.class_name() != "BlendBSDF":
         return 0, 0
     shift = parts[0].component_count()
-    other = delta_lobes(parts[1])
+    other = delta_lobes(parts[-1])  # two that are equal are one object
     return front | other[0] << shift, back | other[1] << shift
 
 
