@@ -20,7 +20,7 @@ SHINY: Mapping[str, tuple[int, float, Mapping[str, Any]]] = {
     "plastic": (5, 0.02, {"type": "plastic", "diffuse_reflectance": 0.6}),
     "principled": (5, 0.02, {"type": "principled", "base_color": 0.6, "roughness": 0.3, "metallic": 0.5}),
     "mirror": (3, 0.01, {"type": "conductor", "material": "none"}),
-    "retroreflector": (3, 0.01, {"type": "retroreflector", "width": 2.0}),
+    "retroreflector": (3, 0.01, {"type": "retroreflector", "width": 2.0, "albedo": 0.5, "diffuse": 0.2}),
 }
 
 Truth = Literal["quadrature", "refined", "long run"]

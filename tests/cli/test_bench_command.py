@@ -18,7 +18,7 @@ from nlosrender.bench.rates import gather_rate
 from nlosrender.bench.references import Reference
 from nlosrender.bench.runs import Run, load
 from nlosrender.bench.scaling import write_wavy_sheet
-from nlosrender.bench.scenes import wavy_sheet
+from nlosrender.bench.scenes import built_in_scenes, wavy_sheet
 from nlosrender.cli.app import app
 
 TRUTH = np.random.default_rng(1).uniform(0.5, 1.5, (1, 10, 12, 400))  # (laser, row, column, bin)
@@ -156,6 +156,16 @@ def test_the_gather_and_the_rays_it_leaves_out_are_counted_alike(tmp_path):
     assert "pass the hidden geometry by" in box.what
     assert box.difference == 0
     assert mixture.difference > 0
+
+
+def test_every_scene_has_a_valid_configuration(tmp_path):
+    """Also those that need a mesh; another one stands in for the furniture, which takes seconds to write."""
+    write_wavy_sheet(tmp_path / "sheet.ply", 200)
+    write_wavy_sheet(tmp_path / "bench-furniture.ply", 200)
+    scenes = built_in_scenes(tmp_path / "sheet.ply", tmp_path)
+    assert len(scenes) == 14
+    for scene in scenes.values():
+        scene.config()
 
 
 def test_unknown_names_are_refused_with_what_is_known():
