@@ -20,7 +20,7 @@ FURTHER_FLOOR = 1e-3
 # VPLs that share subpaths round delays to half a bin: a blur of variance 1/24 bin^2 adds 1/48 of the second difference,
 # which is most of what is there where the light begins. Twice that, for the orders above.
 BLUR = 1 / 24
-# Of a row: what float32 leaves of a surface that is seen edge on, and paths never meet.
+# Of the capture: what float32 leaves of a surface that is seen edge on, and paths never meet.
 GRAZING = 1e-12
 SHARE = 0.1  # bins are joined until they hold this share of their row
 
@@ -70,7 +70,7 @@ def group_sums(lights: Repeated, paths: Repeated, slot: int, is_third: bool) -> 
             # the third bounce is as good as it says itself, bin by bin; over all where resolutions agree by chance
             floor = 2 * max(stated[:, row, chosen].mean(axis=0).sum(), relative * other.mean()) if is_third else 0.0
             if not is_third:
-                floor = BLUR * np.abs(bend[chosen]).sum() + GRAZING * both.sum()
+                floor = BLUR * np.abs(bend[chosen]).sum() + GRAZING * theirs.sum() / len(theirs)
             columns.append((value, other, max(floor, FURTHER_FLOOR * other.mean())))
     return Sums(*(np.array(column).T for column in zip(*columns, strict=True)))
 
