@@ -93,12 +93,12 @@ class VplBounces:
             self.proposal_sensors = (
                 capture.sensor_grid.positions.reshape(-1, 3)[list(some)] / built.metres_per_engine_unit
             )
-        pairs = capture.n_sensors * (capture.n_lasers if capture.scan_type == "exhaustive" else 1)
+        lasers = capture.n_lasers if capture.scan_type == "exhaustive" else 1
+        pairs = capture.n_sensors * lasers
         self.is_confocal = capture.scan_type == "confocal"
         # every contribution of a confocal capture takes a shadow ray of its own to the laser
         kept = tuning.confocal_contributions_per_vpl, tuning.contributions_per_vpl
         self.contributions_per_vpl = kept[0 if self.is_confocal else 1]
-        lasers = capture.n_lasers if capture.scan_type == "exhaustive" else 1
         self.vpls_per_round = min(
             tuning.vpls_per_round, max(64, tuning.max_contribution_values // (self.contributions_per_vpl * lasers))
         )
@@ -190,7 +190,8 @@ class VplBounces:
 
     def render(self, batch: Batch, budget: Budget, passes: Passes, known_squares: float = 0.0) -> Histogram:
         """Render bounces 2 and 4 and up of a batch; see ``SupplementaryEngine.render``."""
-        known_squares += self.device.exact_squares(batch)
+        if budget.rounds is None and budget.target_error is not None:
+            known_squares += self.device.exact_squares(batch)
         histogram = self.histogram(batch, self.options.replicas)
         grid = self.device.capture.sensor_grid
         contrasts = RoundContrasts(histogram, self.device.sensor_indices(batch), (grid.nx, grid.ny))
