@@ -7,6 +7,7 @@ is there and seen, so that an edge counts once (docs/virtual-lights.md, 11).
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import drjit as dr
@@ -21,9 +22,9 @@ from nlosrender.engine.launch.ray_offsets import offset_origin, ray_offset
 from nlosrender.scene.build import BuiltScene, wall_box
 from nlosrender.scene.pose import Float64
 
-NO_MIRROR = 0xFFFFFFFF
+NO_NUMBER = 0xFFFFFFFF  # of a shape, or of a facet, that is no mirror
 FLAT_PLUGINS = ("Rectangle", "Disk")
-COPLANAR = 1e-5  # radians between neighbouring facets of one mirror: what float32 vertices leave of a plane's facets
+COPLANAR = 1e-5  # radians between neighbouring facets of one mirror: float32 vertices tilt those of a plane by less
 # What float32 rounds a point of reflection by, over 1 + the largest coordinate [engine units]: the quick test goes so
 # far beyond a mirror's edges. Points so near to an edge between two mirrors may count for both, or for none.
 ROUNDING = 3e-7
@@ -31,6 +32,34 @@ MIN_HEIGHT = 1e-7  # engine units: points nearer to a mirror's plane lie in it a
 NUDGE = 5e-7  # as ROUNDING: how far beside a point on an edge a ray is sent; a plate's edges are met at a tenth of it
 TRIES = 6  # rays at most: about the point at angles of 1 to 5 radians, which are along one edge and no other
 ROWS = 3  # of four numbers each, aligned loads: what the quick test reads of a mirror
+
+
+@dataclass(frozen=True, eq=False)
+class NumberOfShape:
+    """A number for some shapes of a scene, found by the shapes that rays meet."""
+
+    numbers: mi.UInt32  # by Dr.Jit's index of a shape's pointer; NO_NUMBER of other shapes
+
+    @classmethod
+    def of(cls, shapes: Sequence[mi.Shape], numbers: Sequence[int]) -> NumberOfShape:
+        """Return the table of ``shapes`` and their ``numbers``."""
+        index = [int(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))[0]) for shape in shapes]
+        table = np.full(max(index, default=0) + 1, NO_NUMBER, np.uint32)
+        table[index] = numbers
+        result = cls(on_device(mi.UInt32, table))
+        dr.eval(result.numbers)
+        return result
+
+    def at(self, si: mi.SurfaceInteraction3f | mi.PreliminaryIntersection3f, active: mi.Bool) -> mi.UInt32:
+        """Return the number of the shape that a ray met; NO_NUMBER where it met another one, or none."""
+        shape = dr.reinterpret_array(mi.UInt32, si.shape)  # 0: nothing was met
+        known = active & si.is_valid() & (shape < dr.width(self.numbers))
+        return dr.select(known, dr.gather(mi.UInt32, self.numbers, shape, known), NO_NUMBER)
+
+
+def components_of(bits: int) -> tuple[int, ...]:
+    """Return the numbers of the BSDF components whose bits are set, lowest first."""
+    return tuple(k for k in range(32) if bits >> k & 1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,7 +91,7 @@ class PlainMirror:
         cosine = cosine * self.front
         si.wi = mi.Vector3f(dr.safe_sqrt(1 - dr.square(cosine)), 0, cosine)
         for bits, is_side in zip(self.lobes, (cosine > 0, cosine < 0), strict=True):
-            for component in (k for k in range(32) if bits >> k & 1):
+            for component in components_of(bits):
                 context = mi.BSDFContext()
                 context.component = component
                 _, value = self.bsdf.sample(context, si, 0.5, mi.Point2f(0.5), active & is_side)
@@ -81,8 +110,8 @@ class FlatMirrors:
     packed: mi.Float
     lobes: mi.UInt32  # two a mirror: bits of the delta reflection components of its BSDF on the front and on the back
     components: tuple[int, ...]  # that any of them has
-    first_facet: mi.UInt32  # by number of a shape's pointer: where its facets begin in ``mirror_of``; NO_MIRROR
-    mirror_of: mi.UInt32  # mirror of each facet; NO_MIRROR for those that no point of the wall sees
+    first_facet: NumberOfShape  # where the facets of a shape begin in ``mirror_of``
+    mirror_of: mi.UInt32  # mirror of each facet; NO_NUMBER for those that no point of the wall sees
     plain: PlainMirror | None  # of the only one
 
     def is_alone(self, built: BuiltScene) -> bool:
@@ -92,7 +121,7 @@ class FlatMirrors:
         is_whole = len(smooth) == 1 and not smooth[0] & (
             mi.BSDFFlags.Smooth | mi.BSDFFlags.Null | mi.BSDFFlags.DeltaTransmission
         )
-        return is_whole and self.n_mirrors == 1 and not (np.array(self.mirror_of) == NO_MIRROR).any()
+        return is_whole and self.n_mirrors == 1 and not (np.array(self.mirror_of) == NO_NUMBER).any()
 
     def shows_wall(self, built: BuiltScene) -> bool:
         """Return whether the only mirror may show a planar wall to itself: its image lies before the wall."""
@@ -110,54 +139,50 @@ class FlatMirrors:
         """Return the flat mirrors of a scene; with polarised light there are none."""
         corners, facets, lobes = [np.zeros((0, 3, 3))], [np.zeros(0, np.uint32)], [np.zeros((0, 2), np.uint32)]
         shapes = [shape for shape in built.scene.shapes() if has_flat_mirrors(shape)]
-        number = {shape: int(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))[0]) for shape in shapes}
-        first_facet = np.full(max(number.values(), default=0) + 1, NO_MIRROR, np.uint32)
+        first_facet: list[int] = []
         n_mirrors = n_facets = 0
         plain = None
         for shape in shapes:
             triangles, primitives = _facets(built, shape)
             mirror, bounds = _mirrors_of(triangles)
-            mirror_of = np.full(shape.face_count() if shape.is_mesh() else 1, NO_MIRROR, np.uint32)
+            mirror_of = np.full(shape.face_count() if shape.is_mesh() else 1, NO_NUMBER, np.uint32)
             mirror_of[primitives] = mirror + n_mirrors
-            first_facet[number[shape]] = n_facets
+            first_facet.append(n_facets)
             corners.append(bounds)
             facets.append(mirror_of)
             lobes.append(np.tile(np.array(delta_lobes(shape.bsdf()), np.uint32), (len(bounds), 1)))
             n_mirrors, n_facets = n_mirrors + len(bounds), n_facets + len(mirror_of)
             plain = PlainMirror.of(shape, triangles, bounds[0]) if n_mirrors == len(bounds) == 1 else None
         bits = np.concatenate(lobes)
-        used = int(np.bitwise_or.reduce(bits, axis=None))
         mirrors = cls(
             n_mirrors,
             dr.opaque(mi.UInt32, n_mirrors),
             on_device(mi.Float, np.ravel(_packed(np.concatenate(corners))).astype(np.float32)),
             on_device(mi.UInt32, np.ravel(bits)),
-            tuple(k for k in range(32) if used >> k & 1),
-            on_device(mi.UInt32, first_facet),
+            components_of(int(np.bitwise_or.reduce(bits, axis=None))),
+            NumberOfShape.of(shapes, first_facet),
             on_device(mi.UInt32, np.concatenate(facets)),
             plain,
         )
-        dr.eval(mirrors.packed, mirrors.lobes, mirrors.first_facet, mirrors.mirror_of)
+        dr.eval(mirrors.packed, mirrors.lobes, mirrors.mirror_of)
         return mirrors
 
     def number_at(self, si: mi.SurfaceInteraction3f | mi.PreliminaryIntersection3f, active: mi.Bool) -> mi.UInt32:
-        """Return the number of the mirror that a ray met; NO_MIRROR where it met none."""
+        """Return the number of the mirror that a ray met; NO_NUMBER where it met none."""
         if not self.n_mirrors:
-            return mi.UInt32(NO_MIRROR)
-        shape = dr.reinterpret_array(mi.UInt32, si.shape)  # 0: nothing was met
-        known = active & si.is_valid() & (shape < dr.width(self.first_facet))
-        first = dr.select(known, dr.gather(mi.UInt32, self.first_facet, shape, known), NO_MIRROR)
-        known &= first != NO_MIRROR
-        return dr.select(known, dr.gather(mi.UInt32, self.mirror_of, first + si.prim_index, known), NO_MIRROR)
+            return mi.UInt32(NO_NUMBER)
+        first = self.first_facet.at(si, active)
+        known = first != NO_NUMBER
+        return dr.select(known, dr.gather(mi.UInt32, self.mirror_of, first + si.prim_index, known), NO_NUMBER)
 
     def is_met(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Bool:
         """Return whether rays met a mirror."""
-        return self.number_at(si, active) != NO_MIRROR
+        return self.number_at(si, active) != NO_NUMBER
 
     def may_reflect(self, number: mi.UInt32, point: mi.Point3f, laser: mi.Point3f) -> mi.Bool:
-        """Return whether mirrors can reflect the light of a laser point to a point: no ray is traced.
+        """Return whether the point of reflection lies within the bounds of mirrors; visibility is not tested.
 
-        True also for points of reflection beside a mirror of many facets, but not beside a single facet.
+        The bounds of a mirror of many facets are a triangle around it, those of a single facet are exact.
         """
         plane, one, other = (dr.gather(mi.Vector4f, self.packed, number * ROWS + row) for row in range(ROWS))
         height, above = _affine(plane, point), _affine(plane, laser)

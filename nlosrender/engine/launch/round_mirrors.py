@@ -14,12 +14,19 @@ import mitsuba as mi
 import numpy as np
 
 from nlosrender.engine.launch.device_arrays import on_device
-from nlosrender.engine.launch.flat_mirrors import Reflection, delta_lobes, has_known_lobes, lobe_weight
+from nlosrender.engine.launch.flat_mirrors import (
+    NO_NUMBER,
+    NumberOfShape,
+    Reflection,
+    components_of,
+    delta_lobes,
+    has_known_lobes,
+    lobe_weight,
+)
 from nlosrender.engine.launch.ray_offsets import offset_origin
 from nlosrender.scene.build import BuiltScene
 from nlosrender.scene.loading.round_surfaces import ROUND_PLUGINS, RoundSurface
 
-NO_NUMBER = 0xFFFFFFFF
 # Newton steps. Of 200,000 pairs of points 0.01 to 100 radii above the mirror the angle is good to 1e-2 after 4, 2e-4
 # after 5, 5e-7 after 6, 4e-7 after 8 and more: what float32 leaves.
 STEPS = 7
@@ -33,7 +40,7 @@ class RoundMirrors:
     packed: mi.Float  # eight a mirror: centre, radius; unit axis (0 of a sphere), length
     lobes: mi.UInt32  # of each mirror: bits of the delta reflection components on its outside
     components: tuple[int, ...]  # that any of them has
-    numbers: mi.UInt32  # by number of a shape's pointer: the mirror; NO_NUMBER
+    numbers: NumberOfShape  # the mirror that each shape is
 
     @classmethod
     def of(cls, built: BuiltScene) -> RoundMirrors | None:
@@ -41,29 +48,25 @@ class RoundMirrors:
         shapes = [shape for shape in built.scene.shapes() if _outer_lobes(shape)]
         if not shapes:
             return None
-        number = [int(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))[0]) for shape in shapes]
-        numbers = np.full(max(number) + 1, NO_NUMBER, np.uint32)
-        numbers[number] = np.arange(len(shapes))
         rows = np.zeros((len(shapes), 8))
         for row, surface in zip(rows, map(RoundSurface.of, shapes), strict=True):
             length = float(np.linalg.norm(surface.axis))
             row[:3], row[3], row[7] = surface.centre, surface.radius, length
             row[4:7] = surface.axis / max(length, 1e-30)
         bits = np.array([_outer_lobes(shape) for shape in shapes], np.uint32)
-        used = int(np.bitwise_or.reduce(bits))
         mirrors = cls(
             dr.opaque(mi.UInt32, len(shapes)),
             on_device(mi.Float, rows.ravel().astype(np.float32)),
             on_device(mi.UInt32, bits),
-            tuple(k for k in range(32) if used >> k & 1),
-            on_device(mi.UInt32, numbers),
+            components_of(int(np.bitwise_or.reduce(bits))),
+            NumberOfShape.of(shapes, range(len(shapes))),
         )
-        dr.eval(mirrors.packed, mirrors.lobes, mirrors.numbers)
+        dr.eval(mirrors.packed, mirrors.lobes)
         return mirrors
 
     def is_met(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Bool:
         """Return whether rays met the convex side of a mirror."""
-        number = self._number_at(si, active)
+        number = self.numbers.at(si, active)
         active = active & (number != NO_NUMBER)
         surface = _Surface.of(self, number, active)
         return active & (dr.dot(surface.across(si.p), si.to_world(si.wi)) > 0)
@@ -98,7 +101,7 @@ class RoundMirrors:
         active &= inside & (cosine > 0) & (dr.dot(normal, from_lit) < 0)
         ray = mi.Ray3f(offset_origin(built, si, direction), direction)
         hit = built.scene.ray_intersect(ray, mi.RayFlags.All, coherent=False, active=active)
-        active &= self._number_at(hit, active) == number
+        active &= self.numbers.at(hit, active) == number
         lobes = dr.gather(mi.UInt32, self.lobes, number, active)
         weight = lobe_weight(hit, lobes, self.components, active)
         active &= dr.any(weight > 0)
@@ -107,11 +110,6 @@ class RoundMirrors:
         active &= ~built.scene.ray_test(segment, coherent=False, active=active)
         spread = surface.spread(normal, direction, cosine, near, far)
         return Reflection(direction, from_lit, near + far, weight / spread, active)
-
-    def _number_at(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.UInt32:
-        shape = dr.reinterpret_array(mi.UInt32, si.shape)  # 0: nothing was met
-        known = active & si.is_valid() & (shape < dr.width(self.numbers))
-        return dr.select(known, dr.gather(mi.UInt32, self.numbers, shape, known), NO_NUMBER)
 
 
 @dataclass(frozen=True, eq=False)
