@@ -51,8 +51,6 @@ class PathEngine:
         Why this engine renders the scene, in plain words.
     tuning
         Its numbers.
-    only_specular
-        Whether to compute only what delta lobes reflect or let through, for engines that know the rest.
     """
 
     name = "path"
@@ -63,10 +61,8 @@ class PathEngine:
         first_bounce: int = THIRD_BOUNCE,
         reason: str = "asked for",
         tuning: PathTuning = DEFAULT_TUNING,
-        *,
-        only_specular: bool = False,
     ):
-        self.only_specular = only_specular
+        self.only_specular = False
         self.device, self.first_bounce, self.reason, self.tuning = device, first_bounce, reason, tuning
         self.built, self.capture, self.time_axis = device.built, device.capture, device.time_axis
         self.options, self.sampler = device.options, device.sampler

@@ -24,7 +24,7 @@ from nlosrender.engine.launch.pilot_points import pilot_of
 from nlosrender.engine.launch.schedule import DEFAULT_TARGET
 from nlosrender.engine.virtual_lights.calibration import calibrated_lights
 from nlosrender.engine.virtual_lights.cost import gather_batch_bytes, virtual_light_estimate
-from nlosrender.engine.virtual_lights.elements.tessellator import Tessellator, wall_sees_itself
+from nlosrender.engine.virtual_lights.elements.tessellator import Tessellator, is_mirror, wall_sees_itself
 from nlosrender.engine.virtual_lights.gather.lighting import GatherSettings
 from nlosrender.engine.virtual_lights.reciprocity import is_reciprocal
 from nlosrender.engine.virtual_lights.refinement import difference_divisor
@@ -34,14 +34,14 @@ from nlosrender.engine.virtual_lights.vpls.rounds import VplBounces
 
 
 class VirtualLightEngine:
-    """Third bounce by the gather of patches, further bounces by the gather of VPLs or by paths.
+    """Third bounce by the gather of patches, further bounces by the gather of VPLs, and by paths for delta lobes.
 
     Parameters
     ----------
     device
         The capture on the device. Its hidden geometry has to be meshes, spheres and cylinders, all of them opaque.
     paths
-        Engine of the bounces above the third where surfaces are not Lambertian.
+        Engine of what delta lobes add to the bounces above the third.
     lanes
         Lanes that keep the backend busy.
     tuning
@@ -70,21 +70,27 @@ class VirtualLightEngine:
             laser_rays=tuning.laser_rays,
         )
         all_lambertian = self.settings.is_diffuse and is_lambertian(built.wall_shape.bsdf())
-        reciprocal = is_reciprocal(built, capture, self.time_axis.n_bins, is_lambertian=all_lambertian, tuning=tuning)
         has_vpls = self.has_further_bounces and self._mirrors_once
         mirror = device.lone_mirror if has_vpls else None
         bin_width = self.time_axis.bin_width_opl / built.metres_per_engine_unit
         self.tessellator = Tessellator(built, capture, bin_width, mirror=mirror, tuning=tuning)
-        reciprocal = reciprocal and mirror is None
+        reciprocal = mirror is None and is_reciprocal(
+            built, capture, self.time_axis.n_bins, is_lambertian=all_lambertian, tuning=tuning
+        )
         self.third = ThirdBounce(device, self.tessellator, self.settings, lanes, reciprocal, mirror)
         self.further: VplBounces | None = None  # where further bounces are asked for
         self.traces_paths = self.has_further_bounces and not has_vpls  # for light of delta lobes
         if self.has_further_bounces:
             masks = self.third.masks if self.settings.needs_visibility else None
-            is_diffuse = self.settings.is_diffuse
-            may_share = all_lambertian and has_vpls and mirror is None and capture.n_lasers == 1
-            may_share = may_share and not self.settings.is_confocal
-            self.further = VplBounces(device, self.tessellator, masks, is_diffuse, may_share, with_delta=has_vpls)
+            can_share = self.settings.has_one_laser and not self.settings.is_confocal
+            self.further = VplBounces(
+                device,
+                self.tessellator,
+                masks,
+                self.settings.is_diffuse,
+                may_share=can_share and all_lambertian and has_vpls and mirror is None,
+                with_delta=has_vpls,
+            )
             paths.only_specular = self.traces_paths
         surfaces = "Lambertian" if self.settings.is_diffuse else "diffuse and rough"
         surfaces += " surfaces and a mirror" if mirror is not None else " surfaces"
@@ -271,11 +277,6 @@ class VirtualLightEngine:
     def cost_estimate(self, plan: Plan, budget: Budget, lanes: int, pilot: PilotSeconds) -> TimeEstimate:
         """Estimate the seconds of a render; see ``Engine.cost_estimate``."""
         return virtual_light_estimate(self, plan, budget, lanes, pilot)
-
-
-def is_mirror(bsdf: mi.BSDF) -> bool:
-    """Return whether a BSDF has delta lobes alone: no connection finds anything there."""
-    return not bool(bsdf.flags() & mi.BSDFFlags.Smooth)
 
 
 def is_lambertian(bsdf: mi.BSDF) -> bool:

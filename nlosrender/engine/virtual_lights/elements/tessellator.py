@@ -74,7 +74,7 @@ class Tessellator:
                 if not wall_sees_itself(built):
                     continue
                 self.wall_index = index
-            if not bool(shape.bsdf().flags() & mi.BSDFFlags.Smooth):  # a mirror alone: connections find nothing there
+            if is_mirror(shape.bsdf()):
                 continue
             if shape.is_mesh():
                 triangles.append(elements_of_mesh(built, index, shape, mirror))
@@ -179,8 +179,13 @@ class Tessellator:
 
 def can_tessellate(built: BuiltScene) -> bool:
     """Return whether every hidden shape is a mesh, a sphere or a cylinder, or nothing but a mirror."""
-    shapes = [shape for shape in built.hidden_shapes if bool(shape.bsdf().flags() & mi.BSDFFlags.Smooth)]
+    shapes = [shape for shape in built.hidden_shapes if not is_mirror(shape.bsdf())]
     return all(shape.is_mesh() or shape.class_name() in ROUND_PLUGINS for shape in shapes)
+
+
+def is_mirror(bsdf: mi.BSDF) -> bool:
+    """Return whether a BSDF has delta lobes alone: connections evaluate it to 0."""
+    return not bool(bsdf.flags() & mi.BSDFFlags.Smooth)
 
 
 def wall_sees_itself(built: BuiltScene) -> bool:

@@ -288,14 +288,25 @@ def _corners(patches: DevicePatches, index: mi.UInt32) -> tuple[mi.Point3f, mi.P
 
 def irradiance(built: BuiltScene, laser: WallPoints, point: mi.Point3f, shading: mi.Normal3f) -> mi.Spectrum:
     """Return the irradiance at a point from a laser point that it sees [1 / (engine unit)^2 per J]."""
+    emitted, direction, distance2 = _emitted(built, laser, point)
+    return emitted * (dr.maximum(-dr.dot(shading, direction), 0) / distance2)
+
+
+def reflected_light(
+    built: BuiltScene, laser: WallPoints, si: mi.SurfaceInteraction3f, active: mi.Bool = True
+) -> mi.Spectrum:
+    """Return the radiance along ``si.wi`` of surfaces that a laser point lights; visibility is left to the caller.
+
+    In 1 / (sr engine unit^2) per J, by Mitsuba's ``eval`` of their BSDF.
+    """
+    emitted, direction, distance2 = _emitted(built, laser, si.p)
+    return emitted * si.bsdf().eval(mi.BSDFContext(), si, si.to_local(-direction), active) / distance2
+
+
+def _emitted(built: BuiltScene, laser: WallPoints, point: mi.Point3f) -> tuple[mi.Spectrum, mi.Vector3f, mi.Float]:
+    """Return the wall's BSDF towards points, the direction there, and the squared distance."""
     to_point = point - laser.interaction.p
     distance2 = dr.squared_norm(to_point)
     direction = to_point * dr.rsqrt(distance2)
     emitted = built.wall_bsdf.eval(mi.BSDFContext(), laser.interaction, laser.interaction.to_local(direction))
-    return emitted * (dr.maximum(-dr.dot(shading, direction), 0) / distance2)
-
-
-def perpendicular_irradiance(built: BuiltScene, laser: WallPoints, point: mi.Point3f) -> mi.Spectrum:
-    """Return the irradiance of a surface at a point that faces the laser point [1 / (engine unit)^2 per J]."""
-    to_point = point - laser.interaction.p
-    return irradiance(built, laser, point, mi.Normal3f(-dr.normalize(to_point)))
+    return emitted, direction, distance2

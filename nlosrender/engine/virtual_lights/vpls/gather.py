@@ -16,7 +16,7 @@ from nlosrender.engine.launch.histogram import DeviceHistogram, HistogramShape
 from nlosrender.engine.launch.launch_params import LaunchParams
 from nlosrender.engine.launch.ray_offsets import WALL_OFFSET, off_the_surface
 from nlosrender.engine.virtual_lights.gather.device_patches import surface_at, to_points
-from nlosrender.engine.virtual_lights.gather.lighting import irradiance, perpendicular_irradiance
+from nlosrender.engine.virtual_lights.gather.lighting import irradiance, reflected_light
 from nlosrender.engine.virtual_lights.visibility.masks import Surface, VisibilityMasks, WallTiles
 from nlosrender.engine.virtual_lights.visibility.shadow_rays import is_visible, mirrored_share
 from nlosrender.scene.build import BuiltScene
@@ -185,8 +185,7 @@ def gather_contributions(
 
         # ---- Deposit its contributions ------------------------------------------------------------------------------
         delay = connection.distance * scale + sensors.delay_fraction
-        si: mi.SurfaceInteraction3f | None = None
-        si = sensor  # not read
+        si = sensor  # read for glossy VPLs alone
         if dr.hint(table.interaction is not None, mode="scalar"):
             si = dr.gather(mi.SurfaceInteraction3f, table.interaction, vpl)
             si.wi = si.to_local(-direction)
@@ -221,9 +220,7 @@ def gather_contributions(
                     value *= irradiance(built, own_laser, end_point, shading)
                 else:
                     there = dr.gather(mi.SurfaceInteraction3f, contributions.interaction, contribution)
-                    to_laser = there.to_local(dr.normalize(own_laser.interaction.p - end_point))
-                    value *= perpendicular_irradiance(built, own_laser, end_point)
-                    value *= there.bsdf().eval(context, there, to_laser)
+                    value *= reflected_light(built, own_laser, there)
                 is_lit = dr.any(value > 0)
                 if dr.hint(needs_visibility, mode="scalar"):
                     end_offset = dr.gather(mi.Vector3f, contributions.offset, contribution)

@@ -27,7 +27,7 @@ from nlosrender.engine.launch.ray_offsets import connection_segment, off_the_wal
 from nlosrender.engine.launch.time_gate import CaptureTimeGate, TimeGate, time_gate_roulette
 from nlosrender.engine.launch.wall_points import WallPoints
 from nlosrender.engine.virtual_lights.gather.device_patches import normal_reflectance, surface_at
-from nlosrender.engine.virtual_lights.gather.lighting import irradiance, perpendicular_irradiance
+from nlosrender.engine.virtual_lights.gather.lighting import irradiance, reflected_light
 from nlosrender.engine.virtual_lights.tuning import DEFAULT_TUNING
 from nlosrender.scene.build import BuiltScene
 from nlosrender.scene.pose import Float64
@@ -200,10 +200,8 @@ def trace_subpaths(
             lit = proposal_lasers.light(built, leaving, si.p, si.sh_frame.n)
         else:
             for k in range(proposal_lasers.count):
-                point = proposal_lasers.points.gather(mi.UInt32(k))
-                to_laser = si.to_local(dr.normalize(point.interaction.p - si.p))
-                reflected = bsdf.eval(context, si, to_laser, hidden) * perpendicular_irradiance(built, point, si.p)
-                lit += dr.mean(throughput * reflected) / proposal_lasers.count
+                laser = proposal_lasers.points.gather(mi.UInt32(k))
+                lit += dr.mean(throughput * reflected_light(built, laser, si, hidden)) / proposal_lasers.count
             lit += proposal_lasers.untried(leaving, si.p)
         lit = dr.select(hidden, lit, 0)
         if dr.hint(time_gate is not None, mode="scalar"):
@@ -456,8 +454,7 @@ def _connect(
     if ends.interaction is None:
         value = carried * irradiance(built, lasers, si.p, facing)
     else:
-        value = carried * perpendicular_irradiance(built, lasers, si.p)
-        value *= si.bsdf().eval(mi.BSDFContext(), si, si.to_local(to_laser / distance))
+        value = carried * reflected_light(built, lasers, si)
     value *= dr.gather(mi.Float, scale, entry)
     active = dr.any(value > 0)
     if mirror is not None:
