@@ -89,9 +89,9 @@ def _started(wanted: BackendName, colored: bool, polarized: bool) -> Backend:
         mitsuba.set_variant(variant)
         mitsuba.set_log_level(mitsuba.LogLevel.Error)  # its warnings go to stdout, into the middle of our JSON
         from nlosrender.scene.loading.exact_blend import register_blend
-        from nlosrender.scene.loading.retroreflector import register_plugins
+        from nlosrender.scene.loading.retroreflector import register_retroreflector
 
-        register_plugins()
+        register_retroreflector()
         register_blend()
     except ImportError as error:
         raise BackendError(f"Mitsuba cannot start its variant {variant}: {error}. Try 'nlosrender doctor'.") from error

@@ -7,11 +7,12 @@ the quotient of the summed values and densities: half a mirror, half matt 0.7, r
 
 from __future__ import annotations
 
-from functools import cache
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
+
+from nlosrender.scene.loading.bsdf_plugin import eval_alone, pdf_alone, register_once
 
 MITSUBA_NAME, NAME = "blendbsdf", "exactblend"  # the latter takes the place of the former in all scenes
 ALL_COMPONENTS = 0xFFFFFFFF
@@ -19,13 +20,14 @@ ALL_COMPONENTS = 0xFFFFFFFF
 
 def register_blend() -> None:
     """Make the BSDF known to the active variant of Mitsuba, under the name ``NAME``."""
-    _register(mi.variant())
+    register_once(NAME, _define)
 
 
-@cache  # a variant keeps what it knows
-def _register(variant: str) -> None:
+def _define() -> type[mi.BSDF]:
     class ExactBlend(mi.BSDF):  # type: ignore[misc]  # each variant has a base class of its own
         """Parameters: the texture ``weight`` of the second of two nested BSDFs."""
+
+        eval, pdf = eval_alone, pdf_alone
 
         def __init__(self, properties: mi.Properties) -> None:
             mi.BSDF.__init__(self, properties)
@@ -70,16 +72,6 @@ def _register(variant: str) -> None:
             bs.pdf = dr.select(scatters, density, share * bs.pdf)
             return bs, dr.select(scatters, mixed, value)
 
-        def eval(
-            self, context: mi.BSDFContext, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool = True
-        ) -> mi.Spectrum:
-            return self.eval_pdf(context, si, wo, active)[0]
-
-        def pdf(
-            self, context: mi.BSDFContext, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool = True
-        ) -> mi.Float:
-            return self.eval_pdf(context, si, wo, active)[1]
-
         def eval_pdf(
             self, context: mi.BSDFContext, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool = True
         ) -> tuple[mi.Spectrum, mi.Float]:
@@ -114,4 +106,4 @@ def _register(variant: str) -> None:
         def class_name(self) -> str:
             return "BlendBSDF"
 
-    mi.register_bsdf(NAME, ExactBlend)
+    return ExactBlend

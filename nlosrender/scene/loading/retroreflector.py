@@ -22,7 +22,6 @@ Patches need not be smaller than the lobe: docs/retroreflectors.md.
 from __future__ import annotations
 
 import math
-from functools import cache
 from typing import Any
 
 import drjit as dr
@@ -30,6 +29,7 @@ import mitsuba as mi
 import numpy as np
 from scipy.special import i0e
 
+from nlosrender.scene.loading.bsdf_plugin import eval_alone, pdf_alone, register_once
 from nlosrender.scene.pose import Float64
 
 # All three measured: the directional albedo is right to 1.3e-5 for widths of 0.01 to 60 degrees, at every incidence.
@@ -73,18 +73,19 @@ def scaling(k: float) -> Float64:
     return np.where(at <= solved, 1 / np.maximum(kernel(at) @ h, 1e-9), expansion(at)) * np.sqrt(cosine + u)
 
 
-def register_plugins() -> None:
+def register_retroreflector() -> None:
     """Make the BSDF known to the active variant of Mitsuba, under the name ``retroreflector``."""
-    _register(mi.variant())
+    register_once("retroreflector", _define)
 
 
-@cache  # a variant keeps what it knows
-def _register(variant: str) -> None:
+def _define() -> type[mi.BSDF]:
     class Retroreflector(mi.BSDF):  # type: ignore[misc]  # each variant has a base class of its own
         """Parameters: ``width`` [degrees], the textures ``albedo`` and ``diffuse``; light leaves it unpolarised.
 
         Where the textures' sum is above 1, ``diffuse`` gives way.
         """
+
+        eval, pdf = eval_alone, pdf_alone
 
         def __init__(self, properties: mi.Properties) -> None:
             mi.BSDF.__init__(self, properties)
@@ -105,16 +106,6 @@ def _register(variant: str) -> None:
             callback.put("width", self.width, mi.ParamFlags.NonDifferentiable)
             callback.put("albedo", self.albedo, mi.ParamFlags.Differentiable)
             callback.put("diffuse", self.diffuse, mi.ParamFlags.Differentiable)
-
-        def eval(
-            self, context: mi.BSDFContext, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool = True
-        ) -> mi.Spectrum:
-            return self.eval_pdf(context, si, wo, active)[0]
-
-        def pdf(
-            self, context: mi.BSDFContext, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool = True
-        ) -> mi.Float:
-            return self.eval_pdf(context, si, wo, active)[1]
 
         def eval_pdf(
             self, context: mi.BSDFContext, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool = True
@@ -176,4 +167,4 @@ def _register(variant: str) -> None:
         def class_name(self) -> str:
             return "Retroreflector"
 
-    mi.register_bsdf("retroreflector", Retroreflector)
+    return Retroreflector
