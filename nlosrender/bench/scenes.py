@@ -100,9 +100,7 @@ def letters() -> BenchScene:
 
 def bunny(mesh: Path, scan: str = "single", max_bounces: int | None = 3) -> BenchScene:
     """A mesh at 1 m: third bounce, single or confocal; or all bounces."""
-    item = _item("mesh", filename=str(mesh.absolute()), translate=[0.0, 0.0, 1.0], face_normals=True)
-    item["bsdf"] = _diffuse(0.8)
-    sections = _sections([item], 64, bins=(1.3, 0.003, 700), scan=scan)
+    sections = _bunny_sections(mesh, _diffuse(0.8), scan)
     what = "third bounce" if max_bounces == 3 else "all bounces"
     title = f"{mesh.stem} at 1 m, {scan}, {what}, 64 x 64 sensor points, 700 bins of 3 mm"
     if max_bounces is None:
@@ -114,11 +112,15 @@ def shiny_bunny(mesh: Path, name: str) -> BenchScene:
     """The mesh at 1 m with a BSDF of ``SHINY``; a retroreflector confocal, where it sends its light."""
     max_bounces, target, bsdf = SHINY[name]
     scan = "confocal" if name == "retroreflector" else "single"
-    item = _item("mesh", filename=str(mesh.absolute()), translate=[0.0, 0.0, 1.0], face_normals=True, bsdf=dict(bsdf))
-    sections = _sections([item], 64, bins=(1.3, 0.003, 700), scan=scan)
+    sections = _bunny_sections(mesh, bsdf, scan)
     title = f"{mesh.stem} at 1 m, {name}, {scan}, {max_bounces} bounces, 64 x 64 sensor points, 700 bins of 3 mm"
     truth: Truth = "refined" if max_bounces == 3 else "long run"
     return BenchScene(f"bunny-{name}", title, target, truth, sections, max_bounces)
+
+
+def _bunny_sections(mesh: Path, bsdf: Mapping[str, Any], scan: str) -> dict[str, Any]:
+    item = _item("mesh", filename=str(mesh.absolute()), translate=[0.0, 0.0, 1.0], face_normals=True, bsdf=dict(bsdf))
+    return _sections([item], 64, bins=(1.3, 0.003, 700), scan=scan)
 
 
 def closed_room(n: int = 32, max_bounces: int | None = None) -> BenchScene:
@@ -131,8 +133,8 @@ def closed_room(n: int = 32, max_bounces: int | None = None) -> BenchScene:
 
 def mirror_room(n: int = 32) -> BenchScene:
     """The closed room with a mirror before one of its sides; light that meets it twice in a row is not sampled."""
-    mirror = _item("rectangle", width=1.9, height=1.9, center=[0.98, 0.0, 1.0], normal=[-1, 0, 0])
-    mirror |= {"name": "mirror", "bsdf": {"type": "conductor", "material": "none"}}
+    mirror = _item("rectangle", name="mirror", width=1.9, height=1.9, center=[0.98, 0.0, 1.0], normal=[-1, 0, 0])
+    mirror["bsdf"] = dict(SHINY["mirror"][2])
     item = _item("room", size=[2.0, 2.0, 2.0], bsdf=_diffuse(0.5))
     sections = _sections([item, mirror], n, bins=(0.0, 0.03, 500), wall_reflectance=0.5)
     title = f"closed room of 2 m, one side a mirror, all bounces, {n} x {n} sensor points, 500 bins of 3 cm"
@@ -147,9 +149,7 @@ def furnished_room(mesh: Path, n: int = 64) -> BenchScene:
             mesh.parent.mkdir(parents=True, exist_ok=True)
             write_furniture(mesh, 1_200_000)
 
-    furniture = _item("mesh", filename=str(mesh.absolute()), face_normals=True, bsdf=_diffuse(0.6)) | {
-        "name": "furniture"
-    }
+    furniture = _item("mesh", name="furniture", filename=str(mesh.absolute()), face_normals=True, bsdf=_diffuse(0.6))
     item = _item("room", size=[2.0, 2.0, 2.2], bsdf=_diffuse(0.5))
     sections = _sections([item, furniture], n, bins=(0.0, 0.03, 400), wall_reflectance=0.5)
     title = f"room of 2 m, furniture of 1.2 million triangles, all bounces, {n} x {n} sensor points, 400 bins of 3 cm"

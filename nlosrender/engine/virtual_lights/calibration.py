@@ -23,9 +23,6 @@ if TYPE_CHECKING:
     from nlosrender.engine.virtual_lights.vpls.rounds import VplBounces
 
 
-MOST_OF_THIRD = 0.7  # of the squares that third bounce and VPLs share
-
-
 def calibrated_lights(
     third: ThirdBounce, further: VplBounces | None, budget: Budget, *, share_squares: float
 ) -> Budget:
@@ -40,7 +37,7 @@ def calibrated_lights(
     if budget.time_limit_s is not None:
         return replace(budget, patch_scale=_patch_scale_in_time(third, budget.time_limit_s, share * target))
     if further is not None:
-        share = max(share for share in tuning.third_shares if share**2 < share_squares * MOST_OF_THIRD)
+        share = max(share for share in tuning.third_shares if share**2 < share_squares * tuning.most_of_third)
     few = _pilot_of_patches(third, pilot)
     gather = cache(lambda scale: third.gather(few, scale))  # a smaller share goes on from these
     known_squares = device.exact_squares(few)

@@ -213,7 +213,7 @@ class VirtualLightEngine:
             return self.device.histogram_without_samples(batch)
         if not self.traces_paths:
             return self.further.render(batch, budget, passes.stage("further bounces", begin, 1), known_squares)
-        end, left = 0.8, budget.time_limit_s
+        end, left = self.third.tuning.time_share_of_lights, budget.time_limit_s
         of_lights, of_paths = (None, None) if left is None else (end * left, (1 - end) * left)
         rest = passes.stage("further bounces", begin, end)
         result = self.further.render(batch, replace(budget, time_limit_s=of_lights), rest, known_squares)

@@ -153,6 +153,10 @@ class VirtualLightTuning:
     # Of the target: paths of light that delta lobes reflect, beside VPLs, which take far less time (plastic bunny, 5
     # bounces, 2 %: 77,000 paths per sensor point at 0.3).
     specular_share: float = 0.65
+    # Of a time limit, and of the progress that is told: VPLs beside such paths (chosen).
+    time_share_of_lights: float = 0.8
+    # Of the squares that third bounce and VPLs share: the third bounce, at most (chosen; 0.65^2 of 0.9 is 0.47).
+    most_of_third: float = 0.7
     max_rounds: int = 2**20  # of a target that is out of reach
 
     # ---- Split of the target error (8); squares of shares leave 10 % for what a pilot cannot know ------------------

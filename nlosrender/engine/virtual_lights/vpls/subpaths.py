@@ -35,7 +35,8 @@ from nlosrender.scene.pose import Float64
 if TYPE_CHECKING:
     from nlosrender.engine.virtual_lights.vpls.sampler import Vpls
 
-SIDE_SEED = 0x9E3779B9  # makes the side that light leaves from independent of its direction
+SIDE_SEED = 0x9E3779B9  # seeds the choice of a two-sided VPL's side, which has to be independent of the direction's
+MIN_SIDE_SHARE = 0.05  # probability of either side, at least: sensor points that were not tried may see it; chosen
 
 
 @dataclass(frozen=True, eq=False)
@@ -367,7 +368,7 @@ def _front_shares(built: BuiltScene, vpls: Vpls, sensors: Float64) -> Float64:
     """Return the probability (n,) that a VPL sends light from its front: of two-sided ones about what sees it."""
     shares = (np.einsum("nkx,nx->nk", sensors - vpls.positions[:, None], vpls.normals) > 0).mean(axis=1)
     is_two_sided = np.array([bool(shape.bsdf().flags() & mi.BSDFFlags.BackSide) for shape in built.scene.shapes()])
-    return np.where(is_two_sided[vpls.shapes], np.clip(shares, 0.05, 0.95), 1.0)
+    return np.where(is_two_sided[vpls.shapes], np.clip(shares, MIN_SIDE_SHARE, 1 - MIN_SIDE_SHARE), 1.0)
 
 
 def _response(vpls: mi.SurfaceInteraction3f, direction: mi.Vector3f, sensors: Float64) -> mi.Float:
