@@ -96,7 +96,7 @@ def _end(message: str | None, exit_code: int, parts: Iterable[str], issues: Iter
     try:
         if message is not None:
             typer.echo(message, err=True)
-    except OSError:  # nobody reads the stream any more: the exit code still tells
+    except OSError:  # standard error is closed or full; the exit code still reports the failure
         give_up_stderr()
     with suppress(OSError):
         OUTPUT.print_failure(parts, exit_code, issues)

@@ -41,7 +41,8 @@ _NUMBER_RANGES = {  # lowest and highest number allowed
     Kind.SPECTRUM: (0.0, float("inf")),
     Kind.IOR: (1e-6, float("inf")),
     Kind.IOR_NUMBER: (1e-6, float("inf")),
-    Kind.WIDTH: (0.01, 60.0),  # float32 has 1e-3 of the lobe's peak at the lowest; at the highest it is no lobe
+    # degrees; narrower: float32 directions err by more than 1e-3 of the lobe's peak; wider: the lobe is nearly diffuse
+    Kind.WIDTH: (0.01, 60.0),
 }
 
 SHARES_ROUNDING = 1e-9  # 0.7 + 0.2 + 0.1 > 1
@@ -50,7 +51,7 @@ WHITE_DIFFUSE = FrozenDict(type="diffuse", reflectance=1.0)
 
 
 def check_parameters(check: PluginCheck, kind: str, values: Mapping[str, Any], names: Collection[str]) -> None:
-    """Note what is wrong with the parameters of a BSDF; of those not in the table nothing is said.
+    """Note what is wrong with the parameters of a BSDF; those not in the table are not checked.
 
     ``names`` are all that it has, of which ``values`` are known.
     """

@@ -32,8 +32,8 @@ def choose_engine(
 ) -> Engine:
     """Return the engine for a scene, with its reason in plain words (backend started).
 
-    ``auto`` chooses virtual lights for scenes that they support: diffuse and rough surfaces. The path engine renders
-    all others.
+    ``auto`` chooses virtual lights for scenes that they support, those without transmission (``_obstacle``). The path
+    engine renders all others.
 
     Parameters
     ----------

@@ -17,10 +17,10 @@ Array = NDArray[np.float64]
 ENERGY_FLOOR = 0.003
 # Rays start 1e-4 engine units off a surface, in either engine, but not at the same vertices; float32 within a path.
 FURTHER_FLOOR = 1e-3
-# VPLs that share subpaths round delays to half a bin: a blur of variance 1/24 bin^2 adds 1/48 of the second difference,
-# which is most of what is there where the light begins. Twice that, for the orders above.
+# Blur of VPL histograms, which round delays to half a bin: a variance of 1/24 bin^2 adds 1/48 of the second difference.
+# Twice that, for higher orders.
 BLUR = 1 / 24
-# Of the capture: what float32 leaves of a surface that is seen edge on, and paths never meet.
+# Share of the capture's sum: float32 cosines of a surface seen edge on are not quite 0, where no path arrives.
 GRAZING = 1e-12
 SHARE = 0.1  # bins are joined until they hold this share of their row
 

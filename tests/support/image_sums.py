@@ -1,4 +1,4 @@
-"""Sums over images of the laser points in flat mirrors: the third bounce by float64 numpy, with nothing of ours."""
+"""Image method for flat mirrors: the third bounce in float64 numpy, independent of the engines."""
 
 from __future__ import annotations
 

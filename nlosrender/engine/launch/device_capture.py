@@ -146,20 +146,20 @@ class DeviceCapture:
 
     @cached_property
     def mirrors(self) -> tuple[Mirrors, ...]:
-        """Mirrors by way of which light of the lasers is looked for."""
+        """Flat and round mirrors for connections to the lasers; none where only the second bounce is asked for."""
         highest = self.options.bounces.max_bounces
         return () if highest is not None and highest < THIRD_BOUNCE else mirrors_of(self.built)
 
     @cached_property
     def lone_mirror(self) -> FlatMirrors | None:
-        """The flat mirror that alone has delta lobes, and no others; None: there are others, or none is looked for."""
+        """The flat mirror of a scene whose other surfaces have no delta lobes; None: there is no such mirror."""
         flat = self.mirrors[0] if len(self.mirrors) == 1 else None
         return flat if isinstance(flat, FlatMirrors) and flat.is_alone(self.built) else None
 
     def exact_light(self, batch: Batch | Pilot) -> Iterator[tuple[int, NDArray[np.float64]]]:
-        """Yield bounces and their light (channel, 1, laser, sensor, row) that is exact: one replica computes it.
+        """Yield bounce index and H (channel, 1, laser, sensor, row) of light that has no noise: one replica is enough.
 
-        The second bounce, of which a planar wall has none, and the third of laser points by way of mirrors.
+        The second bounce, 0 on a planar wall, and the third bounce of laser points reflected by mirrors.
         """
         shape = replace(self.shape(batch, 1), replicas=1)
         if not self.built.wall.is_planar:
@@ -177,7 +177,7 @@ class DeviceCapture:
         return sum(float(np.square(light[..., :-1] / self.scale).sum()) for _, light in self.exact_light(batch))
 
     def histogram_without_samples(self, batch: Batch) -> Histogram:
-        """Return the histogram of a batch of which nothing is sampled: exact light, all else zero."""
+        """Return a batch's histogram without samples: exact light, zero elsewhere."""
         shape, slots = self.shape(batch, 1), self.options.bounces.n_slots
         axes = (shape.channels, slots, shape.lasers, shape.sensors, shape.row)
         result = Histogram.of_rows(np.zeros(axes), np.zeros(axes), 0, no_contrasts(shape.channels, slots))

@@ -64,7 +64,7 @@ def components_of(bits: int) -> tuple[int, ...]:
 
 @dataclass(frozen=True, eq=False)
 class PlainMirror:
-    """A mirror without textures that is a triangle or fills its rectangle: coordinates tell where it is, not rays."""
+    """An untextured mirror that is a triangle or a full rectangle: bounds replace the ray that looks for a facet."""
 
     limit: float  # of either coordinate
     front: float  # 1, or -1 where the plane's normal points to the back
@@ -115,7 +115,7 @@ class FlatMirrors:
     plain: PlainMirror | None  # of the only one
 
     def is_alone(self, built: BuiltScene) -> bool:
-        """Return whether one flat mirror is all that has delta lobes, and has no others: no two are met in a row."""
+        """Return whether one flat mirror without a diffuse part has the only delta lobes: no path meets two in a row."""
         lobes = [shape.bsdf().flags() for shape in built.scene.shapes()]
         smooth = [flags for flags in lobes if flags & mi.BSDFFlags.Delta]
         is_whole = len(smooth) == 1 and not smooth[0] & (
@@ -124,7 +124,7 @@ class FlatMirrors:
         return is_whole and self.n_mirrors == 1 and not (np.array(self.mirror_of) == NO_NUMBER).any()
 
     def shows_wall(self, built: BuiltScene) -> bool:
-        """Return whether the only mirror may show a planar wall to itself: its image lies before the wall."""
+        """Return whether part of a planar wall may see the wall in the only mirror: its image lies before the wall."""
         plane = np.array(self.packed, np.float64)[:4]
         heights = wall_box(built.wall) / built.metres_per_engine_unit @ plane[:3] + plane[3]
         return built.wall.is_planar and bool((heights * plane[2] < -MIN_HEIGHT).any())

@@ -1,4 +1,4 @@
-"""Mirror connections: from vertices to the laser points by way of one flat mirror, and deposits."""
+"""Mirror connections: vertices connected to the laser points by one reflection in a flat or round mirror."""
 
 from __future__ import annotations
 
@@ -37,9 +37,9 @@ def mirrors_of(built: BuiltScene) -> tuple[Mirrors, ...]:
 
 
 def deposit_mirrored_bounce(params: LaunchParams, mirrors: Mirrors, histogram: DeviceHistogram) -> None:
-    """Deposit the third bounce by way of one mirror, for every lane and each of its lasers; exact.
+    """Deposit the third bounce by one mirror reflection, for every lane and each of its lasers; exact.
 
-    As ``deposit_second_bounce``.
+    Parameters as of ``deposit_second_bounce``.
     """
     sensor, zero = params.sensors.interaction, mi.UInt32(0)
     vertex = MirroredVertex(sensor, mi.Spectrum(1), mi.Float(0), zero, zero, mirrors.count, None)

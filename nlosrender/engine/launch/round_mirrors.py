@@ -28,7 +28,7 @@ from nlosrender.scene.build import BuiltScene
 from nlosrender.scene.loading.round_surfaces import ROUND_PLUGINS, RoundSurface
 
 # Newton steps. Of 200,000 pairs of points 0.01 to 100 radii above the mirror the angle is good to 1e-2 after 4, 2e-4
-# after 5, 5e-7 after 6, 4e-7 after 8 and more: what float32 leaves.
+# after 5, 5e-7 after 6, and 4e-7, the rounding of float32, after 8 and more.
 STEPS = 7
 
 

@@ -19,7 +19,7 @@ energy E with f_l; V is visibility. With bounce index b = k + 2 the deposit, in 
 
     H_b += E  T_k  f(x_k) cos  f_l cos_l  V / |x_k - l|^2                     [``laser_connections``]
 
-and the same by way of flat mirrors one bounce later, see ``connect_by_mirrors``.
+and the same by one mirror reflection, one bounce later (``connect_by_mirrors``).
 
 Russian roulette divides T by the survival probability (``_survival``): at every bounce from the first deposited one on
 the albedo, at bounce 3 over the period n (``continuation_period``); and, once, that of the time gate where a path can

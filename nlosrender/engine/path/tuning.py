@@ -42,9 +42,9 @@ class PathTuning:
     # paths take 0.20 to 0.35 CPU s on these scenes, compiling and running the pilot 0.22 to 0.36 CPU s.
     pilot_samples: int = 64
     min_paths_for_pilot: int = 2**20
-    # Flat mirrors that connections of a vertex are tried by way of, 3 ns each. Of 2,910 facets of a bunny's front,
+    # Mirrors tried for the connections of a vertex, 3 ns each. Of 2,910 facets of a bunny's front,
     # CPU s to equal error with a mirror bunny on a matt floor, bounce 4: 18 / 14 / 12 / 27 / 63 at 16 / 64 / 256 / 1024
-    # / all. Sensor points look for a spot by way of all, for the sum over mirrors is all they see: 7 / 3 / 1.6 / 0.8 /
+    # / all. For a spot, sensor points try all mirrors, because that sum is all they see: 7 / 3 / 1.6 / 0.8 /
     # 0.06 s with a spot of 2 cm, bounce 3.
     mirrors_per_vertex: int = 256
     direct: LoopCost = LoopCost(2.0, 8, 3)  # ``third_bounce_loop``; measured on open scenes (5c22817)

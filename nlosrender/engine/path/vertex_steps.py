@@ -33,7 +33,7 @@ class Departure:
     bsdf_density: mi.Float  # share of BSDF sampling in the direction's density [1/sr]; 1 for delta lobes
     hidden_density: mi.Float  # share of hidden geometry sampling, before the Jacobian [1/area]
     is_delta: mi.Bool  # the direction comes from a delta lobe
-    is_imaged: mi.Bool  # that of a mirror, and the direction before from none: connections by way of it find more
+    is_imaged: mi.Bool  # a mirror reflected a scattered ray: mirror connections sample such paths to the spot
     has_target: mi.Bool  # it was sent to a sampled point of the hidden geometry: the next three
     target: mi.Point3f
     target_shape: mi.ShapePtr

@@ -80,7 +80,7 @@ class ThirdBounce:
         Whether exchanging laser and sensor point changes nothing, see ``reciprocity.is_reciprocal``: then no two
         points are gathered from twice in one batch.
     mirror
-        The only one, by way of which laser and sensor points see the patches as well: bounces 4 and 5.
+        The scene's only mirror: patches are lit and seen by reflection in it, too, bounces 4 and 5. None: no mirror.
     """
 
     def __init__(

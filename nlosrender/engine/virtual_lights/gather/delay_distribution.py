@@ -59,7 +59,7 @@ class Delays:
     t1: mi.Float
     t2: mi.Float | None  # None: no patch is a parallelogram, t2 = t1
     t3: mi.Float
-    first: mi.Float  # what the density has before arrives then
+    first: mi.Float  # least delay that light may have: the CDF is 0 before, and jumps there
     light: mi.Vector3f | None = None  # per area, at t0, t1 and t3 of triangles, mean 1; None: even over all patches
 
     @classmethod

@@ -8,6 +8,7 @@ by the balance heuristic (Veach 1997). docs/virtual-lights.md, 7.7.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import cast
 
 import drjit as dr
 import mitsuba as mi
@@ -76,8 +77,8 @@ class SharedContributions:
     ) -> SharedContributions:
         """Connect first hits to all VPLs of the group whose subpath met them."""
         own, count = on_device(mi.UInt32, contributions.vpls), dr.width(receivers.position)
-        assert contributions.firsts is not None
-        densities, seen_by = _connect_group(built, receivers, own, contributions.firsts, needs_visibility)
+        firsts = cast(FirstHit, contributions.firsts)  # those of shared subpaths are kept
+        densities, seen_by = _connect_group(built, receivers, own, firsts, needs_visibility)
         bounds = on_device(mi.UInt32, np.searchsorted(contributions.vpls, np.arange(count + 1)))
         dr.eval(densities, seen_by)
         return cls(contributions, densities, seen_by, bounds)

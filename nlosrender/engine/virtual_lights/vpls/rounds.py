@@ -49,7 +49,7 @@ if TYPE_CHECKING:
 
 
 class VplBounces:
-    """Bounces above the third, of light that no delta lobe sends to a sensor point.
+    """Bounces above the third whose last hidden vertex is not specular, by virtual point lights.
 
     Parameters
     ----------

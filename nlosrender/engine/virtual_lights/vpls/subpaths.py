@@ -65,7 +65,7 @@ class ProposalLasers:
         return lit
 
     def untried(self, leaving: mi.Spectrum, point: mi.Point3f) -> mi.Float:
-        """Return what no vertex has less of, for lasers that are not tried may light it."""
+        """Return the least light expected of a vertex: lasers that are no proposal lasers may light it."""
         if self.are_all:
             return mi.Float(0)
         away = dr.squared_norm(point - self.points.gather(mi.UInt32(0)).interaction.p)
