@@ -115,7 +115,7 @@ class FlatMirrors:
     plain: PlainMirror | None  # of the only one
 
     def is_alone(self, built: BuiltScene) -> bool:
-        """Return whether one flat mirror without a diffuse part has the only delta lobes: no path meets two in a row."""
+        """Return whether a flat mirror without diffuse part has the only delta lobes: no path meets two in a row."""
         lobes = [shape.bsdf().flags() for shape in built.scene.shapes()]
         smooth = [flags for flags in lobes if flags & mi.BSDFFlags.Delta]
         is_whole = len(smooth) == 1 and not smooth[0] & (
