@@ -66,6 +66,7 @@ def validate(
     from nlosrender.config.load import config_of, load_document
     from nlosrender.config.sweep_load import sweep_of
     from nlosrender.config.warnings import config_warnings
+    from nlosrender.scene.item_bounds import item_bounds
 
     issues: list[ValidationIssue] = []
     warnings: list[str] = []
@@ -73,7 +74,7 @@ def validate(
     for path in configs:
         try:
             document = load_document(path, overrides or ())
-            sweep = sweep_of(document)
+            sweep = sweep_of(document, item_bounds)
             config = config_of(document) if sweep is None else sweep.config(0)
             found, lines = list(config_warnings(config)), []  # type: list[str], list[str]
             if config.scene.has_mesh_files:  # numpy is loaded only for these

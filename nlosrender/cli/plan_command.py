@@ -30,9 +30,10 @@ def plan(config: ConfigFile, overrides: Overrides = None, as_json: AsJson = Fals
     from nlosrender.analysis.render_plan import plan_render
     from nlosrender.config.load import config_of, load_document
     from nlosrender.config.sweep_load import sweep_of
+    from nlosrender.scene.item_bounds import item_bounds
 
     document = load_document(config, overrides or ())
-    sweep = sweep_of(document)
+    sweep = sweep_of(document, item_bounds)
     with document.placing_issues():
         if sweep is not None:
             _plan_all(sweep, as_json)
@@ -113,7 +114,7 @@ def _plan_all(sweep: Sweep, as_json: bool) -> None:
     logical, disk = readable_size(total["logical_bytes"]), readable_size(total["disk_bytes_estimate"])
     rows = [
         ("captures", f"{len(sweep)}, in {sweep.output_folder}"),
-        ("keys", ", ".join(sweep.values(0))),
+        ("keys", ", ".join(sweep.keys)),
         ("engine", f"{', '.join(sorted({plan.engine for plan in plans}))} ({basis})"),
         ("files", f"{logical} for a reader, about {disk} on disk ({basis})"),
         ("takes", f"{'unknown time' if seconds is None else f'about {readable_duration(seconds)}'} ({basis})"),
@@ -135,7 +136,7 @@ def _total(sweep: Sweep, indices: Sequence[int], plans: Sequence[RenderPlan]) ->
     return {
         "captures": len(sweep),
         "folder": str(sweep.output_folder),
-        "keys": list(sweep.values(0)),
+        "keys": list(sweep.keys),
         "measured_captures": list(indices),
         "logical_bytes": round(share * sum(plan.file.logical_bytes for plan in plans)),
         "disk_bytes_estimate": round(share * sum(plan.file.disk_bytes_estimate for plan in plans)),

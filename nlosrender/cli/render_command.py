@@ -88,13 +88,14 @@ def render(
     from nlosrender.config.sweep_load import sweep_of
     from nlosrender.files.atomic_write import refuse_sources
     from nlosrender.pipeline import render_capture
+    from nlosrender.scene.item_bounds import item_bounds
 
     changes = list(overrides or [])
     if output is not None:
         refuse_folder(output, "capture.hdf5")
         changes.append(f"output.path={json.dumps(str(output))}")  # JSON is YAML: "1e3" or "yes" stay text
     document = load_document(config, changes)
-    sweep = sweep_of(document)
+    sweep = sweep_of(document, item_bounds)
     if sweep is not None:
         if lasers is not None:
             raise typer.BadParameter("cuts one capture, not a sweep; use --shard", param_hint="--lasers")

@@ -33,7 +33,7 @@ from nlosrender.errors import ValidationIssue
 
 LETTERS = string.ascii_uppercase + string.digits + " "
 MAX_LETTERS = 256
-_MESH_SUFFIXES = (".ply", ".obj")
+MESH_SUFFIXES = (".ply", ".obj", ".stl", ".off", ".glb")
 _TOWARDS_WALL = (0.0, 0.0, -1.0)  # a default wall looks along +z
 _NO_ROTATION = (0.0, 0.0, 0.0)
 
@@ -52,8 +52,8 @@ def _letters(value: object) -> str:
 
 
 def _mesh_file(value: object, validation: ValidationInfo) -> Path:
-    if not isinstance(value, str) or not value.lower().endswith(_MESH_SUFFIXES):
-        raise invalid_value(value, f"the name of a {' or '.join(_MESH_SUFFIXES)} file")
+    if not isinstance(value, str) or not value.lower().endswith(MESH_SUFFIXES):
+        raise invalid_value(value, f"the name of a {', '.join(MESH_SUFFIXES[:-1])} or {MESH_SUFFIXES[-1]} file")
     path, problem = existing_file(value, config_folder(validation))
     made_by = validation.data.get("made_by")
     if isinstance(made_by, str) and not path.exists():
@@ -63,10 +63,9 @@ def _mesh_file(value: object, validation: ValidationInfo) -> Path:
     return path
 
 
+_MESH_PATTERN = r"\.([pP][lL][yY]|[oO][bB][jJ]|[sS][tT][lL]|[oO][fF][fF]|[gG][lL][bB])$"
 LetterText = Annotated[str, Checked(_letters, {"type": "string", "pattern": "^[A-Z0-9 ]*[A-Z0-9][A-Z0-9 ]*$"})]
-MeshFilename = Annotated[
-    Path, Checked(_mesh_file, {"type": "string", "pattern": r"\.([pP][lL][yY]|[oO][bB][jJ])$"}, with_context=True)
-]
+MeshFilename = Annotated[Path, Checked(_mesh_file, {"type": "string", "pattern": _MESH_PATTERN}, with_context=True)]
 ShapeMapping = Annotated[FrozenDict, plugin_mapping(check_shape, SHAPE_TYPES)]
 
 
@@ -129,7 +128,7 @@ class FromFile(Section):
     made_by: Text | None = Field(default=None, exclude=True)
     """the command that makes the file, told when it is missing"""
     filename: MeshFilename
-    """a .ply or .obj file; relative names start at the YAML's folder"""
+    """a .ply, .obj, .stl, .off or .glb file; relative names start at the YAML's folder"""
     scale: Scale = 1.0
     """m per unit of the file; [x, y, z]: along its axes; negative: mirrored, and its front stays its front"""
     rotate_deg: Angles3 = _NO_ROTATION
@@ -138,10 +137,19 @@ class FromFile(Section):
     """m, scene coordinates"""
 
 
+class FitConfig(Section):
+    """A size for a mesh of any unit and origin."""
+
+    largest: Length
+    """m, the largest edge of the mesh's bounding box after scale and before the rotation"""
+
+
 class MeshConfig(FromFile, _HiddenItem):
     """A triangle mesh from a file: scaled, then rotated about x, then y, then z, then translated."""
 
     type: Literal["mesh"]
+    fit: FitConfig | None = None
+    """{largest: 0.8}: brought to this size, its bounding box centred on translate; null: as the file has it"""
     normals: Annotated[Literal["auto", "file", "flat", "smooth"], ONE_OF] = "auto"
     """auto: the file's vertex normals where it has some, else flat faces; file: it has to have them; flat: none;
     smooth: averaged from the faces around each vertex"""

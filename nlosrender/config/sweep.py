@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import math
-import random
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
-from nlosrender.config.fields import Checked, Seed, as_finite, finite_numbers, integer
+from nlosrender.config.draws import draw_of
+from nlosrender.config.fields import Checked, Seed, as_finite, integer
 from nlosrender.config.issues import invalid_value, mismatch
 from nlosrender.config.section import MAPPING, ONE_OF, Section
 from nlosrender.errors import ValidationIssue
@@ -19,38 +18,6 @@ MAX_CAPTURES = 100_000  # of one sweep; beyond it a range is a slip of the pen
 _STEP_SLACK = 1e-9  # of a step: 0.1 * 3 is not 0.3
 
 _VALUES = "a list of values, {range: {start: 0.5, stop: 1.5, n: 5}} or log_range alike"
-_DRAW = "one of {uniform: [a, b]}, {log_uniform: [a, b]}, {integers: [a, b]}, {choice: [...]}"
-
-
-@dataclass(frozen=True)
-class Draw:
-    """A distribution of one key.
-
-    Parameters
-    ----------
-    kind
-        ``uniform``, ``log_uniform``, ``integers`` (both ends included) or ``choice``.
-    among
-        The two ends, or what is chosen from.
-    """
-
-    kind: str
-    among: tuple[Any, ...]
-
-    def value(self, key: str, seed: int, number: int) -> Any:
-        """Return the ``number``-th draw for ``key``; it depends on these and the seed alone.
-
-        So a sweep can be made longer, or get further keys, without changing what has been rendered.
-        """
-        share = random.Random(f"{seed} {key} {number}").random()  # of text: the same on every machine and version
-        low, high = self.among[0], self.among[-1]
-        if self.kind == "choice":
-            return self.among[int(share * len(self.among))]
-        if self.kind == "integers":
-            return low + int(share * (high - low + 1))
-        if self.kind == "log_uniform":
-            return math.exp(math.log(low) + share * (math.log(high) - math.log(low)))
-        return low + share * (high - low)
 
 
 def _swept_values(value: object) -> tuple[Any, ...]:
@@ -92,24 +59,6 @@ def _range(kind: str, start: float, stop: float, n: int) -> tuple[float | int, .
     return tuple(int(value) for value in values) if all(value.is_integer() for value in values) else tuple(values)
 
 
-def _draw(value: object) -> Draw:
-    kinds = ("uniform", "log_uniform", "integers", "choice")
-    if not isinstance(value, Mapping) or len(value) != 1 or next(iter(value)) not in kinds:
-        raise invalid_value(value, _DRAW)
-    kind, among = next(iter(value.items()))
-    if kind == "choice":
-        if not isinstance(among, list) or not among:
-            raise invalid_value(among, "a list of values to choose from")
-        return Draw(kind, tuple(among))
-    ends = finite_numbers(among, 2)
-    above = 0.0 if kind == "log_uniform" else -math.inf
-    whole = kind != "integers" or (ends and all(isinstance(end, int) for end in among))
-    if ends is None or not whole or not above < ends[0] <= ends[1]:
-        need = {"integers": "two integers", "log_uniform": "two numbers > 0"}.get(kind, "two numbers")
-        raise invalid_value(among, f"{need} [a, b] with a <= b")
-    return Draw(kind, tuple(among) if kind == "integers" else tuple(ends))
-
-
 def _one_key(**properties: dict[str, Any]) -> dict[str, Any]:
     """Return the JSON Schema of a mapping with one of some keys."""
     return {
@@ -123,11 +72,10 @@ def _one_key(**properties: dict[str, Any]) -> dict[str, Any]:
 
 _LIST = {"type": "array", "minItems": 1}
 _RANGE = {"type": "object", "required": ["start", "stop"], "additionalProperties": {"type": "number"}}
-_ENDS = {"type": "array", "items": {"type": "number"}, "minItems": 2, "maxItems": 2}
 Values = Annotated[
     tuple[Any, ...], Checked(_swept_values, {"anyOf": [_LIST, _one_key(range=_RANGE, log_range=_RANGE)]})
 ]
-RandomDraw = Annotated[Draw, Checked(_draw, _one_key(uniform=_ENDS, log_uniform=_ENDS, integers=_ENDS, choice=_LIST))]
+RandomDraw = Annotated[Any, Checked(draw_of, {"type": ["object", "array"]}, with_context=True)]
 DrawCount = Annotated[int, integer(f"an integer from 1 to {MAX_CAPTURES}", 1, MAX_CAPTURES)]
 
 
@@ -139,7 +87,8 @@ class RandomSweep(Section):
     seed: Seed = 0
     """start of the draws; they do not depend on count or on other keys"""
     keys: Annotated[dict[str, RandomDraw], MAPPING]
-    """dotted key: {uniform: [a, b]}, {log_uniform: [a, b]}, {integers: [a, b]} or {choice: [...]}"""
+    """dotted key: {uniform: [a, b]}, {log_uniform: [a, b]}, {integers: [a, b]}, {choice: [...]}, {files: "*.obj", pick:
+    random or each}, {rotation: uniform or three [a, b]}, {inside: three [a, b]}; or a value with draws in it"""
 
 
 class SweepConfig(Section):

@@ -8,10 +8,13 @@ import os
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 from nlosrender.config.document import Config
+from nlosrender.config.draws import Drawn, Suffix, drawn_value
+from nlosrender.config.families import FAMILY_KEYS, PLACES, PLACING, Measure, Member, family_items, placed, with_copies
 from nlosrender.config.issues import shown
 from nlosrender.config.load import MAX_ISSUES, capture_config, in_order, validated
 from nlosrender.config.overrides import put
@@ -21,17 +24,38 @@ from nlosrender.errors import ConfigError, KeyPath, ValidationIssue
 
 DEFAULT_PATTERN = "{name}/{index:05d}.hdf5"
 _SWEEP = "sweep"
+ALL = -1  # in place of an item: all that is not of a further copy
 _PLACEHOLDER = re.compile(r"\{(?:(name)|index(?::(0?\d)d)?)\}")
 
 
 @dataclass(frozen=True)
 class _Setting:
-    """One value of one swept key, and where in the YAML it comes from."""
+    """One value of one swept key, or a draw of it, and where in the YAML it comes from."""
 
     key: str
-    value: Any
+    value: Any  # or, with a seed, what ``drawn_value`` takes
     key_at: KeyPath
     at: KeyPath  # of the value
+    seed: int | None = None  # of a draw
+    number: int = 0  # of the draw
+
+    def settled(self, drawn: list[Drawn], suffix: Suffix = lambda key: "") -> Any:
+        """Return the value; a drawn one is also added to ``drawn``, ``suffix`` makes it another one."""
+        if self.seed is None:
+            return copy.deepcopy(self.value)
+        return copy.deepcopy(drawn_value(self.value, self.key, self.seed, self.number, drawn, suffix))
+
+
+Settings = tuple[_Setting, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class SweptCapture:
+    """One capture of a sweep."""
+
+    config: Config
+    values: dict[str, Any]  # by swept key; further copies of an item have #1, #2 after theirs
+    files: dict[str, str]  # drawn files by key, as the YAML would name them
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,8 +63,9 @@ class Sweep:
     """The captures of one file: how many, what differs between them, and the config of each."""
 
     document: Document  # without the sweep itself
-    settings: tuple[tuple[_Setting, ...], ...]  # of every capture
+    settings: tuple[Settings, ...]  # of every capture
     paths: tuple[Path, ...]  # output of every capture, all different
+    measure: Measure | None = None  # the box around an item, for families that need it
 
     def __len__(self) -> int:
         """Return the number of captures."""
@@ -56,24 +81,49 @@ class Sweep:
         """The folder that all captures are below."""
         return Path(os.path.commonpath([path.absolute().parent for path in self.paths]))
 
-    def values(self, index: int) -> dict[str, Any]:
-        """Return the values of the swept keys in one capture."""
-        return {setting.key: setting.value for setting in self.settings[index]}
+    @cached_property
+    def keys(self) -> tuple[str, ...]:
+        """The swept keys, as the file has them."""
+        return tuple(setting.key for setting in self.settings[0])
 
-    def config(self, index: int) -> Config:
-        """Return the config of one capture.
+    def values(self, index: int) -> dict[str, Any]:
+        """Return the values of the swept keys in one capture, places of families as first drawn."""
+        return self._drawing(index).values()
+
+    def files(self, index: int) -> dict[str, str]:
+        """Return the drawn files of one capture by key."""
+        return self._drawing(index).files()
+
+    def capture(self, index: int) -> SweptCapture:
+        """Return one capture, its families placed.
 
         Raises
         ------
         ConfigError
-            It has mistakes; ``sweep_of`` has looked for them.
+            It has mistakes; ``sweep_of`` has looked for those that need no mesh to be read.
         """
         # built when it is needed: a hundred thousand configs fill the memory
-        return capture_config(_capture_document(self.document, self.settings[index], index))
+        drawing = self._drawing(index)
+        drawing.place(self.measure)
+        return SweptCapture(capture_config(drawing.document), drawing.values(), drawing.files())
+
+    def config(self, index: int) -> Config:
+        """Return the config of one capture; errors as of ``capture``."""
+        return self.capture(index).config
+
+    def _drawing(self, index: int) -> _Drawing:
+        return _Drawing(self.document, self.settings[index], index)
 
 
-def sweep_of(document: Document) -> Sweep | None:
-    """Validate all captures of a document's sweep.
+def sweep_of(document: Document, measure: Measure | None = None) -> Sweep | None:
+    """Validate all captures of a document's sweep, but for places that depend on the meshes of a family.
+
+    Parameters
+    ----------
+    document
+        The file.
+    measure
+        Tells the box around an item, for families with ``no_overlap`` or ``on_floor``.
 
     Returns
     -------
@@ -92,7 +142,7 @@ def sweep_of(document: Document) -> Sweep | None:
         raise ConfigError(in_order(found, document))
     _check_overrides(section, document)
     base = replace(document, tree={key: value for key, value in document.tree.items() if key != _SWEEP})
-    return _validated(base, tuple(_settings(section)))
+    return replace(_validated(base, tuple(_settings(section))), measure=measure)
 
 
 def _check_overrides(section: SweepConfig, document: Document) -> None:
@@ -115,9 +165,7 @@ def _settings(section: SweepConfig) -> Iterator[tuple[_Setting, ...]]:
         at, seed, draws = (_SWEEP, "random", "keys"), section.random.seed, section.random.keys
         axes += [
             [
-                tuple(
-                    _Setting(key, draw.value(key, seed, number), (*at, key), (*at, key)) for key, draw in draws.items()
-                )
+                tuple(_Setting(key, draw, (*at, key), (*at, key), seed, number) for key, draw in draws.items())
                 for number in range(section.random.count)
             ]
         ]
@@ -132,7 +180,7 @@ def _validated(base: Document, settings: tuple[tuple[_Setting, ...], ...]) -> Sw
     paths: dict[Path, int] = {}
     for index, own in enumerate(settings):
         try:
-            path = capture_config(_capture_document(base, own, index)).output.path
+            path = capture_config(_Drawing(base, own, index).document).output.path
         except ConfigError as error:
             for issue in error.issues:
                 found.setdefault(issue, []).append(index)
@@ -152,24 +200,84 @@ def _counted(issue: ValidationIssue, indices: list[int], settings: tuple[tuple[_
     """Say which captures have a mistake that not all of them have."""
     if len(indices) == len(settings):
         return issue
-    first = ", ".join(f"{setting.key} = {shown(setting.value)}" for setting in settings[indices[0]])
+    first = ", ".join(f"{setting.key} = {shown(setting.settled([]))}" for setting in settings[indices[0]])
     count = (
         f"{len(indices)} of {len(settings)} captures, the first one with" if len(indices) > 1 else "The capture with"
     )
     return replace(issue, message=f"{issue.message} ({count} {first}.)")
 
 
-def _capture_document(base: Document, settings: tuple[_Setting, ...], index: int) -> Document:
-    """Return the document of one capture: the base with the swept values in place and an output of its own."""
-    document = base.copy()
-    for setting in settings:
-        place = Place(base.place(setting.key_at, "key"), base.place(setting.at))
-        try:
-            put(document, setting.key.split("."), copy.deepcopy(setting.value), place)
-        except ConfigError as error:
-            document.issues += error.issues
-    _set_output(document, index)
-    return document
+class _Drawing:
+    """The document of one capture: the base with swept and drawn values in place, copies, and an output of its own."""
+
+    def __init__(self, base: Document, settings: Settings, index: int):
+        self._base, self._settings = base, settings
+        self._lifted: dict[str, Any] = {}
+        self._drawn: dict[tuple[int, int], list[Drawn]] = {(ALL, 0): []}  # by item and copy, redrawn ones later
+        self.document = self._filled(lambda key: "", self._drawn[ALL, 0])
+        self.members: list[Member] = with_copies(self.document, self.redraw) if family_items(self.document.tree) else []
+        _set_output(self.document, index)
+
+    def redraw(self, item: int, number: int, attempt: int) -> Any:
+        """Return a raw item as its copy ``number`` has it; another ``attempt`` draws only another place."""
+
+        def suffix(key: str) -> str:
+            own = _own_key(key, item)
+            is_moved = attempt > 0 and own in PLACING
+            return "" if own is None else f"#{number}" * (number > 0) + f"~{attempt}" * is_moved
+
+        drawn: list[Drawn] = []
+        raw: dict[str, Any] = self._filled(suffix, drawn).tree["scene"]["hidden_geometry"][item]
+        self._drawn[item, number] = [one for one in drawn if _own_key(one.key, item) is not None]
+        return raw
+
+    def place(self, measure: Measure | None) -> None:
+        """Place the members of families; ConfigError: a mistake, or there is no place."""
+        if not self.members:
+            return
+        if measure is None:
+            raise ValueError("families are placed by a measure of items")
+        placed(self.document, self.members, self.redraw, measure, capture_config)
+        for member in self.members:
+            item = self.document.tree["scene"]["hidden_geometry"][member.at]
+            key = next((key for key in PLACES if key in item), None)
+            if key is not None and member.floor is not None:
+                where = f"scene.hidden_geometry.{member.item}.{key}{_mark(member.copy)}"
+                self._lifted[where] = item[key]
+
+    def values(self) -> dict[str, Any]:
+        """Return the swept and drawn values by key."""
+        found = {setting.key: copy.deepcopy(setting.value) for setting in self._settings if setting.seed is None}
+        for (_, number), drawn in self._drawn.items():
+            told = (one for one in drawn if one.key.rpartition(".")[2] not in FAMILY_KEYS[number == 0 :])
+            found |= {f"{one.key}{_mark(number)}": copy.deepcopy(one.value) for one in told}
+        return found | self._lifted
+
+    def files(self) -> dict[str, str]:
+        """Return the drawn files by key."""
+        each = ((f"{one.key}{_mark(number)}", one) for (_, number), drawn in self._drawn.items() for one in drawn)
+        return {key: one.value for key, one in each if one.draw.kind == "files"}
+
+    def _filled(self, suffix: Suffix, drawn: list[Drawn]) -> Document:
+        document = self._base.copy()
+        for setting in self._settings:
+            place = Place(document.place(setting.key_at, "key"), document.place(setting.at))
+            try:
+                put(document, setting.key.split("."), setting.settled(drawn, suffix), place)
+            except ConfigError as error:
+                document.issues += error.issues
+        return document
+
+
+def _mark(number: int) -> str:
+    """Return what keys of a further copy of an item end with."""
+    return f"#{number}" if number else ""
+
+
+def _own_key(key: str, item: int) -> str | None:
+    """Return the first key below an item that a dotted key leads to, empty for the item itself; None: another place."""
+    start = f"scene.hidden_geometry.{item}"
+    return key.removeprefix(start).lstrip(".").partition(".")[0] if f"{key}.".startswith(f"{start}.") else None
 
 
 def _set_output(document: Document, index: int) -> None:

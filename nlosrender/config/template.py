@@ -84,7 +84,7 @@ scene:
     # Further items, one example of each type. rotate_deg: degrees about x, then y, then z.
     # - {{type: mesh, filename: bunny.ply, scale: 1, rotate_deg: [0, 90, 0], translate: [0, 0, 1], normals: auto}}
     #   # scale: a number or [x, y, z], negative mirrors; normals: auto, file, flat or smooth, or face_normals: true
-    #   # for flat ones; see docs/meshes.md
+    #   # for flat ones; see docs/meshes.md. fit: {{largest: 0.8}}: that size [m], centred on translate; default null
     # - {{type: letters, text: Z, height: 0.8, thickness: 0.0, stroke_width: null, spacing: null, center: [0, 0, 1]}}
     # - {{type: box, center: [0, 0, 1], size: [0.3, 0.2, 0.1], rotate_deg: [0, 0, 30]}}
     # - {{type: sphere, center: [0, 0, 1], radius: 0.3, inside: false}}
@@ -145,6 +145,7 @@ output:
 #     seed: 0                    # 0..4294967295; default 0
 #     keys:                      # uniform: [a, b] | log_uniform: [a, b] | integers: [a, b] | choice: [...]
 #       scene.hidden_geometry.0.bsdf.reflectance: {{uniform: [0.2, 0.9]}}
+#       # also files of a folder, rotations, places, copies of an item, draws inside a value: docs/datasets.md
 """
 
 

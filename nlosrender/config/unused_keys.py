@@ -34,7 +34,7 @@ _NEEDED_BY: dict[str, tuple[str, ...]] = {
 }
 _SECTIONS: dict[str, type[Section]] = {"scene": SceneConfig, "capture": CaptureConfig, "render": RenderConfig}
 # an item or a wall without them would stand elsewhere than its author thinks: they stay mistakes
-_PLACING = ("center", "translate", "rotate_deg", "scale")
+_PLACING = ("center", "translate", "rotate_deg", "scale", "fit")
 
 
 def fields_by_type(choice: Any) -> dict[str, set[str]]:

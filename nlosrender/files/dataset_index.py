@@ -6,7 +6,7 @@ import json
 import math
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -31,13 +31,14 @@ class IndexEntry:
     file: str  # relative to the index's folder
     values: Mapping[str, Any]  # of the keys that differ between the captures
     status: Status
-    capture_hash: str  # of the configuration, without where and on what it is rendered
+    capture_hash: str | None = None  # of the configuration, without where and on what it is rendered
     config_hash: str | None = None
     energy: Mapping[str, float] | None = None  # H summed over the capture, by bounce [J m^-2 sr^-1]
     error_estimate: float | None = None  # relative L2 of H; None: not known
     seconds: float | None = None  # of the run that finished it
     message: str | None = None  # why it failed
     unsampled_paths: Sequence[str] = ()  # classes of paths whose light is missing
+    files: Mapping[str, Any] = field(default_factory=dict)  # drawn ones by key: {"file": name, "sha256": digest}
 
 
 def stored_entry(entry: IndexEntry, path: Path) -> IndexEntry:

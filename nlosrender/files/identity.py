@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import json
 from collections.abc import Iterator, Mapping, Sequence
@@ -20,6 +21,7 @@ NOT_THE_CAPTURE = (("output", "path"), ("render", "memory_limit"), ("render", "b
 PACKAGES = ("nlosrender", "mitsuba", "drjit")  # whose versions the samples depend on
 FILE_KEY = "filename"  # of meshes, textures, spectra
 SCENE_KEY = "mitsuba"  # of a whole scene, which names files of its own
+KEPT_DIGESTS = 65536  # of meshes, which the captures of a dataset share
 MAX_LISTED = 6  # differences in one message
 SELECTION = "part_selection"  # attribute of a file that holds a part: the option that selected it
 
@@ -128,8 +130,20 @@ def _scene_digests(name: str) -> str | list[str]:
 
 def _digest(name: str) -> str:
     """Return a digest of a file: the same mesh may lie elsewhere on another machine, or be another one by now."""
+    digest = file_digest(Path(name))
+    return name if digest is None else f"sha256:{digest}"  # the renderer says so, with its place in the YAML
+
+
+def file_digest(path: Path) -> str | None:
+    """Return the SHA-256 (hex) of a file; None: it cannot be read."""
     try:
-        with Path(name).open("rb") as stream:
-            return f"sha256:{hashlib.file_digest(stream, 'sha256').hexdigest()}"
-    except OSError:  # the renderer says so, with its place in the YAML
-        return name
+        status = path.stat()
+        return _sha256(path, status.st_mtime_ns, status.st_size)
+    except OSError:
+        return None
+
+
+@functools.lru_cache(KEPT_DIGESTS)
+def _sha256(path: Path, changed: int, size: int) -> str:
+    with path.open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()

@@ -17,7 +17,7 @@ from nlosrender.errors import ConfigError, FileError, InterruptedRender, OptionE
 from nlosrender.files.atomic_write import explained_write, partial_folder
 from nlosrender.files.dataset_index import IndexEntry, relative_name, stored_entry, write_index
 from nlosrender.files.file_kinds import CAPTURE, same_capture
-from nlosrender.files.identity import capture_hash
+from nlosrender.files.identity import capture_hash, file_digest
 from nlosrender.files.reading.reader import read_header
 from nlosrender.interruption import StopRequest, stop_request
 from nlosrender.rendering.render_report import Progress, RenderReport, Standing, Warn, Watch
@@ -59,11 +59,26 @@ class _Dataset:
                 folder.mkdir(parents=True, exist_ok=True)
 
     def look(self, index: int, anew: bool = False) -> IndexEntry:
-        """Note and return what there is of a capture; with ``anew`` nothing counts."""
+        """Note and return what there is of a capture; with ``anew`` nothing counts.
+
+        What nothing is there of is not asked for its hash: meshes of a large dataset would be read before the first
+        render begins.
+        """
         sweep, path = self.sweep, self.sweep.paths[index]
-        expected = capture_hash(config_to_dict(sweep.config(index)))
-        entry = IndexEntry(index, relative_name(path, self.folder), sweep.values(index), "pending", expected)
-        self.entries[index] = entry if anew else stored_entry(entry, path)
+        files = {key: {"file": name, "sha256": None} for key, name in sweep.files(index).items()}
+        entry = IndexEntry(index, relative_name(path, self.folder), sweep.values(index), "pending", files=files)
+        self.entries[index] = entry
+        if anew or not os.path.lexists(path):
+            return entry
+        with suppress(ConfigError):  # such as of a mesh that cannot be read: the render says so
+            capture = sweep.capture(index)
+            files = {
+                key: {"file": name, "sha256": file_digest(sweep.document.folder / name)}
+                for key, name in capture.files.items()
+            }
+            expected = capture_hash(config_to_dict(capture.config))
+            entry = replace(entry, values=capture.values, files=files, capture_hash=expected)
+            self.entries[index] = stored_entry(entry, path)
         return self.entries[index]
 
     def refuse_others(self, indices: Sequence[int], overwrite: bool) -> None:
@@ -79,15 +94,17 @@ class _Dataset:
             target = Path(os.path.realpath(path))
             if not os.path.lexists(target) or partial_folder(target).exists():  # the render checks what it began over
                 continue
+            expected = self.entries[index].capture_hash
+            if overwrite or expected is None:  # None: its render will fail
+                CAPTURE.refuse_others(path, target)
+                continue
             config = config_to_dict(self.sweep.config(index))
-            kind = CAPTURE if overwrite else same_capture(self.entries[index].capture_hash, str(WHOLE), config)
-            kind.refuse_others(path, target)
+            same_capture(expected, str(WHOLE), config).refuse_others(path, target)
 
     def write(self, at_once: bool = False) -> None:
         """Write the index, unless that was done a moment ago."""
         if at_once or time.monotonic() - self._written > INDEX_SECONDS:
-            keys = list(self.sweep.values(0))
-            write_index(self.path, self.sweep.source, keys, [self.entries[index] for index in self.chosen])
+            write_index(self.path, self.sweep.source, self.sweep.keys, [self.entries[index] for index in self.chosen])
             self._written = time.monotonic()
 
 

@@ -80,7 +80,7 @@ def _read(surface: Surface, file: MeshFile) -> tuple[FileMesh, TriangleMesh, str
     try:
         read = read_mesh_file(file.filename, file.kind)
         mesh, normals = with_normals(read.mesh, file.normals)
-        mesh = mesh.transformed(file.to_local)
+        mesh = mesh.transformed(file.placed(mesh.bounds()))
         mesh = readable(mesh) if file.flip_v else mesh
         mesh = mesh.turned_round() if file.flip_normals else mesh
     except ValueError as error:

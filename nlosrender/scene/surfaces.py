@@ -34,14 +34,26 @@ Radiance = float | tuple[float, float, float]  # grey or [r, g, b], W m^-2 sr^-1
 
 @dataclass(frozen=True, eq=False)
 class MeshFile:
-    """A .ply or .obj file and the (4, 4) matrix from its coordinates to the local frame [m]."""
+    """A mesh file and the (4, 4) matrix from its coordinates to the local frame [m]."""
 
     filename: str
     to_local: Float64
-    kind: str = "ply"  # one of MESH_PLUGINS
+    kind: str = "ply"  # the suffix
     flip_normals: bool = False  # seen from the other side
     flip_v: bool = False  # turn the vertical texture coordinate round
     normals: Normals = "auto"
+    fit: tuple[float, Float64] | None = None  # largest edge [m] of the box of what (3,) scales along the file's axes
+
+    def placed(self, box: Bounds) -> Float64:
+        """Return the (4, 4) matrix to the local frame of a file whose points have this box: ``fit`` needs it."""
+        if self.fit is None:
+            return self.to_local
+        largest, scale = self.fit
+        low, high = box
+        fitted = np.eye(4) * (largest / float((np.abs(scale) * (high - low)).max()))
+        fitted[:3, 3] = -fitted[0, 0] * (low + high) / 2
+        fitted[3, 3] = 1.0
+        return self.to_local @ fitted
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,7 +142,8 @@ def _shape(item: HiddenItemConfig, frame: Pose) -> TriangleMesh | MeshFile | Sha
         case "mesh":
             kind = Path(item.filename).suffix.lower().lstrip(".")
             to_local = frame.inverse_matrix() @ mesh_matrix(item)
-            return MeshFile(str(item.filename), to_local, kind, normals=item.shading_normals)
+            fit = None if item.fit is None else (float(item.fit.largest), np.broadcast_to(item.scale, 3))
+            return MeshFile(str(item.filename), to_local, kind, normals=item.shading_normals, fit=fit)
         case "sphere" | "cylinder":
             return _pictured(item, frame) if has_picture(item.bsdf) else _plain_round(item, frame)
         case "mitsuba":

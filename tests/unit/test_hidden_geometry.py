@@ -74,7 +74,13 @@ def test_mesh_file_is_scaled_turned_and_moved():
     """A file's point p comes to scale * p, turned about x, y, z, translated, then into the local frame."""
     angles, translate = [20, 35, -70], [1.0, 2.0, 3.0]
     config = item(
-        "mesh", filename="/a/b.ply", scale=2.5, rotate_deg=angles, translate=translate, shading_normals="smooth"
+        "mesh",
+        filename="/a/b.ply",
+        scale=2.5,
+        rotate_deg=angles,
+        translate=translate,
+        shading_normals="smooth",
+        fit=None,
     )
     surface = one(config)
     assert isinstance(surface.shape, MeshFile)

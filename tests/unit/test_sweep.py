@@ -11,8 +11,9 @@ import pytest
 
 from nlosrender.config import sweep_load
 from nlosrender.config.document import Config
+from nlosrender.config.draws import Draw
 from nlosrender.config.load import config_hash, config_to_dict, parse_config, parse_document
-from nlosrender.config.sweep import MAX_CAPTURES, Draw, SweepConfig
+from nlosrender.config.sweep import MAX_CAPTURES, SweepConfig
 from nlosrender.config.sweep_load import Sweep
 from nlosrender.errors import ConfigError
 

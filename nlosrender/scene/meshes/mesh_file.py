@@ -12,11 +12,12 @@ from nlosrender.scene.meshes.mesh_normals import Normals, with_normals
 from nlosrender.scene.meshes.obj import read_obj
 from nlosrender.scene.meshes.ply import read_ply
 from nlosrender.scene.meshes.triangle_mesh import TriangleMesh
+from nlosrender.scene.meshes.trimesh_formats import FORMATS, reader_of
 
 MAX_BYTES = 4 * 2**30  # the arrays read from a text take about as much again
 MAX_FACES = 2**31 - 1  # Mitsuba counts with 32 bits
 MAX_COORDINATE = 1e30  # the squares of areas stay finite in float64
-READERS = {"ply": read_ply, "obj": read_obj}
+READERS = {"ply": read_ply, "obj": read_obj} | {kind: reader_of(kind) for kind in FORMATS}
 
 
 def read_mesh(filename: str, kind: str, normals: Normals = "auto") -> TriangleMesh:
@@ -31,7 +32,7 @@ def read_mesh(filename: str, kind: str, normals: Normals = "auto") -> TriangleMe
 
 
 def read_mesh_file(filename: str, kind: str) -> FileMesh:
-    """Return what a ``ply`` or ``obj`` file holds in its own coordinates, without triangles that have no area.
+    """Return what a mesh file holds in its own coordinates, without triangles of no area; kinds: ``READERS``.
 
     Raises
     ------
