@@ -299,3 +299,43 @@ def test_virtual_lights_in_a_mirror_are_those_of_twice_the_length() -> None:
         deviation = np.sqrt(seeds.var(axis=0, ddof=1) / 6 + sums(variance))
         assert (np.abs(seeds.mean(axis=0) - expected) <= 6 * deviation + 0.002 * expected).all()
     assert np.sqrt(own.sum()) < 0.03 * np.linalg.norm(mean)
+
+
+@pytest.mark.parametrize("grid", [0.0, 0.3])
+def test_the_index_has_every_mirror_that_may_reflect(grid: float, tmp_path: Path) -> None:
+    """Of 300 triangles all that the quick test allows, for points anywhere and lasers of a point or of a grid."""
+    draw = np.random.default_rng(7)
+    centres = draw.uniform([-0.8, -0.8, 0.3], [0.8, 0.8, 1.2], (300, 3))
+    vertices = (centres[:, None] + draw.normal(0, 0.05, (300, 3, 3))).reshape(-1, 3)
+    vertices = np.concatenate([vertices, [[0, 0, 0.05], [0.01, 0, 0.05], [0, 0.01, 0.05]]])  # at the laser, and open
+    faces = np.arange(len(vertices)).reshape(-1, 3)
+    name = write_uv_ply(tmp_path / "mirrors.ply", vertices, None, faces)
+    mesh = {"type": "mesh", "filename": name, "normals": "flat", "bsdf": {"type": "twosided", "bsdf": MIRROR}}
+    lasers = {"laser_grid": {"nx": 3, "ny": 2, "width": grid, "height": grid}} if grid else {}
+    stage = Stage.of(flat_wall(mesh, scan="exhaustive" if grid else "single", capture=lasers), tmp_path)
+
+    import drjit as dr
+    import mitsuba as mi
+
+    from nlosrender.engine.launch.flat_mirrors import FlatMirrors
+    from nlosrender.engine.launch.mirror_index import lit_sphere
+
+    built, capture = stage.engine.built, stage.engine.capture
+    mirrors = FlatMirrors.of(built, lit_sphere(built, capture))
+    box = built.scene.bbox()
+    points = draw.uniform(np.ravel(box.min), np.ravel(box.max), (400, 3))
+    begin, count = (np.array(x, dtype=int) for x in mirrors.index.near(mi.Point3f(points.T), mi.Bool(True)))
+    listed = np.array(mirrors.index.mirrors)
+    near = np.zeros((len(points), mirrors.n_mirrors), bool)
+    for row, start, n in zip(near, begin, count, strict=True):
+        row[listed[start : start + n]] = True
+    pair = dr.arange(mi.UInt32, near.size)
+    point = dr.gather(mi.Point3f, mi.Point3f(points.T), pair // mirrors.n_mirrors)
+    found = 0
+    for laser in capture.laser_grid.positions.reshape(-1, 3) / built.metres_per_engine_unit:
+        may = np.array(mirrors.may_reflect(pair % mirrors.n_mirrors, point, mi.Point3f(*laser.tolist())))
+        may = may.reshape(near.shape)
+        assert not (may & ~near).any()
+        found += may.sum()
+    assert found > 100
+    assert near.mean() < (0.9 if grid else 0.1)

@@ -82,8 +82,8 @@ def test_engines_agree_in_a_tube_in_a_few_seconds(tmp_path: Path) -> None:
 @pytest.mark.parametrize("scan", ["single", "confocal", "exhaustive"])
 @pytest.mark.parametrize("name", WALLS)
 def test_engines_agree_on_curved_walls(name: str, scan: str, tmp_path: Path) -> None:
-    """Bin groups, rows and energies of every bounce."""
-    compare(name, scan, tmp_path, seeds=16, rounds=8, spp=100_000, target=0.01)
+    """Bin groups, rows and energies of every bounce; of 8 rounds some sums on a tube are far from normal."""
+    compare(name, scan, tmp_path, seeds=16, rounds=32, spp=100_000, target=0.01)
 
 
 @pytest.mark.parametrize("engine", ["path", "virtual_lights"])

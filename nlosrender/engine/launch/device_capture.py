@@ -19,6 +19,7 @@ from nlosrender.engine.launch.flat_mirrors import FlatMirrors
 from nlosrender.engine.launch.histogram import DeviceHistogram, Histogram, HistogramShape
 from nlosrender.engine.launch.launch_params import LaunchParams
 from nlosrender.engine.launch.mirror_connections import Mirrors, deposit_mirrored_bounce, mirrors_of
+from nlosrender.engine.launch.mirror_index import lit_sphere
 from nlosrender.engine.launch.morton import morton_order
 from nlosrender.engine.launch.schedule import DEFAULT_SCHEDULE, ScheduleTuning
 from nlosrender.engine.launch.second_bounce import deposit_second_bounce
@@ -148,7 +149,9 @@ class DeviceCapture:
     def mirrors(self) -> tuple[Mirrors, ...]:
         """Flat and round mirrors for connections to the lasers; none where only the second bounce is asked for."""
         highest = self.options.bounces.max_bounces
-        return () if highest is not None and highest < THIRD_BOUNCE else mirrors_of(self.built)
+        if highest is not None and highest < THIRD_BOUNCE:
+            return ()
+        return mirrors_of(self.built, lit_sphere(self.built, self.capture))
 
     @cached_property
     def lone_mirror(self) -> FlatMirrors | None:

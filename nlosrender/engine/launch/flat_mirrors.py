@@ -18,6 +18,7 @@ from scipy import sparse
 
 from nlosrender.engine.launch.device_arrays import on_device
 from nlosrender.engine.launch.facing_triangles import facing_triangles
+from nlosrender.engine.launch.mirror_index import LitSphere, MirrorIndex
 from nlosrender.engine.launch.ray_offsets import offset_origin, ray_offset
 from nlosrender.scene.build import BuiltScene, wall_box
 from nlosrender.scene.pose import Float64
@@ -104,7 +105,7 @@ class FlatMirrors:
     """The flat mirrors of a scene on the device."""
 
     n_mirrors: int
-    count: mi.UInt32  # opaque copy of ``n_mirrors``
+    index: MirrorIndex
     # 12 a mirror: its plane (n, d) with n . x + d = 0, and two coordinates in it, affine maps (w, w0) of points: the
     # mirror lies where both are at least 0, and their sum is at most 1
     packed: mi.Float
@@ -135,8 +136,8 @@ class FlatMirrors:
         return points - 2 * (points @ plane[:3] + plane[3])[:, None] * plane[:3]
 
     @classmethod
-    def of(cls, built: BuiltScene) -> FlatMirrors:
-        """Return the flat mirrors of a scene; with polarised light there are none."""
+    def of(cls, built: BuiltScene, lasers: LitSphere | None) -> FlatMirrors:
+        """Return the flat mirrors of a scene, indexed for light of ``lasers``; with polarised light there are none."""
         corners, facets, lobes = [np.zeros((0, 3, 3))], [np.zeros(0, np.uint32)], [np.zeros((0, 2), np.uint32)]
         shapes = [shape for shape in built.scene.shapes() if has_flat_mirrors(shape)]
         first_facet: list[int] = []
@@ -153,11 +154,11 @@ class FlatMirrors:
             lobes.append(np.tile(np.array(delta_lobes(shape.bsdf()), np.uint32), (len(bounds), 1)))
             n_mirrors, n_facets = n_mirrors + len(bounds), n_facets + len(mirror_of)
             plain = PlainMirror.of(shape, triangles, bounds[0]) if n_mirrors == len(bounds) == 1 else None
-        bits = np.concatenate(lobes)
+        bits, around = np.concatenate(lobes), np.concatenate(corners)
         mirrors = cls(
             n_mirrors,
-            dr.opaque(mi.UInt32, n_mirrors),
-            on_device(mi.Float, np.ravel(_packed(np.concatenate(corners))).astype(np.float32)),
+            MirrorIndex.of(built, lasers, around),
+            on_device(mi.Float, np.ravel(_packed(around)).astype(np.float32)),
             on_device(mi.UInt32, np.ravel(bits)),
             components_of(int(np.bitwise_or.reduce(bits, axis=None))),
             NumberOfShape.of(shapes, first_facet),

@@ -10,6 +10,7 @@ import mitsuba as mi
 from nlosrender.engine.launch.flat_mirrors import FlatMirrors, has_flat_mirrors
 from nlosrender.engine.launch.histogram import DeviceHistogram
 from nlosrender.engine.launch.launch_params import LaunchParams
+from nlosrender.engine.launch.mirror_index import LitSphere
 from nlosrender.engine.launch.ray_offsets import off_the_wall
 from nlosrender.engine.launch.round_mirrors import RoundMirrors
 from nlosrender.scene.build import BuiltScene
@@ -25,14 +26,16 @@ class MirroredVertex:
     throughput: mi.Spectrum  # of the path up to it
     opl: mi.Float  # of the path up to it [engine units]
     slot: mi.UInt32  # bounce slot of the deposits
-    first: mi.UInt32  # mirror of the first connection
-    count: mi.UInt32  # of mirrors; after the last one follows number 0
+    begin: mi.UInt32  # in the mirrors' index: what is near the vertex begins here
+    length: mi.UInt32  # and so many mirrors are
+    first: mi.UInt32  # of these, the first that is tried
+    count: mi.UInt32  # that are tried; after the last one follows number 0
     in_spot: mi.Vector3f | None  # from the laser point to the point of its spot, in the wall's frame; None: no spot
 
 
-def mirrors_of(built: BuiltScene) -> tuple[Mirrors, ...]:
-    """Return the flat and the round mirrors of a scene, if there are any."""
-    flat = FlatMirrors.of(built) if any(map(has_flat_mirrors, built.scene.shapes())) else None
+def mirrors_of(built: BuiltScene, lasers: LitSphere | None = None) -> tuple[Mirrors, ...]:
+    """Return the flat and the round mirrors of a scene, if there are any, indexed for light of ``lasers``."""
+    flat = FlatMirrors.of(built, lasers) if any(map(has_flat_mirrors, built.scene.shapes())) else None
     return tuple(mirrors for mirrors in (flat, RoundMirrors.of(built)) if mirrors is not None)
 
 
@@ -41,9 +44,10 @@ def deposit_mirrored_bounce(params: LaunchParams, mirrors: Mirrors, histogram: D
 
     Parameters as of ``deposit_second_bounce``.
     """
-    sensor, zero = params.sensors.interaction, mi.UInt32(0)
-    vertex = MirroredVertex(sensor, mi.Spectrum(1), mi.Float(0), zero, zero, mirrors.count, None)
-    deposit_reflections(params, mirrors, histogram, vertex, mi.Bool(True))
+    sensor, zero, yes = params.sensors.interaction, mi.UInt32(0), mi.Bool(True)
+    begin, count = mirrors.index.near(sensor.p, yes)
+    vertex = MirroredVertex(sensor, mi.Spectrum(1), mi.Float(0), zero, begin, count, zero, count, None)
+    deposit_reflections(params, mirrors, histogram, vertex, yes)
 
 
 @dr.syntax
@@ -58,8 +62,9 @@ def deposit_reflections(
             active & (tried < vertex.count),
             exclude=[params, mirrors, histogram, vertex, active, laser, place],
         ):
-            number = vertex.first + tried
-            number = dr.select(number < mirrors.count, number, number - mirrors.count)
+            entry = vertex.first + tried
+            entry = vertex.begin + dr.select(entry < vertex.length, entry, entry - vertex.length)
+            number = mirrors.index.mirror(entry, active)
             is_near = active & mirrors.may_reflect(number, vertex.si.p, place)
             _connect(params, mirrors, histogram, vertex, laser, number, is_near)
             tried += 1

@@ -23,6 +23,7 @@ from nlosrender.engine.launch.flat_mirrors import (
     has_known_lobes,
     lobe_weight,
 )
+from nlosrender.engine.launch.mirror_index import MirrorIndex
 from nlosrender.engine.launch.ray_offsets import offset_origin
 from nlosrender.scene.build import BuiltScene
 from nlosrender.scene.loading.round_surfaces import ROUND_PLUGINS, RoundSurface
@@ -36,7 +37,7 @@ STEPS = 7
 class RoundMirrors:
     """The convex sides of the spheres and cylinders of a scene that have delta reflection lobes."""
 
-    count: mi.UInt32  # opaque
+    index: MirrorIndex
     packed: mi.Float  # eight a mirror: centre, radius; unit axis (0 of a sphere), length
     lobes: mi.UInt32  # of each mirror: bits of the delta reflection components on its outside
     components: tuple[int, ...]  # that any of them has
@@ -55,7 +56,7 @@ class RoundMirrors:
             row[4:7] = surface.axis / max(length, 1e-30)
         bits = np.array([_outer_lobes(shape) for shape in shapes], np.uint32)
         mirrors = cls(
-            dr.opaque(mi.UInt32, len(shapes)),
+            MirrorIndex.of_all(len(shapes)),
             on_device(mi.Float, rows.ravel().astype(np.float32)),
             on_device(mi.UInt32, bits),
             components_of(int(np.bitwise_or.reduce(bits))),

@@ -97,6 +97,7 @@ class PathEngine:
             has_transmission=any(bool(flag & mi.BSDFFlags.Transmission) for flag in flags),
             is_plain_diffuse=is_plain_diffuse(self.built),
             only_specular=self.only_specular,
+            delta_share=self.tuning.delta_share if self.only_specular else 0.0,
             has_mirrors=bool(self.mirrors),
             # with a mirrored spot every path adds what its sensor point sees of it
             max_tries=0 if has_spot and self.mirrors else self.tuning.max_tries,

@@ -158,6 +158,7 @@ def trace_paths(
         opl, medium = dr.select(start, 0, opl), dr.select(start, 1, medium)
         bounce = dr.select(start, mi.UInt32(FIRST_BOUNCE), bounce)
         is_past_gate &= ~start
+        is_specular &= ~start
         on_wall = vertex.shape == wall
 
         # ---- Sample the next direction ------------------------------------------------------------------------------
@@ -184,7 +185,9 @@ def trace_paths(
             alive &= ~dark
             has_target &= ~dark
         before = way
-        way, survival, eta = leave(settings, params, generator, vertex, on_wall, numbers, sample, by_bsdf, has_target)
+        way, survival, eta = leave(
+            settings, params, generator, vertex, on_wall, numbers, sample, by_bsdf, has_target, is_specular
+        )
         if dr.hint(settings.mirrors_spot, mode="scalar"):
             way.is_imaged = is_imaged(params, vertex, before, way, by_bsdf & ~start)
         if dr.hint(params.hidden_aabb is not None, mode="scalar"):
@@ -195,7 +198,7 @@ def trace_paths(
             alive &= ~misses
         medium *= eta
         if dr.hint(settings.only_specular, mode="scalar"):
-            is_specular = (is_specular & ~start) | way.is_delta
+            is_specular |= way.is_delta
 
         # ---- Stop ---------------------------------------------------------------------------------------------------
         if dr.hint(settings.goes_on and settings.russian_roulette, mode="scalar"):
@@ -254,7 +257,9 @@ def _begin_until_near(
     ):
         starts, numbers, _ = starts.begin(stride, steps)
         tries += 1
-        way, survival, eta = leave(settings, params, generator, sensor, on_wall, numbers, None, misses, nowhere)
+        way, survival, eta = leave(
+            settings, params, generator, sensor, on_wall, numbers, None, misses, nowhere, nowhere
+        )
         misses &= misses_hidden(params, way.ray)
     return generator, starts, way, survival, eta, misses
 

@@ -73,8 +73,8 @@ def connect_by_mirrors(
 ) -> None:
     """Connect a vertex to every laser of the lane by way of mirrors and deposit, one bounce later than directly.
 
-    By way of ``mirrors_per_vertex`` of either kind from a random one on, with the weight that makes up for the others;
-    of all of them where the point of the spot is given. docs/virtual-lights.md, 11.2.
+    By way of ``mirrors_per_vertex`` of either kind near the vertex, from a random one on, with the weight that makes up
+    for the others; of all of them where the point of the spot is given. docs/virtual-lights.md, 11.2.
     """
     if not params.mirrors:
         return
@@ -83,12 +83,14 @@ def connect_by_mirrors(
     if settings.finds_spot and in_spot is None:
         in_spot = _on_disk(generator, active) * settings.spot_radius
     for mirrors in params.mirrors:
-        count = mirrors.count if takes_all else dr.minimum(mirrors.count, params.mirrors_per_vertex)
-        first = mi.UInt32(generator.next_float32(active & (count < mirrors.count)) * mi.Float(mirrors.count))
-        first = dr.select(count < mirrors.count, dr.minimum(first, mirrors.count - 1), 0)
-        throughput = vertex.throughput * (mi.Float(mirrors.count) / mi.Float(count))
-        start = MirroredVertex(vertex.si, throughput, vertex.opl, settings.slot(bounce), first, count, in_spot)
-        deposit_reflections(params, mirrors, histogram, start, active)
+        begin, near = mirrors.index.near(vertex.si.p, active)
+        count = near if takes_all else dr.minimum(near, params.mirrors_per_vertex)
+        first = mi.UInt32(generator.next_float32(active & (count < near)) * mi.Float(near))
+        first = dr.select(count < near, dr.minimum(first, near - 1), 0)
+        throughput = vertex.throughput * (mi.Float(near) / mi.Float(dr.maximum(count, 1)))
+        slot = settings.slot(bounce)
+        start = MirroredVertex(vertex.si, throughput, vertex.opl, slot, begin, near, first, count, in_spot)
+        deposit_reflections(params, mirrors, histogram, start, active & (near > 0))
 
 
 def _connect(

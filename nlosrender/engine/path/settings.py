@@ -28,6 +28,7 @@ class PathSettings:
     has_transmission: bool  # some BSDF refracts: the optical path length needs the medium's index
     is_plain_diffuse: bool  # flat surfaces of one reflectance each: only normals matter to their BSDFs
     only_specular: bool = False  # only paths with a delta event after the sensor point are deposited
+    delta_share: float = 0.0  # probability of delta lobes where a path still needs one; 0: that of the BSDF
     has_mirrors: bool = False  # vertices are connected to the lasers by way of mirrors, too
     max_tries: int = PathTuning.max_tries  # see ``PathTuning``
 

@@ -150,7 +150,9 @@ def follow_paths(
         sample = sampler.sample(numbers.bits_u, numbers.v, has_target)
         has_target &= ~turns_away(params, sample, vertex.p)
         by_bsdf = alive & ~on_wall
-        way, survival, eta = leave(settings, params, generator, vertex, on_wall, numbers, sample, by_bsdf, has_target)
+        way, survival, eta = leave(
+            settings, params, generator, vertex, on_wall, numbers, sample, by_bsdf, has_target, mi.Bool(False)
+        )
         alive = by_bsdf | has_target
         if dr.hint(settings.russian_roulette, mode="scalar"):
             # by the albedo of hidden vertices, that of bounce 3 included, which the period n has thinned out already;

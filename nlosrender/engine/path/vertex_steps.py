@@ -123,6 +123,7 @@ def leave(
     sample: SurfaceSample | None,
     by_bsdf: mi.Bool,
     has_target: mi.Bool,
+    is_specular: mi.Bool,
 ) -> tuple[Departure, mi.Float, mi.Float]:
     """Sample the direction in which a path leaves a vertex.
 
@@ -136,6 +137,8 @@ def leave(
         Points of the hidden geometry for the lanes ``has_target``; None where the technique is not used.
     by_bsdf, has_target
         Which of the two techniques a lane uses; lanes of neither have ended.
+    is_specular
+        Whether a delta lobe is on the path, where paths without one are not deposited.
 
     Returns
     -------
@@ -150,7 +153,7 @@ def leave(
     if q < 1 or settings.goes_on:
         lobe = generator.next_float32(by_bsdf)
         square = mi.Point2f(unit_interval(numbers.bits_u), numbers.v)
-        bs, weight = vertex.bsdf().sample(context, vertex, lobe, square, by_bsdf)
+        bs, weight = _bsdf_sample(settings, vertex, lobe, square, by_bsdf, ~on_wall & ~is_specular)
         wo = bs.wo
         weight = vertex.to_world_mueller(weight, -wo, vertex.wi)
         way.is_delta = by_bsdf & mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
@@ -179,6 +182,33 @@ def leave(
         world = dr.select(has_target, dr.normalize(sample.p - ray_origin), world)
     way.ray = mi.Ray3f(ray_origin, world)
     return way, survival, eta
+
+
+def _bsdf_sample(
+    settings: PathSettings,
+    vertex: mi.SurfaceInteraction3f,
+    lobe: mi.Float,
+    square: mi.Point2f,
+    active: mi.Bool,
+    needs_delta: mi.Bool,
+) -> tuple[mi.BSDFSample3f, mi.Spectrum]:
+    """Sample the BSDF; lanes that ``needs_delta`` take its delta lobes with probability ``delta_share``.
+
+    By itself a smooth coat is sampled in one of twelve cases (plastic of albedo 0.5).
+    """
+    bsdf, context, share = vertex.bsdf(), mi.BSDFContext(), settings.delta_share
+    if not share:
+        return bsdf.sample(context, vertex, lobe, square, active)
+    flags = bsdf.flags()
+    chooses = active & needs_delta & mi.has_flag(flags, mi.BSDFFlags.Delta) & mi.has_flag(flags, mi.BSDFFlags.Smooth)
+    takes = chooses & (lobe < share)
+    own_lobe = dr.select(chooses, (lobe - share) / (1 - share), lobe)
+    bs, weight = bsdf.sample(context, vertex, own_lobe, square, active & ~takes)
+    drops = chooses & mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
+    weight = dr.select(drops, 0, weight / dr.select(chooses, 1 - share, 1))
+    context.type_mask = int(mi.BSDFFlags.Delta)
+    delta, of_delta = bsdf.sample(context, vertex, lobe / share, square, takes)
+    return dr.select(takes, delta, bs), dr.select(takes, of_delta / share, weight)
 
 
 def is_imaged(

@@ -25,17 +25,19 @@ if TYPE_CHECKING:
 
 def calibrated_lights(
     third: ThirdBounce, further: VplBounces | None, budget: Budget, *, share_squares: float
-) -> Budget:
+) -> tuple[Budget, float]:
     """Return ``budget`` with patch scale and rounds for its target error, or the patch scale for its time limit.
 
     ``further`` is None where the third bounce is the highest that is asked for. ``share_squares``: part of the target's
-    square that both may use.
+    square that both may use. Returns what they are expected to use of it, too.
     """
     device, tuning = third.device, third.tuning
     pilot, target = pilot_of(device.capture), budget.target_error or DEFAULT_TARGET
     share = tuning.third_share_alone if further is None else tuning.third_share_of_many
     if budget.time_limit_s is not None:
-        return replace(budget, patch_scale=_patch_scale_in_time(third, budget.time_limit_s, share * target))
+        return replace(
+            budget, patch_scale=_patch_scale_in_time(third, budget.time_limit_s, share * target)
+        ), share_squares
     if further is not None:
         share = max(share for share in tuning.third_shares if share**2 < share_squares * tuning.most_of_third)
     few = _pilot_of_patches(third, pilot)
@@ -43,7 +45,7 @@ def calibrated_lights(
     known_squares = device.exact_squares(few)
     patch_scale, gathered, of_third = refined_to(share * target, third.tessellator, gather, known_squares)
     if further is None:
-        return replace(budget, patch_scale=patch_scale)
+        return replace(budget, patch_scale=patch_scale), (of_third / target) ** 2
     goal, squares = tuning.rest_share_of_many * target, gathered.squares * (pilot.sensors.size / few.sensors.size)
     squares += device.exact_squares(pilot)
     histogram = further.histogram(pilot, further.pilot_replicas(pilot.sensors.size))
@@ -61,9 +63,10 @@ def calibrated_lights(
         share = finer
         patch_scale, _, of_third = refined_to(share * target, third.tessellator, gather, known_squares)
     # patches come in steps: what they leave of their share is spent on rounds
-    left = math.sqrt(share_squares - min(share, of_third / target) ** 2) * target
-    rounds = further.rounds_needed(error, done, left)
-    return replace(budget, patch_scale=patch_scale, rounds=rounds)
+    third_squares = min(share, of_third / target) ** 2
+    rounds = further.rounds_needed(error, done, math.sqrt(share_squares - third_squares) * target)
+    used = third_squares + (error / target) ** 2 * done / rounds
+    return replace(budget, patch_scale=patch_scale, rounds=rounds), min(used, share_squares)
 
 
 def _pilot_of_patches(third: ThirdBounce, pilot: Pilot) -> Pilot:

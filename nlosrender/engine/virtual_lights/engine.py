@@ -157,14 +157,13 @@ class VirtualLightEngine:
             return budget
         if budget not in self._calibrated:
             tuning = self.third.tuning
-            of_paths = tuning.specular_share if self.traces_paths else 0.0
-            of_lights = tuning.share_squares - of_paths**2
-            calibrated = calibrated_lights(self.third, self.further, budget, share_squares=of_lights)
+            of_lights = tuning.share_squares - (tuning.specular_share**2 if self.traces_paths else 0.0)
+            calibrated, used = calibrated_lights(self.third, self.further, budget, share_squares=of_lights)
             if self.traces_paths:
                 squares = self.third.gather(
                     pilot_of(self.capture), calibrated.patch_scale or self.third.tuning.coarsest_scale
                 ).squares
-                goal = of_paths * (budget.target_error or DEFAULT_TARGET)
+                goal = math.sqrt(tuning.share_squares - used) * (budget.target_error or DEFAULT_TARGET)
                 paths = self.paths.calibrate(replace(budget, target_error=goal), seconds, squares)
                 calibrated = replace(calibrated, spp=paths.spp)
             if math.isfinite(seconds):
