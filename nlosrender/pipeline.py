@@ -8,6 +8,7 @@ Mitsuba and Dr.Jit are imported only when a render starts, after the backend has
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -26,6 +27,7 @@ from nlosrender.files.parts.shards import part_attributes
 from nlosrender.files.provenance import provenance_attributes
 from nlosrender.rendering.dask_executor import render_on_cluster
 from nlosrender.rendering.dask_worker import Job
+from nlosrender.rendering.ground_truth import ground_truth
 from nlosrender.rendering.item_in_flight import SAVING, SavePolicy
 from nlosrender.rendering.local_executor import render_items, resumable
 from nlosrender.rendering.outcome import missed_target, missing_light, summed_capture
@@ -116,7 +118,10 @@ def render_capture(
             provenance = provenance_attributes(
                 resolved, config_hash(config), engine=engine.name, seed=config.render.seed, meshes=engine.built.meshes
             )
-            partial.open(header, provenance | identity_attributes(identity), output.compression, output.variance)
+            with stopwatch.stage("truth") if output.ground_truth else nullcontext():
+                truth = ground_truth(config, engine.built, engine.capture)
+            attributes = provenance | identity_attributes(identity)
+            partial.open(header, attributes, output.compression, output.variance, truth)
             warnings.emit(partial.damage)
             earlier = len(partial.finished.items)
             items = remaining_items(plan, header.confocal, partial.finished.items)

@@ -95,6 +95,12 @@ class Config(Section):
             message = mismatch(self.render.temporal_kernel_opl, "0: a line_of_sight capture has plain bins")
             yield ValidationIssue(("render", "temporal_kernel_opl"), message)
 
+    def rule_ground_truth(self) -> Iterator[ValidationIssue]:
+        """It is seen from a relay wall."""
+        if self.output.ground_truth and self.capture.is_line_of_sight:
+            message = "is seen from a relay wall, and a line_of_sight capture has none; remove it."
+            yield ValidationIssue(("output", "ground_truth"), message, "key")
+
     # --- captures of a relay wall ---
 
     def rule_relay_wall(self) -> Iterator[ValidationIssue]:

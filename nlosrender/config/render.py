@@ -12,6 +12,8 @@ from nlosrender.config.fields import (
     BounceCount,
     Checked,
     Flag,
+    GridCount,
+    Length,
     LengthOrZero,
     MemoryLimit,
     OpenUnit,
@@ -20,8 +22,8 @@ from nlosrender.config.fields import (
     Seed,
     memory_bytes,
 )
-from nlosrender.config.issues import invalid_value, shown
-from nlosrender.config.section import ONE_OF, Section
+from nlosrender.config.issues import invalid_value, mismatch, shown
+from nlosrender.config.section import LIST, ONE_OF, Section
 from nlosrender.errors import ValidationIssue
 
 _STOPPING = ("spp", "target_error", "time_limit_s")
@@ -98,6 +100,29 @@ class RenderConfig(Section):
         return memory_bytes(self.memory_limit)
 
 
+TruthKind = Literal["depth", "normal", "albedo", "position", "instance", "occupancy", "poses"]
+
+
+class TruthGridConfig(Section):
+    """Points and voxels of the ground truth; they cover what the sensor grid covers."""
+
+    nx: GridCount
+    """points along the wall's x axis"""
+    ny: GridCount
+    """points along the wall's y axis"""
+    nz: GridCount | None = None
+    """voxels along the wall's normal; null: as many as nx"""
+    near: LengthOrZero | None = None
+    """m from the wall, where voxels begin; null: where the hidden geometry does"""
+    far: Length | None = None
+    """m from the wall, where voxels end; null: where the hidden geometry does"""
+
+    def rule_depths(self) -> Iterator[ValidationIssue]:
+        """There is room between near and far."""
+        if self.near is not None and self.far is not None and not self.near < self.far:
+            yield ValidationIssue(("far",), mismatch(self.far, f"more than near, {self.near:g} m"))
+
+
 class OutputConfig(Section):
     """The file that is written."""
 
@@ -111,3 +136,8 @@ class OutputConfig(Section):
     """gzip (with shuffle) or none"""
     variance: Flag = True
     """store the variance of the estimate per bin"""
+    ground_truth: Annotated[tuple[Annotated[TruthKind, ONE_OF], ...], LIST] = ()
+    """what of the hidden scene is stored beside the light, any of: depth, normal, albedo, position, instance,
+    occupancy, poses"""
+    ground_truth_grid: TruthGridConfig | None = None
+    """its points; null: the sensor grid"""

@@ -132,6 +132,8 @@ output:
   frame: znlos                   # znlos (wall in y = 0) | scene (coordinates as above); default znlos
   compression: gzip              # gzip | none; default gzip
   variance: true                 # store the variance of the estimate per bin; default true
+  ground_truth: []               # depth, normal, albedo, position, instance, occupancy, poses; default []: none
+  ground_truth_grid: null        # {{nx: 64, ny: 64, nz: 64, near: 0.5, far: 1.5}}; default null: the sensor grid
 
 # Many captures from this file: each key below, by its dotted name, takes all of its values. output.path then needs
 # {{index}} or {{index:05d}} in it and may have {{name}}; default {{name}}/{{index:05d}}.hdf5. An index.json lists them.

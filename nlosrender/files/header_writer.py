@@ -17,6 +17,7 @@ from nlosrender.capture.bounces import (
 from nlosrender.files import layout
 from nlosrender.files.attributes import set_attributes
 from nlosrender.files.capture_header import CaptureHeader
+from nlosrender.files.truth_datasets import NO_TRUTH, GroundTruth, write_ground_truth
 from nlosrender.scene.pose import Pose
 
 _VIEW_TEXT = {
@@ -38,7 +39,12 @@ GZIP_LEVEL = 4  # stored as the filter's level; HDF5 itself packs only chunks th
 
 
 def create_capture(
-    file: h5py.File, header: CaptureHeader, attributes: Mapping[str, object], compression: str, store_variance: bool
+    file: h5py.File,
+    header: CaptureHeader,
+    attributes: Mapping[str, object],
+    compression: str,
+    store_variance: bool,
+    truth: GroundTruth = NO_TRUTH,
 ) -> None:
     """Create everything of a capture file but its light.
 
@@ -52,6 +58,8 @@ def create_capture(
         ``gzip`` (with shuffle: the one filter pair that every HDF5 build has) or ``none``.
     store_variance
         Also create a dataset ``variance`` shaped as ``data``.
+    truth
+        What is known of the hidden scene.
 
     Raises
     ------
@@ -70,6 +78,7 @@ def create_capture(
             if header.shared_samples:
                 described["not_to_be_summed"] = header.shared_samples
         set_attributes(samples, described)
+    write_ground_truth(file, truth, filters)
     add_attributes(file, header, attributes)
 
 

@@ -68,6 +68,23 @@ DATASETS: tuple[DatasetSpec, ...] = (
     DatasetSpec("hiddenVolumeSize", FLOAT, (), "full edge of the hidden geometry's bounding cube", "m"),
     DatasetSpec("isConfocal", INTEGER, (), "1 for a confocal capture, else 0"),
 )
+
+# Ground truth, where ``output.ground_truth`` asks for it; rows and columns of the sensor grid, or of a grid of its own.
+GROUND_TRUTH: tuple[DatasetSpec, ...] = (
+    DatasetSpec("gt_depth", FLOAT, ("gt_y", "gt_x"), "distance from the wall along its normal; NaN: nothing", "m"),
+    DatasetSpec("gt_normal", FLOAT, (THREE, "gt_y", "gt_x"), "unit normal of the surface's front; NaN: nothing there"),
+    DatasetSpec("gt_albedo", FLOAT, ("gt_channel", "gt_y", "gt_x"), "diffuse reflectance; NaN: nothing there"),
+    DatasetSpec("gt_position", FLOAT, (THREE, "gt_y", "gt_x"), "point of the surface; NaN: nothing there", "m"),
+    DatasetSpec("gt_instance", INTEGER, ("gt_y", "gt_x"), "1 + index of the hidden item, see names; 0: nothing there"),
+    DatasetSpec(
+        "gt_occupancy",
+        FLOAT,
+        ("gt_z", "gt_y", "gt_x"),
+        "share of the voxel inside of an item; along the wall's normal, its y and its x axis",
+    ),
+    DatasetSpec("gt_occupancy_bounds", FLOAT, (2, THREE), "outer corners of the first and the last voxel", "m"),
+    DatasetSpec("gt_poses", FLOAT, ("item", 4, 4), "from each hidden item's own coordinates to this file's; see names"),
+)
 SPECS: Mapping[str, DatasetSpec] = {spec.name: spec for spec in DATASETS}
 
 ROOT_TEXT = {"data order": "column-major", "engine": "nlosrender"}  # attributes of the file

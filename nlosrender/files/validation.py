@@ -88,6 +88,7 @@ def _layout(file: h5py.File, path: Path, samples: h5py.Dataset) -> list[str]:
     for spec in layout.DATASETS:
         if spec.name not in missing:
             found += _dataset(dataset_in(file, path, spec.name), spec, sizes)
+    found += _ground_truth(file, path)
     if not found:  # values mean something only where types and shapes are right
         found += _values(file, path, sizes, confocal) + _points(file, path, sizes, confocal)
     return found + _attributes(file, samples)
@@ -143,6 +144,23 @@ def _dataset(dataset: h5py.Dataset | None, spec: layout.DatasetSpec, sizes: Mapp
     elif not found and not np.isfinite(dataset[()]).all():
         found.append(f"{spec.name}: holds a value that is not finite")
     return found
+
+
+def _ground_truth(file: h5py.File, path: Path) -> Iterator[str]:
+    """Yield what is wrong with the ground truth, where there is some: classes, ranks, and grids that differ."""
+    sizes: dict[str | int, int] = {layout.THREE: layout.THREE, 2: 2, 4: 4}
+    for spec in layout.GROUND_TRUTH:
+        if spec.name not in file:
+            continue
+        dataset = dataset_in(file, path, spec.name)
+        if dataset is None:
+            yield f"{spec.name}: is not a dataset"
+            continue
+        yield from _number(dataset, spec.name, spec.dtype)
+        need = tuple(sizes.setdefault(axis, length) for axis, length in zip(spec.shape, dataset.shape, strict=False))
+        if dataset.ndim != len(spec.shape) or dataset.shape != need:
+            axes = ", ".join(map(str, spec.shape))
+            yield f"{spec.name}: shape {dataset.shape}, need ({axes}), alike in all ground truth"
 
 
 def _number(dataset: h5py.Dataset, name: str, dtype: str) -> list[str]:

@@ -43,7 +43,7 @@ class Stopwatch:
         try:
             yield
         finally:
-            self.seconds[name] += time.perf_counter() - start
+            self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - start
 
     def report(self) -> dict[str, float]:
         """Return seconds per stage and ``total`` since the stopwatch was made."""

@@ -54,6 +54,7 @@ class BuiltScene(EngineScene):
     """The scene of a capture with a relay wall, whose local frame is the engine's."""
 
     wall_shape: mi.Shape
+    poses: tuple[Float64, ...] = ()  # (4, 4) of each surface, from its own coordinates to the local frame [m]
 
     @property
     def all_flat(self) -> bool:
@@ -131,6 +132,7 @@ def build_scene(wall: RelayWall, wall_bsdf: Mapping[str, object], surfaces: Sequ
         n_triangles=count_triangles(shapes),
         warnings=read.warnings + warnings + medium_warnings(zip(keys, shapes, strict=True)),
         meshes=read.meshes,
+        poses=read.poses,
     )
     _ = built.curvatures  # now, not while a kernel is recorded
     return built

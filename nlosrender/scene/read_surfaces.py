@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from nlosrender.config.bsdf_table import TRANSMITTING
 from nlosrender.errors import ConfigError
 from nlosrender.scene.bounding_box import box_corners
@@ -16,7 +18,7 @@ from nlosrender.scene.meshes.mesh_normals import with_normals
 from nlosrender.scene.meshes.mesh_report import MeshReport, mesh_report
 from nlosrender.scene.meshes.triangle_mesh import TriangleMesh
 from nlosrender.scene.picture_orientation import has_picture, readable
-from nlosrender.scene.pose import Pose
+from nlosrender.scene.pose import Float64, Pose
 from nlosrender.scene.surfaces import MeshFile, ShapeDescription, Surface, all_surfaces
 from nlosrender.scene.walls.mesh_wall import MeshWall
 from nlosrender.scene.walls.wall import RelayWall
@@ -33,6 +35,7 @@ class ReadSurfaces:
     shapes: tuple[TriangleMesh | ShapeDescription, ...]  # local frame [m]
     meshes: tuple[MeshReport, ...]  # of those that are files, and of a wall that is one
     warnings: tuple[str, ...]
+    poses: tuple[Float64, ...] = ()  # (4, 4) of each surface, from its own coordinates to the local frame
 
 
 def read_surfaces(surfaces: Sequence[Surface], wall: RelayWall | None = None) -> ReadSurfaces:
@@ -54,19 +57,25 @@ def read_surfaces(surfaces: Sequence[Surface], wall: RelayWall | None = None) ->
     shapes: list[TriangleMesh | ShapeDescription] = []
     meshes: list[MeshReport] = []
     warnings: list[str] = []
+    poses: list[Float64] = []
     if isinstance(wall, MeshWall) and wall.read is not None:
         meshes.append(mesh_report("scene.relay_wall", "relay wall", wall.file, wall.read, wall.mesh, "flat", None))
         warnings += meshes[-1].warnings(wall.read, has_two_sides=False)
     for surface in surfaces:
         shape = surface.shape
         if isinstance(shape, MeshFile):
-            read, mesh, normals = _read(surface, shape)
+            read, mesh, normals, pose = _read(surface, shape)
             name = Path(shape.filename).name
             meshes.append(mesh_report(surface.key, surface.name, name, read, mesh, normals, wall_corners))
             warnings += meshes[-1].warnings(read, has_two_sides=surface.bsdf.get("type") in TRANSMITTING)
             shape = mesh
+        elif isinstance(shape, ShapeDescription) and surface.pose is None:
+            pose = np.asarray(shape.description.get("to_world", np.eye(4)), dtype=np.float64)
+        else:
+            pose = np.eye(4) if surface.pose is None else surface.pose
         shapes.append(shape)
-    return ReadSurfaces(tuple(shapes), tuple(meshes), tuple(warnings))
+        poses.append(pose)
+    return ReadSurfaces(tuple(shapes), tuple(meshes), tuple(warnings), tuple(poses))
 
 
 def describe_meshes(scene_config: SceneConfig) -> ReadSurfaces:
@@ -75,12 +84,13 @@ def describe_meshes(scene_config: SceneConfig) -> ReadSurfaces:
     return read_surfaces(all_surfaces(scene_config, Pose.identity() if wall is None else wall.pose), wall)
 
 
-def _read(surface: Surface, file: MeshFile) -> tuple[FileMesh, TriangleMesh, str]:
-    """Return what a file holds, its mesh in the local frame, and what the mesh's normals are."""
+def _read(surface: Surface, file: MeshFile) -> tuple[FileMesh, TriangleMesh, str, Float64]:
+    """Return what a file holds, its mesh in the local frame, what the mesh's normals are, and its pose (4, 4)."""
     try:
         read = read_mesh_file(file.filename, file.kind)
         mesh, normals = with_normals(read.mesh, file.normals)
-        mesh = mesh.transformed(file.placed(mesh.bounds()))
+        pose = file.placed(mesh.bounds())
+        mesh = mesh.transformed(pose)
         mesh = readable(mesh) if file.flip_v else mesh
         mesh = mesh.turned_round() if file.flip_normals else mesh
     except ValueError as error:
@@ -92,4 +102,4 @@ def _read(surface: Surface, file: MeshFile) -> tuple[FileMesh, TriangleMesh, str
             "corner some, or take a texture or number that is the same everywhere."
         )
         raise ConfigError.at(f"{surface.key}.bsdf", message)
-    return read, mesh, normals
+    return read, mesh, normals, pose

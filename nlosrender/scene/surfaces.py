@@ -88,6 +88,7 @@ class Surface:
     shape: TriangleMesh | MeshFile | ShapeDescription
     bsdf: Mapping[str, object]  # Mitsuba dict
     radiance: Radiance | None = None  # that its front side emits; None: it emits nothing
+    pose: Float64 | None = None  # (4, 4) from the item's own coordinates to the local frame; of a mesh file its shape's
 
     def bounds(self) -> Bounds | None:
         """Return a box around the surface in the local frame [m], or None when a file or plugin must be asked."""
@@ -123,22 +124,37 @@ def _surface(item: HiddenItemConfig, frame: Pose, key: str, index: int) -> Surfa
                 bsdf = upright_bsdf(shape.description, bsdf)
     except ValueError as error:
         raise ConfigError.at(key, f"{error}.") from error
-    return Surface(item.name or f"{item.type}-{index}", key, shape, bsdf, getattr(item, "radiance", None))
+    name, pose = item.name or f"{item.type}-{index}", item_pose(item, frame)
+    return Surface(name, key, shape, bsdf, getattr(item, "radiance", None), None if pose is None else pose.matrix())
+
+
+def item_pose(item: HiddenItemConfig, frame: Pose) -> Pose | None:
+    """Return the pose of an item's own coordinates in the local frame; None: it has a matrix that may scale."""
+    match item.type:
+        case "rectangle" | "letters":
+            return Pose.from_normal_up(item.center, item.normal, item.up).seen_from(frame)
+        case "box":
+            return Pose(euler_xyz(item.rotate_deg), np.asarray(item.center, dtype=np.float64)).seen_from(frame)
+        case "sphere":
+            return Pose(np.eye(3), np.asarray(item.center, dtype=np.float64)).seen_from(frame)
+        case "cylinder":
+            return cylinder_pose(item.center, item.axis).seen_from(frame)
+        case "room":
+            return Pose.identity()  # defined in the wall's local frame
+    return None
 
 
 def _shape(item: HiddenItemConfig, frame: Pose) -> TriangleMesh | MeshFile | ShapeDescription:
     match item.type:
         case "rectangle":
-            pose = Pose.from_normal_up(item.center, item.normal, item.up).seen_from(frame)
-            return rectangle_mesh(item.width, item.height, pose)
+            return rectangle_mesh(item.width, item.height, item_pose(item, frame))
         case "letters":
-            pose = Pose.from_normal_up(item.center, item.normal, item.up).seen_from(frame)
-            return letters_mesh(item.text, item.height, item.thickness, item.stroke_width, item.spacing, pose)
+            strokes = item.thickness, item.stroke_width, item.spacing
+            return letters_mesh(item.text, item.height, *strokes, item_pose(item, frame))
         case "box":
-            pose = Pose(euler_xyz(item.rotate_deg), np.asarray(item.center, dtype=np.float64))
-            return box_mesh(item.size, pose.seen_from(frame))
+            return box_mesh(item.size, item_pose(item, frame))
         case "room":
-            return room_mesh(item.size)  # defined in the wall's local frame
+            return room_mesh(item.size)
         case "mesh":
             kind = Path(item.filename).suffix.lower().lstrip(".")
             to_local = frame.inverse_matrix() @ mesh_matrix(item)

@@ -53,6 +53,7 @@ from nlosrender.files.partial.work_item_log import (
 )
 from nlosrender.files.partial.work_item_state import NEW, STATE_FORMAT, ItemState, states_in
 from nlosrender.files.sums import Sums
+from nlosrender.files.truth_datasets import NO_TRUTH, GroundTruth
 from nlosrender.interruption import uninterrupted
 
 
@@ -117,7 +118,12 @@ class PartialCapture:
         return partial
 
     def open(
-        self, header: CaptureHeader, attributes: Mapping[str, object], compression: str, store_variance: bool
+        self,
+        header: CaptureHeader,
+        attributes: Mapping[str, object],
+        compression: str,
+        store_variance: bool,
+        truth: GroundTruth = NO_TRUTH,
     ) -> None:
         """Open the samples' file: a new one, made by ``create_capture``, or what the earlier render has left.
 
@@ -133,6 +139,7 @@ class PartialCapture:
             attributes=attributes,
             compression=compression,
             store_variance=store_variance,
+            truth=truth,
         )
         if self.finished.items and self._state.closed and self._is_whole():
             # durable before HDF5 changes its tables: those of a file noted as closed are trusted
