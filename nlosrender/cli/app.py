@@ -14,10 +14,12 @@ from typing import Annotated, Any, NoReturn
 import typer
 
 from nlosrender import __version__
+from nlosrender.cli import dataset_commands
 from nlosrender.cli.bench_command import bench
 from nlosrender.cli.check_engines_command import check_engines
 from nlosrender.cli.compare_command import check, compare
 from nlosrender.cli.config_commands import new, schema, validate
+from nlosrender.cli.dataset_commands import sheet
 from nlosrender.cli.file_commands import export, frames, info, plot
 from nlosrender.cli.interrupt_watch import InterruptWatch
 from nlosrender.cli.json_output import OUTPUT
@@ -40,18 +42,23 @@ app = typer.Typer(
 )
 
 
-def _add(command: Callable[..., Any]) -> None:
+datasets = typer.Typer(help="Data sets: folders of captures.", no_args_is_help=True, rich_markup_mode=None)
+
+
+def _add(command: Callable[..., Any], to: typer.Typer = app) -> None:
     """Add a command by its function's name; the last paragraph of the docstring, its example, follows the options."""
     text, _, example = inspect.cleandoc(command.__doc__ or "").rpartition("\n\nExample: ")
-    app.command(command.__name__.replace("_", "-"), help=text, epilog=f"Example: {example}")(command)
+    to.command(command.__name__.replace("_", "-"), help=text, epilog=f"Example: {example}")(command)
 
 
 _COMMANDS: tuple[Callable[..., Any], ...] = (
     *(render, merge, plan, new, validate, schema, info, plot, frames, reconstruct, export, doctor),
-    *(compare, check, check_engines, bench, paper),
+    *(compare, check, check_engines, bench, paper, sheet),
 )
 for _command in _COMMANDS:
     _add(_command)
+_add(dataset_commands.info, datasets)
+app.add_typer(datasets, name="dataset")
 
 
 def _print_version(wanted: bool) -> None:

@@ -9,6 +9,7 @@ from typing import Any, Self
 from pydantic import Field, PrivateAttr, ValidationInfo
 
 from nlosrender.config.capture import CaptureConfig, TimeAxisConfig
+from nlosrender.config.dataset_section import DatasetConfig
 from nlosrender.config.fields import Name
 from nlosrender.config.issues import WrongValueRead, mismatch, shown
 from nlosrender.config.mitsuba_xml import read_mitsuba_xml
@@ -43,6 +44,8 @@ class Config(Section):
     # never set here: sweep_load makes many configs of it. No part of the capture, so no part of its hash either.
     sweep: SweepConfig | None = Field(default=None, exclude=True)
     """many captures from this file: which keys take which values"""
+    dataset: DatasetConfig | None = Field(default=None, exclude=True)
+    """what the captures of a sweep become for training: splits, index, packages"""
 
     _notes: tuple[str, ...] = PrivateAttr(default=())  # what of the file has no effect
 

@@ -9,7 +9,7 @@ import glob
 import math
 import random
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +18,7 @@ from pydantic import ValidationInfo
 from nlosrender.config.fields import finite_numbers
 from nlosrender.config.issues import invalid_value
 from nlosrender.config.plugin_check import config_folder
+from nlosrender.errors import ConfigError
 
 ENDS, SPANS = ("uniform", "log_uniform", "integers"), ("rotation", "inside")  # [a, b]; one [a, b] per axis
 KINDS = (*ENDS, "choice", "files", *SPANS)
@@ -26,6 +27,7 @@ _DRAW = (
     "{rotation: uniform}, {inside: [[x0, x1], [y0, y1], [z0, z1]]}, or a value with these in it"
 )
 PICKS = ("random", "each")
+COPY = "#"  # before the number of a further copy of an item
 
 
 @dataclass(frozen=True)
@@ -77,9 +79,6 @@ class Drawn:
     draw: Draw
 
 
-Suffix = Callable[[str], str]  # what is added to a key, so that another value is drawn
-
-
 def draw_of(value: object, validation: ValidationInfo) -> Any:
     """Return a value of ``random.keys`` with a ``Draw`` in place of each mapping that describes one.
 
@@ -95,40 +94,66 @@ def draw_of(value: object, validation: ValidationInfo) -> Any:
     return found
 
 
-def drawn_value(
-    tree: Any, key: str, seed: int, number: int, drawn: list[Drawn], suffix: Suffix = lambda key: ""
-) -> Any:
-    """Return a value of ``draw_of`` with everything drawn, and add the draws to ``drawn``.
+@dataclass
+class Drawer:
+    """Draws the values of one capture, and notes them.
 
     Parameters
     ----------
-    tree, key, seed, number
-        As ``draw_of`` returns it; what the draws depend on.
-    drawn
-        Extended by the values drawn; of a chosen mapping with draws in it by all of its values.
     suffix
-        Further copies of an item get draws of their own by it.
+        Added to a key, so that further copies of an item get draws of their own.
+    lead
+        Key and value of the first file of the capture, once it is drawn.
+    goes_with
+        Whether a further file may stand beside the first one; None: any.
     """
-    if isinstance(tree, Draw):
-        value = tree.value(key + suffix(key), seed, number)
-        if _has_draws(value):  # a choice between items that have draws of their own
-            return {
-                name: _leaf(item, f"{key}.{name}", seed, number, drawn, suffix, tree) for name, item in value.items()
-            }
-        drawn.append(Drawn(key, value, tree))
-        return value
-    if isinstance(tree, dict):
-        return {name: drawn_value(item, f"{key}.{name}", seed, number, drawn, suffix) for name, item in tree.items()}
-    if isinstance(tree, list):
-        return [drawn_value(item, f"{key}.{at}", seed, number, drawn, suffix) for at, item in enumerate(tree)]
-    return tree
 
+    suffix: Callable[[str], str] = lambda key: ""
+    lead: tuple[str, str] | None = None
+    goes_with: Callable[[str, str], bool] | None = None
+    drawn: list[Drawn] = field(default_factory=list)
 
-def _leaf(item: Any, key: str, seed: int, number: int, drawn: list[Drawn], suffix: Suffix, chosen_by: Draw) -> Any:
-    if _has_draws(item):
-        return drawn_value(item, key, seed, number, drawn, suffix)
-    drawn.append(Drawn(key, item, chosen_by))
-    return item
+    def value(self, tree: Any, key: str, seed: int, number: int) -> Any:
+        """Return a value of ``draw_of`` for a key with everything drawn; the draws are added to ``drawn``.
+
+        Of a chosen mapping with draws in it all values are added.
+
+        Raises
+        ------
+        ConfigError
+            No file may stand beside the first one.
+        """
+        if isinstance(tree, Draw):
+            draw = self._allowed(tree, key)
+            value = draw.value(key + self.suffix(key), seed, number)
+            if _has_draws(value):  # a choice between items that have draws of their own
+                return {name: self._part(item, f"{key}.{name}", seed, number, draw) for name, item in value.items()}
+            if draw.kind == "files":
+                self.lead = self.lead or (key, value)
+            self.drawn.append(Drawn(key, value, draw))
+            return value
+        if isinstance(tree, dict):
+            return {name: self.value(item, f"{key}.{name}", seed, number) for name, item in tree.items()}
+        if isinstance(tree, list):
+            return [self.value(item, f"{key}.{at}", seed, number) for at, item in enumerate(tree)]
+        return tree
+
+    def _part(self, item: Any, key: str, seed: int, number: int, chosen_by: Draw) -> Any:
+        if _has_draws(item):
+            return self.value(item, key, seed, number)
+        self.drawn.append(Drawn(key, item, chosen_by))
+        return item
+
+    def _allowed(self, draw: Draw, key: str) -> Draw:
+        if draw.kind != "files" or self.lead is None or self.goes_with is None:
+            return draw
+        first = self.lead[1]
+        if key == self.lead[0] and not self.suffix(key).startswith(COPY):  # the first file itself, once more
+            return draw
+        among = tuple(name for name in draw.among if self.goes_with(name, first))
+        if not among:
+            raise ConfigError.at(key, f"has no file that is in one split with {first}. Use more files, or by: capture.")
+        return replace(draw, among=among)
 
 
 def _has_draws(tree: Any) -> bool:

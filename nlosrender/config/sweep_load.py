@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import copy
 import itertools
+import json
 import os
 import re
-from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+from nlosrender.config.dataset_section import DatasetConfig, split_of
 from nlosrender.config.document import Config
-from nlosrender.config.draws import Drawn, Suffix, drawn_value
+from nlosrender.config.draws import COPY, Drawer, Drawn
 from nlosrender.config.families import FAMILY_KEYS, PLACES, PLACING, Measure, Member, family_items, placed, with_copies
 from nlosrender.config.issues import shown
 from nlosrender.config.load import MAX_ISSUES, capture_config, in_order, validated
@@ -23,7 +25,7 @@ from nlosrender.config.yaml_tree import Document, Place
 from nlosrender.errors import ConfigError, KeyPath, ValidationIssue
 
 DEFAULT_PATTERN = "{name}/{index:05d}.hdf5"
-_SWEEP = "sweep"
+_SWEEP, _DATASET = "sweep", "dataset"
 ALL = -1  # in place of an item: all that is not of a further copy
 _PLACEHOLDER = re.compile(r"\{(?:(name)|index(?::(0?\d)d)?)\}")
 
@@ -33,29 +35,29 @@ class _Setting:
     """One value of one swept key, or a draw of it, and where in the YAML it comes from."""
 
     key: str
-    value: Any  # or, with a seed, what ``drawn_value`` takes
+    value: Any  # or, with a seed, what a ``Drawer`` takes
     key_at: KeyPath
     at: KeyPath  # of the value
     seed: int | None = None  # of a draw
     number: int = 0  # of the draw
 
-    def settled(self, drawn: list[Drawn], suffix: Suffix = lambda key: "") -> Any:
-        """Return the value; a drawn one is also added to ``drawn``, ``suffix`` makes it another one."""
-        if self.seed is None:
-            return copy.deepcopy(self.value)
-        return copy.deepcopy(drawn_value(self.value, self.key, self.seed, self.number, drawn, suffix))
+    def settled(self, drawer: Drawer) -> Any:
+        """Return the value; a drawn one is noted by ``drawer``."""
+        value = self.value if self.seed is None else drawer.value(self.value, self.key, self.seed, self.number)
+        return copy.deepcopy(value)
 
 
 Settings = tuple[_Setting, ...]
 
 
 @dataclass(frozen=True, eq=False)
-class SweptCapture:
-    """One capture of a sweep."""
+class CaptureFacts:
+    """What the index of a dataset says of a capture before it is rendered."""
 
-    config: Config
     values: dict[str, Any]  # by swept key; further copies of an item have #1, #2 after theirs
     files: dict[str, str]  # drawn files by key, as the YAML would name them
+    split: str | None  # train, val or test, whatever further captures there are; None: there are no splits
+    label: Any  # what it shows: the value of dataset.label, else the folder of its file, or its text
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,6 +68,7 @@ class Sweep:
     settings: tuple[Settings, ...]  # of every capture
     paths: tuple[Path, ...]  # output of every capture, all different
     measure: Measure | None = None  # the box around an item, for families that need it
+    dataset: DatasetConfig = field(default_factory=DatasetConfig)
 
     def __len__(self) -> int:
         """Return the number of captures."""
@@ -90,12 +93,12 @@ class Sweep:
         """Return the values of the swept keys in one capture, places of families as first drawn."""
         return self._drawing(index).values()
 
-    def files(self, index: int) -> dict[str, str]:
-        """Return the drawn files of one capture by key."""
-        return self._drawing(index).files()
+    def facts(self, index: int) -> CaptureFacts:
+        """Return what is known of a capture, places of families as first drawn: no mesh is read."""
+        return self._facts(self._drawing(index))
 
-    def capture(self, index: int) -> SweptCapture:
-        """Return one capture, its families placed.
+    def capture(self, index: int) -> tuple[Config, CaptureFacts]:
+        """Return the config of one capture, its families placed, and what is known of it.
 
         Raises
         ------
@@ -105,14 +108,25 @@ class Sweep:
         # built when it is needed: a hundred thousand configs fill the memory
         drawing = self._drawing(index)
         drawing.place(self.measure)
-        return SweptCapture(capture_config(drawing.document), drawing.values(), drawing.files())
+        return capture_config(drawing.document), self._facts(drawing)
 
     def config(self, index: int) -> Config:
         """Return the config of one capture; errors as of ``capture``."""
-        return self.capture(index).config
+        return self.capture(index)[0]
+
+    def _facts(self, drawing: _Drawing) -> CaptureFacts:
+        values, lead = drawing.values(), drawing.lead
+        label = next((value for key, value in values.items() if key.endswith(".text")), None)
+        if lead is not None and len(Path(lead[1]).parts) > 1:
+            label = Path(lead[1]).parts[-2]
+        label = label if self.dataset.label is None else values.get(self.dataset.label)
+        split = self.dataset.split
+        by_file = split is not None and split.by != "capture" and lead is not None
+        name = lead[1] if by_file and lead is not None else drawing.name
+        return CaptureFacts(values, drawing.files(), None if split is None else split_of(split, name), label)
 
     def _drawing(self, index: int) -> _Drawing:
-        return _Drawing(self.document, self.settings[index], index)
+        return _Drawing(self.document, self.settings[index], index, self.dataset)
 
 
 def sweep_of(document: Document, measure: Measure | None = None) -> Sweep | None:
@@ -138,11 +152,26 @@ def sweep_of(document: Document, measure: Measure | None = None) -> Sweep | None
     if document.tree.get(_SWEEP) is None:
         return None
     section, found = validated(SweepConfig, document.tree[_SWEEP], document, (_SWEEP,))
-    if found or any(path[0] == _SWEEP for path in document.unread):
-        raise ConfigError(in_order(found, document))
+    dataset, mistakes = validated(DatasetConfig, document.tree.get(_DATASET) or {}, document, (_DATASET,))
+    if found or mistakes or any(path[0] in (_SWEEP, _DATASET) for path in document.unread):
+        raise ConfigError(in_order([*found, *mistakes], document))
     _check_overrides(section, document)
-    base = replace(document, tree={key: value for key, value in document.tree.items() if key != _SWEEP})
-    return replace(_validated(base, tuple(_settings(section))), measure=measure)
+    base = replace(document, tree={key: item for key, item in document.tree.items() if key not in (_SWEEP, _DATASET)})
+    sweep = replace(_validated(base, tuple(_settings(section)), dataset), measure=measure, dataset=dataset)
+    _check_dataset(sweep)
+    return sweep
+
+
+def _check_dataset(sweep: Sweep) -> None:
+    """Refuse splits by files where none are drawn, and a label that is no key of the sweep."""
+    split, label, document = sweep.dataset.split, sweep.dataset.label, sweep.document
+    if split is not None and split.by != "capture" and sweep._drawing(0).lead is None:
+        message = f"got {split.by}, but no file is drawn ({{files: 'folder/*.obj'}}); need capture."
+        raise ConfigError(document.issue((_DATASET, "split", "by"), message))
+    known = sorted({key for index in range(min(len(sweep), 100)) for key in sweep.values(index)})
+    if label is not None and label not in known:
+        message = f"got {label}, need one of the swept keys: {', '.join(known[:10])}."
+        raise ConfigError(document.issue((_DATASET, "label"), message))
 
 
 def _check_overrides(section: SweepConfig, document: Document) -> None:
@@ -174,13 +203,13 @@ def _settings(section: SweepConfig) -> Iterator[tuple[_Setting, ...]]:
         yield tuple(itertools.chain.from_iterable(parts))
 
 
-def _validated(base: Document, settings: tuple[tuple[_Setting, ...], ...]) -> Sweep:
+def _validated(base: Document, settings: tuple[Settings, ...], dataset: DatasetConfig) -> Sweep:
     """Look at every capture; a mistake that several share is told once, with the first of them."""
     found: dict[ValidationIssue, list[int]] = {}
     paths: dict[Path, int] = {}
     for index, own in enumerate(settings):
         try:
-            path = capture_config(_Drawing(base, own, index).document).output.path
+            path = capture_config(_Drawing(base, own, index, dataset).document).output.path
         except ConfigError as error:
             for issue in error.issues:
                 found.setdefault(issue, []).append(index)
@@ -200,7 +229,7 @@ def _counted(issue: ValidationIssue, indices: list[int], settings: tuple[tuple[_
     """Say which captures have a mistake that not all of them have."""
     if len(indices) == len(settings):
         return issue
-    first = ", ".join(f"{setting.key} = {shown(setting.settled([]))}" for setting in settings[indices[0]])
+    first = ", ".join(f"{setting.key} = {shown(setting.settled(Drawer()))}" for setting in settings[indices[0]])
     count = (
         f"{len(indices)} of {len(settings)} captures, the first one with" if len(indices) > 1 else "The capture with"
     )
@@ -210,11 +239,15 @@ def _counted(issue: ValidationIssue, indices: list[int], settings: tuple[tuple[_
 class _Drawing:
     """The document of one capture: the base with swept and drawn values in place, copies, and an output of its own."""
 
-    def __init__(self, base: Document, settings: Settings, index: int):
-        self._base, self._settings = base, settings
+    def __init__(self, base: Document, settings: Settings, index: int, dataset: DatasetConfig):
+        self._base, self._settings, self._split = base, settings, dataset.split
         self._lifted: dict[str, Any] = {}
-        self._drawn: dict[tuple[int, int], list[Drawn]] = {(ALL, 0): []}  # by item and copy, redrawn ones later
-        self.document = self._filled(lambda key: "", self._drawn[ALL, 0])
+        first = self._drawer()
+        self._drawn: dict[tuple[int, int], list[Drawn]] = {
+            (ALL, 0): first.drawn
+        }  # by item and copy, redrawn ones later
+        self.document = self._filled(first)
+        self.lead = first.lead
         self.members: list[Member] = with_copies(self.document, self.redraw) if family_items(self.document.tree) else []
         _set_output(self.document, index)
 
@@ -224,11 +257,12 @@ class _Drawing:
         def suffix(key: str) -> str:
             own = _own_key(key, item)
             is_moved = attempt > 0 and own in PLACING
-            return "" if own is None else f"#{number}" * (number > 0) + f"~{attempt}" * is_moved
+            return "" if own is None else _mark(number) + f"~{attempt}" * is_moved
 
-        drawn: list[Drawn] = []
-        raw: dict[str, Any] = self._filled(suffix, drawn).tree["scene"]["hidden_geometry"][item]
-        self._drawn[item, number] = [one for one in drawn if _own_key(one.key, item) is not None]
+        drawer = self._drawer(suffix)
+        drawer.lead = self.lead
+        raw: dict[str, Any] = self._filled(drawer).tree["scene"]["hidden_geometry"][item]
+        self._drawn[item, number] = [one for one in drawer.drawn if _own_key(one.key, item) is not None]
         return raw
 
     def place(self, measure: Measure | None) -> None:
@@ -245,6 +279,13 @@ class _Drawing:
                 where = f"scene.hidden_geometry.{member.item}.{key}{_mark(member.copy)}"
                 self._lifted[where] = item[key]
 
+    @property
+    def name(self) -> str:
+        """What the capture is known by, whatever further ones there are: in a product a larger count moves indices."""
+        fixed = {setting.key: setting.value for setting in self._settings if setting.seed is None}
+        number = next((setting.number for setting in self._settings if setting.seed is not None), 0)
+        return json.dumps([number, fixed], sort_keys=True)
+
     def values(self) -> dict[str, Any]:
         """Return the swept and drawn values by key."""
         found = {setting.key: copy.deepcopy(setting.value) for setting in self._settings if setting.seed is None}
@@ -258,12 +299,18 @@ class _Drawing:
         each = ((f"{one.key}{_mark(number)}", one) for (_, number), drawn in self._drawn.items() for one in drawn)
         return {key: one.value for key, one in each if one.draw.kind == "files"}
 
-    def _filled(self, suffix: Suffix, drawn: list[Drawn]) -> Document:
+    def _drawer(self, suffix: Callable[[str], str] = lambda key: "") -> Drawer:
+        split = self._split
+        if split is None or split.by == "capture":
+            return Drawer(suffix)
+        return Drawer(suffix, goes_with=lambda name, first: split_of(split, name) == split_of(split, first))
+
+    def _filled(self, drawer: Drawer) -> Document:
         document = self._base.copy()
         for setting in self._settings:
             place = Place(document.place(setting.key_at, "key"), document.place(setting.at))
             try:
-                put(document, setting.key.split("."), setting.settled(drawn, suffix), place)
+                put(document, setting.key.split("."), setting.settled(drawer), place)
             except ConfigError as error:
                 document.issues += error.issues
         return document
@@ -271,7 +318,7 @@ class _Drawing:
 
 def _mark(number: int) -> str:
     """Return what keys of a further copy of an item end with."""
-    return f"#{number}" if number else ""
+    return f"{COPY}{number}" if number else ""
 
 
 def _own_key(key: str, item: int) -> str | None:

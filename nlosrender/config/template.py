@@ -148,6 +148,10 @@ output:
 #     keys:                      # uniform: [a, b] | log_uniform: [a, b] | integers: [a, b] | choice: [...]
 #       scene.hidden_geometry.0.bsdf.reflectance: {{uniform: [0.2, 0.9]}}
 #       # also files of a folder, rotations, places, copies of an item, draws inside a value: docs/datasets.md
+# dataset:                       # of the captures of a sweep
+#   split: {{by: capture, train: 0.8, val: 0.1, test: 0.1, seed: 0}}  # by: capture | file | folder; default null
+#   label: null                  # a swept key; default null: the folder of the drawn file, or the letters
+#   index: csv                   # csv | parquet, the table beside index.json; default csv
 """
 
 

@@ -2,22 +2,28 @@
 
 from __future__ import annotations
 
+import csv
 import json
 import math
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from nlosrender.errors import FileError
 from nlosrender.files.atomic_write import replacing
 from nlosrender.files.attributes import json_object, text_list
 from nlosrender.files.capture_results import UNSAMPLED
-from nlosrender.files.file_kinds import INDEX
+from nlosrender.files.file_kinds import INDEX, TABLES
+from nlosrender.files.identity import file_digest
 from nlosrender.files.parts.shards import PART
 from nlosrender.files.reading.reader import read_header
 
+if TYPE_CHECKING:
+    from nlosrender.config.sweep_load import CaptureFacts, Sweep
+
+INDEX_NAME = "index.json"
 FORMAT_VERSION = 1
 
 Status = Literal["done", "pending", "failed"]
@@ -39,6 +45,27 @@ class IndexEntry:
     message: str | None = None  # why it failed
     unsampled_paths: Sequence[str] = ()  # classes of paths whose light is missing
     files: Mapping[str, Any] = field(default_factory=dict)  # drawn ones by key: {"file": name, "sha256": digest}
+    split: str | None = None  # train, val or test
+    label: Any = None  # what it shows
+
+
+def entry_of(index: int, file: str, facts: CaptureFacts, folder: Path | None = None) -> IndexEntry:
+    """Return the entry of a capture that is still to be rendered, or looked at.
+
+    Parameters
+    ----------
+    index, file
+        As in the entry.
+    facts
+        What the sweep says of it.
+    folder
+        Where names of drawn files start; None: their digests are left for later.
+    """
+    files = {
+        key: {"file": name, "sha256": None if folder is None else file_digest(folder / name)}
+        for key, name in facts.files.items()
+    }
+    return IndexEntry(index, file, facts.values, "pending", files=files, split=facts.split, label=facts.label)
 
 
 def stored_entry(entry: IndexEntry, path: Path) -> IndexEntry:
@@ -66,15 +93,13 @@ def relative_name(path: Path, folder: Path) -> str:
     return Path(os.path.relpath(path.absolute(), folder)).as_posix()
 
 
-def write_index(path: Path, source: str, keys: Sequence[str], entries: Sequence[IndexEntry]) -> None:
-    """Write the index at ``path``; it appears whole or not at all.
+def write_index(path: Path, sweep: Sweep, entries: Sequence[IndexEntry]) -> None:
+    """Write the index at ``path`` (.json), and the same as a table beside it; each appears whole or not at all.
 
     Parameters
     ----------
-    source
+    sweep
         What the captures were made from.
-    keys
-        The keys that differ between them.
     entries
         All captures, in their order.
 
@@ -85,9 +110,90 @@ def write_index(path: Path, source: str, keys: Sequence[str], entries: Sequence[
     """
     content = {
         "format_version": FORMAT_VERSION,
-        "source": source,
-        "keys": list(keys),
+        "source": sweep.source,
+        "keys": list(sweep.keys),
+        "dataset": sweep.dataset.model_dump(mode="json"),
         "captures": [asdict(entry) for entry in entries],
     }
     with replacing(path, INDEX) as partial:
         partial.write_text(json.dumps(content, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+    write_table(path.with_suffix(f".{sweep.dataset.index}"), [asdict(entry) for entry in entries])
+
+
+def write_table(path: Path, captures: Sequence[Mapping[str, Any]], shards: Mapping[int, str] | None = None) -> None:
+    """Write captures of an index as a table, .csv or .parquet: a row each, a column for every drawn value.
+
+    Parameters
+    ----------
+    shards
+        Name of the shard of a package that holds a capture, by its index.
+
+    Raises
+    ------
+    FileError
+        It cannot be written, or the package pyarrow is missing.
+    """
+    keys = list(dict.fromkeys(key for capture in captures for key in capture["values"]))
+    plain = ("index", "file", "status", "split", "label", "error_estimate", "seconds", "message")
+    rows = []
+    for capture in captures:
+        row = {name: capture.get(name) for name in plain} | {"shard": (shards or {}).get(capture["index"])}
+        row["energy"] = sum(capture["energy"].values()) if capture["energy"] else None
+        row |= {f"sha256 {key}": file["sha256"] for key, file in capture["files"].items()}
+        rows.append(row | {key: _cell(capture["values"].get(key)) for key in keys})
+    columns = list(dict.fromkeys(name for row in rows for name in row))
+    with replacing(path, TABLES[path.suffix]) as partial:
+        if path.suffix == ".csv":
+            with partial.open("w", encoding="utf-8", newline="") as file:
+                writer = csv.DictWriter(file, columns, lineterminator="\n")
+                writer.writeheader()
+                writer.writerows(rows)
+        else:
+            table = {name: _alike([row.get(name) for row in rows]) for name in columns}
+            pyarrow().parquet.write_table(pyarrow().table(table), partial)
+
+
+def _alike(column: list[Any]) -> list[Any]:
+    """Return a column of values of one type: as text, where they are of several."""
+    numbers = {float if kind is int else kind for kind in (type(value) for value in column if value is not None)}
+    return column if len(numbers) < 2 else [None if value is None else str(value) for value in column]
+
+
+def pyarrow() -> Any:
+    """Return the package that writes .parquet files, an optional one (FileError)."""
+    try:
+        import pyarrow.parquet
+    except ImportError as error:
+        message = "dataset.index: parquet needs the package pyarrow: pip install 'nlosrender[parquet]', or index: csv."
+        raise FileError(message) from error
+    return pyarrow
+
+
+def read_index(folder: str | Path) -> dict[str, Any]:
+    """Return the index of a dataset's folder; where only those of shards are there, what they say together.
+
+    Raises
+    ------
+    FileError
+        There is none, or it is damaged.
+    """
+    folder = Path(folder)
+    whole = folder / INDEX_NAME
+    paths = [whole] if whole.is_file() else sorted(folder.glob("index-*-of-*.json"))
+    if not paths:
+        raise FileError(f"{folder}: holds no {INDEX_NAME}. Name the folder that a sweep was rendered into.")
+    contents = []
+    for path in paths:
+        try:
+            contents.append(json.loads(path.read_text(encoding="utf-8")))
+            contents[-1]["captures"] = [asdict(IndexEntry(**entry)) for entry in contents[-1]["captures"]]
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise FileError(f"{path}: is no index of captures: {error}") from error
+    captures = sorted(
+        (entry for content in contents for entry in content["captures"]), key=lambda entry: entry["index"]
+    )
+    return {**contents[0], "captures": captures}
+
+
+def _cell(value: Any) -> Any:
+    return value if value is None or isinstance(value, (str, int, float, bool)) else json.dumps(value)

@@ -73,6 +73,7 @@ MAT = _starting("a MATLAB file", rb"MATLAB (5\.0|7\.3) MAT-file")
 PLY = _starting("a PLY mesh", rb"ply\r?\n")
 CONFIG = _starting("a configuration of nlosrender", rb"(.*\n)?scene:")
 INDEX = _starting("an index of captures by nlosrender", rb'\{\s*"format_version"')
+TABLES = {".csv": _starting("a table by nlosrender", rb"index,file,"), ".parquet": _starting("a table", rb"PAR1")}
 REPORT = _starting("a report of nlosrender", rb'\{\s*"facts"')
 PAGE = _starting("a page by nlosrender", rb"<!doctype html>.*<title>nlosrender")
 PICTURES = {".png": PNG, ".pdf": PDF, ".svg": SVG, ".gif": GIF, ".exr": EXR}  # by suffix

@@ -15,9 +15,9 @@ from nlosrender.config.load import config_to_dict
 from nlosrender.config.sweep_load import Sweep
 from nlosrender.errors import ConfigError, FileError, InterruptedRender, OptionError, RenderError
 from nlosrender.files.atomic_write import explained_write, partial_folder
-from nlosrender.files.dataset_index import IndexEntry, relative_name, stored_entry, write_index
+from nlosrender.files.dataset_index import IndexEntry, entry_of, relative_name, stored_entry, write_index
 from nlosrender.files.file_kinds import CAPTURE, same_capture
-from nlosrender.files.identity import capture_hash, file_digest
+from nlosrender.files.identity import capture_hash
 from nlosrender.files.reading.reader import read_header
 from nlosrender.interruption import StopRequest, stop_request
 from nlosrender.rendering.render_report import Progress, RenderReport, Standing, Warn, Watch
@@ -50,6 +50,7 @@ class _Dataset:
         suffix = "" if shard is None else f"-{shard[0]}-of-{shard[1]}"
         self.path = self.folder / f"index{suffix}.json"
         self.entries: dict[int, IndexEntry] = {}
+        self.warned: set[str] = set()
         self._written = 0.0
 
     def prepare(self) -> None:
@@ -65,19 +66,13 @@ class _Dataset:
         render begins.
         """
         sweep, path = self.sweep, self.sweep.paths[index]
-        files = {key: {"file": name, "sha256": None} for key, name in sweep.files(index).items()}
-        entry = IndexEntry(index, relative_name(path, self.folder), sweep.values(index), "pending", files=files)
-        self.entries[index] = entry
+        self.entries[index] = entry_of(index, relative_name(path, self.folder), sweep.facts(index))
         if anew or not os.path.lexists(path):
-            return entry
+            return self.entries[index]
         with suppress(ConfigError):  # such as of a mesh that cannot be read: the render says so
-            capture = sweep.capture(index)
-            files = {
-                key: {"file": name, "sha256": file_digest(sweep.document.folder / name)}
-                for key, name in capture.files.items()
-            }
-            expected = capture_hash(config_to_dict(capture.config))
-            entry = replace(entry, values=capture.values, files=files, capture_hash=expected)
+            config, facts = sweep.capture(index)
+            entry = entry_of(index, relative_name(path, self.folder), facts, sweep.document.folder)
+            entry = replace(entry, capture_hash=capture_hash(config_to_dict(config)))
             self.entries[index] = stored_entry(entry, path)
         return self.entries[index]
 
@@ -104,7 +99,7 @@ class _Dataset:
     def write(self, at_once: bool = False) -> None:
         """Write the index, unless that was done a moment ago."""
         if at_once or time.monotonic() - self._written > INDEX_SECONDS:
-            write_index(self.path, self.sweep.source, self.sweep.keys, [self.entries[index] for index in self.chosen])
+            write_index(self.path, self.sweep, [self.entries[index] for index in self.chosen])
             self._written = time.monotonic()
 
 
@@ -134,7 +129,7 @@ def render_sweep(
         None: go on where an earlier run stopped, or begin; True: there has to be something to go on with; False: render
         everything anew.
     progress, warn
-        Told the share of the captures that are done, and warnings with the capture they are about.
+        Told the share of the captures that are done, and warnings, each once, with the first capture they are about.
     watch
         Told how many captures are finished.
 
@@ -196,8 +191,14 @@ def _render_one(
     dataset: _Dataset, index: int, render: RenderOne, resume: bool | None, progress: Progress, warn: Warn
 ) -> None:
     path = dataset.sweep.paths[index]
+
+    def warn_once(text: str) -> None:  # thousands of captures of a family have most warnings in common
+        if text not in dataset.warned:
+            dataset.warned.add(text)
+            warn(f"{path}: {text}")
+
     try:
-        render(dataset.sweep.config(index), progress, lambda text: warn(f"{path}: {text}"), resume)
+        render(dataset.sweep.config(index), progress, warn_once, resume)
     except (
         ConfigError,
         RenderError,

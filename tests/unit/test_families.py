@@ -86,7 +86,7 @@ def test_files_of_a_folder(tmp_path: Path) -> None:
     sweep = sweep_of(f"{{{key}: {item}}}", tmp_path, count=5)
     names = [sweep.values(i)[f"{key}.filename"] for i in range(5)]
     assert names == ["a/1.obj", "a/3.obj", "b/2.obj", "a/1.obj", "a/3.obj"]
-    assert sweep.files(0) == {f"{key}.filename": "a/1.obj"}
+    assert sweep.facts(0).files == {f"{key}.filename": "a/1.obj"}
     assert sweep.config(2).scene.hidden_geometry[0].filename == tmp_path / "b/2.obj"
     sweep = sweep_of(f"{{{key}: {item.replace('each', 'random')}}}", tmp_path, count=60)
     counts = [sum(sweep.values(i)[f"{key}.filename"] == name for i in range(60)) for name in names[:3]]
@@ -132,13 +132,13 @@ def test_copies_have_draws_of_their_own() -> None:
     counts = [sweep.values(i)["scene.hidden_geometry.0.count"] for i in range(20)]
     assert set(counts) == {0, 1, 2, 3}
     for index, count in enumerate(counts):
-        capture = sweep.capture(index)
-        types = [item.type for item in capture.config.scene.hidden_geometry]
+        config, facts = sweep.capture(index)
+        types = [item.type for item in config.scene.hidden_geometry]
         assert types == ["box"] * (count > 0) + ["rectangle"] + ["box"] * max(count - 1, 0)
-        sizes = [item.size for item in capture.config.scene.hidden_geometry if item.type == "box"]
+        sizes = [item.size for item in config.scene.hidden_geometry if item.type == "box"]
         assert len(set(sizes)) == count
         for number in range(1, count):
-            assert capture.values[f"scene.hidden_geometry.0.size#{number}"] == list(sizes[number])
+            assert facts.values[f"scene.hidden_geometry.0.size#{number}"] == list(sizes[number])
 
 
 def test_more_copies_leave_the_first_ones(tmp_path: Path) -> None:
@@ -170,7 +170,7 @@ def test_no_overlap_on_a_floor() -> None:
         pairs = [(a, b) for a, b in items if a.type == "box"]
         assert all(a.size == b.size for a, b in pairs)
         n_moved += sum(a.center[::2] != b.center[::2] for a, b in pairs)
-        where = apart.capture(index).values["scene.hidden_geometry.0.center"]
+        where = apart.capture(index)[1].values["scene.hidden_geometry.0.center"]
         assert where == pytest.approx(pairs[0][0].center)
     assert 0 < n_moved < 40  # some places were rejected, not all
 
@@ -285,4 +285,4 @@ def test_a_mesh_file_with_a_tree(tmp_path: Path) -> None:
 def test_values_are_plain(tmp_path: Path) -> None:
     """What goes into the index is JSON."""
     sweep = sweep_of(family("3", ", no_overlap: true, on_floor: -1"))
-    json.dumps(sweep.capture(0).values, allow_nan=False)
+    json.dumps(sweep.capture(0)[1].values, allow_nan=False)
