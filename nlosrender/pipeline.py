@@ -8,6 +8,7 @@ Mitsuba and Dr.Jit are imported only when a render starts, after the backend has
 
 from __future__ import annotations
 
+import functools
 from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
@@ -22,6 +23,7 @@ from nlosrender.files.atomic_write import check_writable
 from nlosrender.files.capture_results import MISSED
 from nlosrender.files.file_kinds import CAPTURE
 from nlosrender.files.identity import capture_identity, files_read, identity_attributes
+from nlosrender.files.measured import add_counts
 from nlosrender.files.partial.partial_capture import PartialCapture
 from nlosrender.files.parts.shards import part_attributes
 from nlosrender.files.provenance import provenance_attributes
@@ -35,6 +37,8 @@ from nlosrender.rendering.process_layout import ONE_PROCESS
 from nlosrender.rendering.render_report import Monitor, Progress, RenderReport, Stopwatch, Warn, Warnings, Watch
 from nlosrender.rendering.render_warnings import render_warnings
 from nlosrender.rendering.stages import calibrated_budget, set_up_engine, started_backend
+from nlosrender.sensor.detector import detector_of, detector_warnings
+from nlosrender.sensor.rebinning import TimeBins
 
 if TYPE_CHECKING:
     from nlosrender.rendering.dask_cluster import Cluster
@@ -108,6 +112,9 @@ def render_capture(
         # --- scene -> capture and plan -> engine ---
         with stopwatch.stage("scene"):
             plan, engine, header = set_up_engine(config, backend, selection, processes)
+            if config.sensor is not None:
+                bins = TimeBins(header.start_opl, header.bin_width_opl, header.n_bins)
+                warnings.emit(detector_warnings(detector_of(config.sensor, bins)))
             unsampled = missing_light(engine, strict)
             warnings.emit(paths.warning for paths in unsampled)
             warnings.emit(render_warnings(config, backend, plan, engine, header, processes))
@@ -132,12 +139,19 @@ def render_capture(
             else:
                 job = Job(config, selection, identity, backend.name, processes)
                 render_on_cluster(items, job, budget, partial, stop, cluster, monitor)
+            # --- ideal histograms -> what a detector counts of them ---
+            counted: dict[str, object] = {}
+            if config.sensor is not None and selection == WHOLE:  # parts are measured once they are merged
+                with stopwatch.stage("measure"):
+                    counted |= partial.extend(functools.partial(add_counts, warn=lambda text: warnings.emit([text])))
             # --- results -> attributes, and the partial capture becomes the file ---
             summed = summed_capture(engine, unsampled, partial.finished.sums)
             missed = missed_target(config.render, summed.stated_error)
             warnings.emit([f"H is zero everywhere: {'; '.join(summed.zero_because)}."] if summed.zero_because else [])
             warnings.emit([missed] if missed else [])
-            results = summed.attributes(stopwatch.report())
+            # the file of an earlier run may say another sensor
+            configured = {name: provenance[name] for name in ("config", "config_hash")}
+            results = summed.attributes(stopwatch.report()) | configured | counted
             if selection != WHOLE:
                 results |= part_attributes(plan.part, plan.tiling, partial.finished)
             elif missed:

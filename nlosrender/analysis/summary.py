@@ -19,6 +19,7 @@ _ATTRIBUTES = {"engine": "render_engine", "written_by": "engine"} | {
     for name in (
         *("samples", "seed", "error_estimate", "error_estimate_per_bounce", "energy", "energy_error_per_bounce"),
         *("energy_error", "out_of_window_energy", "seconds", "created", "config_hash", "part", "meshes", "versions"),
+        *("sensor", "measurement", "corrections", "measured_from", "ideal_error_estimate"),
     )
 }
 

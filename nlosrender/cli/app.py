@@ -24,6 +24,7 @@ from nlosrender.cli.file_commands import export, frames, info, plot
 from nlosrender.cli.interrupt_watch import InterruptWatch
 from nlosrender.cli.json_output import OUTPUT
 from nlosrender.cli.machine_commands import doctor
+from nlosrender.cli.measure_command import measure
 from nlosrender.cli.merge_command import merge
 from nlosrender.cli.paper_command import paper
 from nlosrender.cli.plan_command import plan
@@ -52,7 +53,7 @@ def _add(command: Callable[..., Any], to: typer.Typer = app) -> None:
 
 
 _COMMANDS: tuple[Callable[..., Any], ...] = (
-    *(render, merge, plan, new, validate, schema, info, plot, frames, reconstruct, export, doctor),
+    *(render, measure, merge, plan, new, validate, schema, info, plot, frames, reconstruct, export, doctor),
     *(compare, check, check_engines, bench, paper, sheet),
 )
 for _command in _COMMANDS:

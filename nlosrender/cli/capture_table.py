@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from nlosrender.capture.bounces import LINE_OF_SIGHT
@@ -10,7 +10,7 @@ from nlosrender.cli.stated_error import energies_by_bounce, errors_by_bounce
 from nlosrender.readable import readable_size
 
 SHOWN_LENGTH = 160  # characters of one value in the table; --json has all of it
-_MAX_LENGTH = {"mesh": 600}  # names of materials
+_MAX_LENGTH = {"mesh": 600, "sensor": 600}  # names of materials
 
 
 def summary_rows(summary: dict[str, Any]) -> list[tuple[str, str]]:
@@ -54,6 +54,10 @@ def _rows(summary: dict[str, Any]) -> list[tuple[str, str]]:
         *(("NOT SAMPLED", _text(paths)) for paths in _sequence(summary["unsampled_paths"] or [])),
         *(("ZERO BECAUSE", _text(reason)) for reason in _sequence(summary["zero_because"] or [])),
         ("outside the window", _text(summary["out_of_window_energy"])),
+        ("sensor", _sensor(summary["sensor"])),
+        *measurement_rows(_object(summary["measurement"])),
+        ("corrected for", "" if summary["corrections"] in (None, "none") else _joined(summary["corrections"])),
+        ("measured from", _text(summary["measured_from"])),
         ("seconds", _text(summary["seconds"])),
         ("created", _text(summary["created"])),
         ("config hash", _text(summary["config_hash"])),
@@ -62,6 +66,41 @@ def _rows(summary: dict[str, Any]) -> list[tuple[str, str]]:
         ("versions", _text(summary["versions"])),
         ("check", _verdict(summary)),
         *(("differs", str(difference)) for difference in summary.get("deviations", ())),
+    ]
+
+
+def measurement_rows(found: Mapping[str, object]) -> list[tuple[str, str]]:
+    """Return label and text of what a detector counted (``files.measured``); nothing where there are no counts."""
+    if not found:
+        return []
+    number = {key: value if isinstance(value, (int, float)) else None for key, value in found.items()}
+
+    def text(key: str, form: str = ".4g", unit: str = "") -> str:
+        value = number.get(key)
+        return "unknown" if value is None else f"{value:{form}}{unit}"
+
+    ratio = number.get("signal_to_background")
+    return [
+        (
+            "counts",
+            f"{text('counts')}, {text('counts_per_histogram')} per histogram; expected {text('expected_counts')}",
+        ),
+        (
+            "photons",
+            f"{text('photons_per_pulse')} per pulse and histogram, {text('pulses', '.6g')} pulses "
+            f"(scale {text('scale', '.6g')} photons per unit of data)",
+        ),
+        (
+            "detections",
+            f"{text('detections_per_pulse')} per pulse, brightest histogram {text('detections_per_pulse_brightest')}",
+        ),
+        ("lost to pile-up", text("lost_to_pile_up", ".3%")),
+        ("signal/background", "no background" if ratio is None else f"{ratio:.4g}"),
+        ("outside the bins", text("outside_the_bins", ".3%", " of the photons")),
+        (
+            "response",
+            f"{text('response_fwhm_opl')} m at half maximum, mean delay {text('response_mean_delay_opl', '.3g')} m",
+        ),
     ]
 
 
@@ -130,6 +169,12 @@ def _text(value: object) -> str:
 
 def _joined(values: object, separator: str = ", ") -> str:
     return separator.join(_text(value) for value in _sequence(values))
+
+
+def _sensor(sensor: object) -> str:
+    """Return the values of a sensor that are set, by their keys."""
+    known = _object(sensor)
+    return ", ".join(f"{key} {_text(value)}" for key, value in known.items() if value not in (None, 0.0, 1.0))
 
 
 def _sequence(value: object) -> Sequence[object]:

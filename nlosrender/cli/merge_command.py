@@ -33,8 +33,8 @@ def merge(
     from nlosrender.cli.stated_error import energies_by_bounce, stated_error_rows
     from nlosrender.files.parts.merge import merge_captures
 
-    with reporting("merge", quiet) as (progress, _, _):
-        report = merge_captures(parts, output, progress, overwrite=overwrite)
+    with reporting("merge", quiet) as (progress, warn, _):
+        report = merge_captures(parts, output, progress, warn, overwrite=overwrite)
     if as_json:
         import dataclasses
 

@@ -18,6 +18,7 @@ from nlosrender.config.relay_wall import EDGE_TOLERANCE, RectangleWallConfig
 from nlosrender.config.render import OutputConfig, RenderConfig
 from nlosrender.config.scene import SceneConfig
 from nlosrender.config.section import Section
+from nlosrender.config.sensor import SensorConfig, misfits
 from nlosrender.config.sweep import SweepConfig
 from nlosrender.errors import KeyPath, ValidationIssue
 
@@ -41,6 +42,8 @@ class Config(Section):
     """how it is computed"""
     output: OutputConfig = Field(default_factory=OutputConfig)
     """the file that is written"""
+    sensor: SensorConfig | None = None
+    """what a detector reports of it, beside the ideal histogram"""
     # never set here: sweep_load makes many configs of it. No part of the capture, so no part of its hash either.
     sweep: SweepConfig | None = Field(default=None, exclude=True)
     """many captures from this file: which keys take which values"""
@@ -189,6 +192,12 @@ class Config(Section):
             message = "got false with a laser that is a point, which no path finds by chance; "
             message += "need capture.laser_spot_radius > 0, such as 0.01."
             yield ValidationIssue(("render", "laser_sampling"), message)
+
+    def rule_sensor(self) -> Iterator[ValidationIssue]:
+        """The detector can look at the capture."""
+        if self.sensor is not None:
+            for key, message in misfits(self.sensor, self.capture.scan_type):
+                yield ValidationIssue(("sensor", key), message)
 
     # --- all captures ---
 

@@ -159,6 +159,13 @@ def _unquote(value: object) -> str:
     return "Write the number without underscores." if "_" in value else "Write the number without quotes."
 
 
+def _share(value: object) -> float:
+    number = as_finite(value)
+    if number is None or not 0 <= number <= 1:
+        raise invalid_value(value, "a number from 0 to 1", _unquote(value))
+    return number
+
+
 def _brightness(value: object) -> float | tuple[float, ...]:
     numbers = three_or_one(value)
     if numbers is None or not all(0 <= number <= _MAX_JOULES for number in numbers):
@@ -235,6 +242,8 @@ _XYZ = "3 finite numbers [x, y, z]"
 _TEXT = {"type": "string", "minLength": 1}
 
 Positive = Annotated[float, _number("a number > 0", exclusiveMinimum=0)]
+NonNegative = Annotated[float, _number("a number >= 0", minimum=0)]
+Share = Annotated[float, Checked(_share, {"type": "number", "minimum": 0, "maximum": 1})]
 Energy = Annotated[float, _number("a number > 0", (_MIN_JOULES, _MAX_JOULES, "J"), exclusiveMinimum=0)]
 Coordinate = Annotated[
     float, _number(f"a number from -{MAX_LENGTH:g} to {MAX_LENGTH:g} m", (0.0, MAX_LENGTH, "m"), minimum=-MAX_LENGTH)

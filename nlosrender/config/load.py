@@ -187,6 +187,8 @@ def _reading_order(issue: ValidationIssue) -> tuple[int, int]:
 def config_to_dict(config: Config) -> dict[str, Any]:
     """Return the config with every default filled in and file names absolute, as plain JSON values."""
     dumped: dict[str, Any] = json.loads(json.dumps(config.model_dump(mode="json"), allow_nan=False))
+    if dumped["sensor"] is None:  # files of captures without one keep their hash
+        del dumped["sensor"]
     return dumped
 
 

@@ -135,6 +135,40 @@ output:
   ground_truth: []               # depth, normal, albedo, position, instance, occupancy, poses; default []: none
   ground_truth_grid: null        # {{nx: 64, ny: 64, nz: 64, near: 0.5, far: 1.5}}; default null: the sensor grid
 
+# What a detector counts of it, in a dataset counts beside the ideal data; docs/measured.md.
+# sensor:
+#   profile: spad-532            # one of `nlosrender measure --list`, or a YAML file; keys beside it win; default null
+#   photons_per_pulse: {{mean: 0.05}}  # or {{brightest: x}}: photons per histogram; null: physical, by the next four
+#   wavelength_nm: null          # nm, > 0
+#   aperture_solid_angle: null   # sr, > 0
+#   footprint_area: null         # m^2, > 0; null: a cell of the sensor grid
+#   transmission: 1.0            # 0..1
+#   photon_detection_ratio: 1.0  # 0..1
+#   laser_jitter_fwhm_ps: 0      # ps, of the laser pulse; default 0
+#   jitter_fwhm_ps: 0            # ps, of the detector; default 0
+#   jitter_tail_ps: 0            # ps, decay constant of an exponential tail; default 0
+#   jitter_tail_share: null      # 0..1, of the detections; null: 1 with jitter_tail_ps
+#   jitter_file: null            # .csv, .npy or .hdf5: a measured response instead
+#   jitter_file_bin_ps: null     # ps, of its cells where the file does not say
+#   zero_delay: peak             # peak | mean: what of the response is no delay
+#   bin_width_opl: null          # m of optical path, or bin_width_ps; null: as time_axis
+#   n_bins: null                 # integer >= 1; null: to the end of time_axis, or of the laser's period
+#   start_opl: null              # m of optical path; null: as time_axis
+#   gate: null                   # [from, to] m of optical path; null: always on
+#   pulses: null                 # integer >= 1, per histogram; or:
+#   exposure_time: 1.0           # s per histogram
+#   repetition_rate: null        # 1/s, or frequency in MHz; null: pulses far apart
+#   ambient_rate: 0              # 1/s; default 0
+#   dark_count_rate: 0           # 1/s; default 0
+#   pile_up: none                # none | first_photon | dead_time; default none
+#   dead_time_ps: null           # ps, > 0
+#   afterpulse_probability: 0    # 0..1; default 0
+#   afterpulse_decay_ps: 20000   # ps, or a list; default 20000
+#   crosstalk: null              # {{share: 0.1, delay_opl: 0}}
+#   zones: null                  # {{nx: 3, ny: 3, width_deg: 41, height_deg: 52}}, or width and height in m
+#   shot_noise: true             # false: expected counts; default true
+#   seed: 0                      # 0..4294967295; default 0
+
 # Many captures from this file: each key below, by its dotted name, takes all of its values. output.path then needs
 # {{index}} or {{index:05d}} in it and may have {{name}}; default {{name}}/{{index:05d}}.hdf5. An index.json lists them.
 # sweep:

@@ -94,6 +94,14 @@ _READABLE_CAPTURE = _hdf5(
     "a capture by nlosrender",
     lambda file: {layout.DATA} <= file.keys() and get_attributes(file).get("engine") == layout.ROOT_TEXT["engine"],
 )
+MEASURED = _hdf5(
+    "a measured capture by nlosrender",
+    lambda file: (
+        get_attributes(file).get("engine") == layout.ROOT_TEXT["engine"]
+        and layout.DATA in file
+        and get_attributes(file[layout.DATA]).get("unit") == layout.COUNTS_UNIT
+    ),
+)
 VOLUME = _hdf5("a reconstruction by nlosrender", lambda file: {"volume", *"xyz"} <= file.keys())
 TAL = _hdf5("an HDF5_TAL file", lambda file: {"H", "H_format"} <= file.keys())
 

@@ -17,6 +17,8 @@ from nlosrender.files.provenance import package_versions
 
 # Where a capture is written and what it is rendered on say nothing about its samples; the backend that was used is
 # told by the Mitsuba variant.
+# The sensor counts what has been rendered: another one goes on with the same render.
+MEASURED_AFTERWARDS = "sensor"
 NOT_THE_CAPTURE = (("output", "path"), ("render", "memory_limit"), ("render", "backend"))
 PACKAGES = ("nlosrender", "mitsuba", "drjit")  # whose versions the samples depend on
 FILE_KEY = "filename"  # of meshes, textures, spectra
@@ -62,6 +64,7 @@ def comparable_config(resolved_config: Mapping[str, Any]) -> dict[str, Any]:
         if isinstance(content, Mapping)
         else content
         for section, content in resolved_config.items()
+        if section != MEASURED_AFTERWARDS
     }
     return {section: _with_digests(section, content) for section, content in kept.items()}
 

@@ -93,6 +93,8 @@ CHANNELS = {3: "rgb", 4: STOKES}  # grey: files without the attribute
 DATA_UNIT = "J m^-2 sr^-1"  # radiance leaving a sensor point, integrated over the bin, for one pulse
 VIEW_UNIT = "W m^-2 sr^-1"  # line_of_sight: of a pixel's steady radiance the share that arrives in the bin
 
+COUNTS_UNIT = "counts"  # of measured captures: detections of all pulses
+
 
 def data_unit(scan_type: str) -> str:
     """Return the unit of the samples."""

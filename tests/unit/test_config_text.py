@@ -202,6 +202,7 @@ def test_the_starter_names_every_key(scan_type) -> None:
         document.TimeAxisConfig,
         document.RenderConfig,
         document.OutputConfig,
+        document.SensorConfig,
     ]
     sections += [
         value
@@ -209,7 +210,7 @@ def test_the_starter_names_every_key(scan_type) -> None:
         for value in vars(module).values()
         if isinstance(value, type) and issubclass(value, BaseModel) and "type" in value.model_fields
     ]
-    assert len(sections) == 6 + 8 + 4
+    assert len(sections) == 7 + 8 + 4
     for section in sections:
         for key in section.model_fields:
             assert re.search(rf"\b{key}:", text), f"{section.__name__}.{key}"

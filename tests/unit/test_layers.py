@@ -11,7 +11,7 @@ import pytest
 import nlosrender
 
 PACKAGE = Path(nlosrender.__file__).parent
-STAGES = ("config", "scene", "capture", "engine", "files", "rendering", "analysis", "bench", "cli")
+STAGES = ("config", "scene", "capture", "engine", "sensor", "files", "rendering", "analysis", "bench", "cli")
 SHARED = ("constants", "errors", "interruption", "readable")
 MODULES = sorted(PACKAGE.rglob("*.py"))
 IN_STAGES = [path for path in MODULES if path.relative_to(PACKAGE).parts[0] in STAGES]

@@ -200,6 +200,17 @@ class PartialCapture:
         tag = tree_hash({"format": STATE_FORMAT, "identity": self._identity, "budget": dict(budget)})
         return ItemState.of(self.folder, item, tag)
 
+    def extend(self, add: Callable[[HDF5Writer, Path], Mapping[str, object]]) -> Mapping[str, object]:
+        """Let ``add`` write more datasets into the file, which has all samples by now, and return what it does.
+
+        Raises
+        ------
+        FileError
+            The disk refuses.
+        """
+        with explained_write(self.path):
+            return add(self._open_writer, self.path)
+
     def publish(self, attributes: Mapping[str, object]) -> None:
         """Complete the file with its last attributes and put it in place.
 

@@ -25,6 +25,7 @@ from nlosrender.files.capture_results import UNKNOWN_FROM, UNSAMPLED, ZERO, Capt
 from nlosrender.files.file_kinds import CAPTURE, FileKind, same_capture
 from nlosrender.files.hdf5_writer import HDF5Writer
 from nlosrender.files.identity import SELECTION
+from nlosrender.files.measured import add_counts
 from nlosrender.files.partial.work_item_log import CHECKSUM_RANGE, placed_checksum
 from nlosrender.files.parts.shards import CHECKSUMS, NOTE, PART, SUMS, Shard, read_shards
 from nlosrender.files.reading.reader import explained_read, open_hdf5
@@ -46,6 +47,7 @@ def merge_captures(
     paths: Sequence[str | Path],
     output: str | Path,
     progress: Progress = lambda share: None,
+    warn: Callable[[str], None] = lambda text: None,
     *,
     overwrite: bool = False,
 ) -> MergeReport:
@@ -57,8 +59,8 @@ def merge_captures(
         Files rendered with ``--shard`` or ``--lasers``, in any order.
     output
         File to write; it appears when it is complete.
-    progress
-        Called with the share of the work done.
+    progress, warn
+        Called with the share of the work done, and with warnings.
     overwrite
         Whether a file that holds another capture, or a part, may be replaced.
 
@@ -82,6 +84,11 @@ def merge_captures(
                 for name in (PART, SUMS, CHECKSUMS, NOTE, ZERO, SELECTION):
                     writer.file.attrs.pop(name, None)
                 set_attributes(writer.file, _attributes(shards, summed, output))
+            if json_object(shards[0].header.attributes.get("config")).get("sensor"):
+                with explained_write(output):
+                    counted = add_counts(writer, output, warn=warn)
+                    with writer.writing():
+                        set_attributes(writer.file, counted)
     return MergeReport(output=output, parts=len(shards), **summed.results())
 
 

@@ -18,7 +18,7 @@ from nlosrender.files.reading.reader import StoredCapture, finite
 from nlosrender.files.reading.stored_header import StoredHeader, intensity
 from nlosrender.files.reading.stored_points import FLATNESS, Numbers
 from nlosrender.scene.bounding_box import Bounds, box_corners
-from nlosrender.scene.pose import euler_xyz
+from nlosrender.scene.pose import Pose, euler_xyz
 
 Float32 = NDArray[np.float32]
 
@@ -76,14 +76,11 @@ def read_scan(capture: StoredCapture) -> Scan:
             f"{capture.path}: is a line_of_sight capture, a camera's pictures over time: there is no relay wall to "
             "reconstruct from or to export. See `nlosrender frames`."
         )
-    wall_from_file = _wall_from_file(header)
-    if wall_from_file is None:
-        wall_from_file = np.eye(4)
-        wall_from_file[:3, :3] = ZNLOS_FROM_LOCAL.T
+    wall_from_file = wall_frame(header)
     if not all(np.isfinite(part).all() for part in (stored.sensor_positions, stored.laser_positions, header.start_opl)):
         raise FileError(f"{capture.path}: t0 or a position on the wall is not a finite number")
-    sensors = _moved(stored.sensor_positions, wall_from_file)
-    lasers = _moved(stored.laser_positions, wall_from_file)
+    sensors = moved(stored.sensor_positions, wall_from_file)
+    lasers = moved(stored.laser_positions, wall_from_file)
     counted = bool(header.attributes.get("account_first_and_last_bounces", True))  # the layout's rule
     sensor, laser = (_device(place, wall_from_file) for place in (header.sensor_position, header.laser_position))
     to_scene = _matrix(header, "file_to_scene")
@@ -100,7 +97,7 @@ def read_scan(capture: StoredCapture) -> Scan:
         start_opl=header.start_opl,
         bin_width_opl=header.bin_width_opl,
         n_bins=header.n_bins,
-        hidden_aabb=_hidden_aabb(header, wall_from_file),
+        hidden_aabb=hidden_box(header, wall_from_file),
         wall_to_file=wall_to_file,
         wall_to_scene=None if to_scene is None else to_scene @ wall_to_file,
     )
@@ -166,7 +163,7 @@ def read_light(
 def _device(position: Numbers | None, wall_from_file: Float64) -> Float64 | None:
     if position is None or len(position) != 3 or not np.isfinite(position).all():
         return None
-    return _moved(np.asarray(position), wall_from_file)
+    return moved(np.asarray(position), wall_from_file)
 
 
 def _legs(capture: StoredCapture, points: Float64, device: Float64 | None, counted: bool, name: str) -> Float64:
@@ -177,11 +174,20 @@ def _legs(capture: StoredCapture, points: Float64, device: Float64 | None, count
     return np.linalg.norm(points - device, axis=-1)
 
 
-def _wall_from_file(header: StoredHeader) -> Float64 | None:
+def wall_frame(header: StoredHeader) -> Float64:
+    """Return the (4, 4) matrix from a file's positions to the wall's frame."""
     to_scene, wall_to_scene = _matrix(header, "file_to_scene"), _matrix(header, "relay_wall_to_scene")
-    if to_scene is None or wall_to_scene is None:
-        return None  # another writer's file: the layout puts the wall into y = 0
-    return np.linalg.inv(wall_to_scene) @ to_scene
+    if to_scene is not None and wall_to_scene is not None:
+        return np.linalg.inv(wall_to_scene) @ to_scene
+    by_layout = np.eye(4)  # another writer's file: the layout puts the wall into y = 0
+    by_layout[:3, :3] = ZNLOS_FROM_LOCAL.T
+    return by_layout
+
+
+def wall_pose(header: StoredHeader) -> Pose:
+    """Return the pose of the wall's frame in the scene; where the file does not say, it is the scene's."""
+    to_scene = _matrix(header, "relay_wall_to_scene")
+    return Pose(np.eye(3), np.zeros(3)) if to_scene is None else Pose(to_scene[:3, :3], to_scene[:3, 3])
 
 
 def _matrix(header: StoredHeader, name: str) -> Float64 | None:
@@ -193,11 +199,13 @@ def _matrix(header: StoredHeader, name: str) -> Float64 | None:
     return matrix if usable and abs(np.linalg.det(matrix[:3, :3])) > 1e-6 else None
 
 
-def _moved(points: Float64, matrix: Float64) -> Float64:
+def moved(points: Float64, matrix: Float64) -> Float64:
+    """Return points (..., 3) in the frame that a (4, 4) matrix goes to."""
     return points @ matrix[:3, :3].T + matrix[:3, 3]
 
 
-def _hidden_aabb(header: StoredHeader, wall_from_file: Float64) -> Bounds | None:
+def hidden_box(header: StoredHeader, wall_from_file: Float64) -> Bounds | None:
+    """Return the box around the hidden geometry along the wall's axes; None where the file has none."""
     edges, center = header.hidden_volume_edges, header.hidden_volume_position
     if not edges or not max(edges) > 0 or center is None or len(center) != 3:
         return None
@@ -206,5 +214,5 @@ def _hidden_aabb(header: StoredHeader, wall_from_file: Float64) -> Bounds | None
         return None
     half = np.broadcast_to(edges, 3) / 2
     corners = box_corners((-half, half)) @ euler_xyz(np.degrees(angles)).T + np.asarray(center)
-    corners = _moved(corners, wall_from_file)
+    corners = moved(corners, wall_from_file)
     return corners.min(axis=0), corners.max(axis=0)

@@ -90,6 +90,11 @@ class StoredHeader:
         """Rows and columns of the laser grid; a confocal capture has its sensor grid here."""
         return self.sensor_grid if self.confocal else (self.sizes["laser_y"], self.sizes["laser_x"])
 
+    @property
+    def is_measured(self) -> bool:
+        """Whether the samples are a detector's counts."""
+        return self.data_attributes.get("unit") == layout.COUNTS_UNIT
+
     def bounce_name(self, index: int) -> str:
         """Return what an index of the bounce axis holds: a bounce number, "7 and above" or "all"."""
         limit = self.attributes.get("max_bounces")

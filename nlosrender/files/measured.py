@@ -1,0 +1,457 @@
+"""Measured captures: a detector in front of a capture file, a few rows of sensor points at a time.
+
+Counts go into a file of their own (``measure_capture``) or, in a render, into a dataset beside the ideal samples
+(``add_counts``). Random numbers are those of the seed, the laser point and the first row of a block of rows; blocks
+follow from the grid and the detector's bins alone. So counts do not depend on who measures what when.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+from numpy.random import Generator, Philox
+from numpy.typing import NDArray
+from scipy.sparse import csr_array
+from threadpoolctl import threadpool_limits
+
+from nlosrender.config.sensor import SensorConfig, misfits, stored_sensor
+from nlosrender.errors import ConfigError, FileError
+from nlosrender.files import layout
+from nlosrender.files.atomic_write import check_writable, replacing
+from nlosrender.files.attributes import json_object, set_attributes, text_list
+from nlosrender.files.capture_header import CaptureHeader
+from nlosrender.files.capture_results import UNSAMPLED, ZERO
+from nlosrender.files.chunking import Chunker, PackedChunk
+from nlosrender.files.file_kinds import CAPTURE, MEASURED
+from nlosrender.files.hdf5_writer import HDF5Writer
+from nlosrender.files.header_writer import create_capture
+from nlosrender.files.parts.shards import PART
+from nlosrender.files.reading.reader import StoredCapture, finite, open_capture
+from nlosrender.files.reading.scan import hidden_box, moved, wall_frame, wall_pose
+from nlosrender.files.reading.stored_header import StoredHeader, intensity
+from nlosrender.sensor.detector import Detector, Totals, detector_of, detector_warnings, physical_scale
+from nlosrender.sensor.rebinning import TimeBins
+from nlosrender.sensor.zones import zone_of_points, zone_sums
+
+COUNTS = "counts"  # the dataset beside the ideal samples
+SENSOR, MEASUREMENT, CORRECTIONS = "sensor", "measurement", "corrections"  # attributes
+SUMMED_INDEX = 1  # of the bounce axis: where every loader looks
+BLOCK_SAMPLES = 2**21  # of light or counts at a time and thread: some ten arrays of 16 MB
+# of the ideal capture's attributes, what stays true of its counts
+KEPT = ("config", "config_hash", "versions", "render_engine", "meshes", UNSAMPLED, ZERO)
+CORRECTABLE = ("pile_up", "background")
+TOO_FEW = 100  # counts per histogram: below, shot noise alone is more than 10 % of their sum
+
+Block = tuple[int, int, slice]  # laser row, laser column, rows of sensor points or of zones
+Result = TypeVar("Result")
+Progress = Callable[[float], None]
+Warn = Callable[[str], None]
+Put = Callable[[PackedChunk], object]
+
+
+@dataclass(frozen=True)
+class MeasureReport:
+    """What was measured."""
+
+    output: Path
+    measurement: Mapping[str, object]  # as ``measurement_of`` returns it
+
+
+def measure_capture(
+    path: str | Path,
+    output: str | Path,
+    config: SensorConfig | None,
+    progress: Progress = lambda share: None,
+    warn: Warn = lambda text: None,
+    *,
+    corrections: tuple[str, ...] = (),
+    overwrite: bool = False,
+    threads: int | None = None,
+) -> MeasureReport:
+    """Write a capture whose ``data`` are what a detector counts of another one.
+
+    Parameters
+    ----------
+    path
+        A Z-NLOS file by any writer; or one that was measured, to be corrected.
+    output
+        File to write.
+    config
+        The detector; None: that of the file.
+    progress, warn
+        Called with the share of the work done, and with warnings.
+    corrections
+        Some of ``CORRECTABLE``: what is undone of the counts.
+    overwrite
+        Whether a capture may be replaced that holds no counts.
+    threads
+        That measure; None: one per core. Counts are the same.
+
+    Raises
+    ------
+    ConfigError
+        The detector does not fit the capture.
+    FileError
+        The file cannot be measured, or the output not be written.
+    """
+    output = Path(output)
+    kind = CAPTURE if overwrite else MEASURED
+    check_writable(output, kind, [path])
+    with open_capture(path) as capture:
+        measurement = _measurement(capture, config, corrections).scaled(threads)
+        header = capture.header
+        compression = "none" if header.compression == "none" else "gzip"
+        with replacing(output, kind, [path]) as partial, HDF5Writer(partial) as writer:
+            with writer.writing():
+                create_capture(writer.file, measurement.header, {}, compression, store_variance=False)
+                kept = {name: header.attributes[name] for name in KEPT if name in header.attributes}
+                kept |= {
+                    "measured_from": Path(path).name,
+                    "ideal_error_estimate": header.attributes.get("error_estimate", np.nan),
+                }
+                set_attributes(writer.file, kept)
+            data = writer.file[layout.DATA]
+            totals = measurement.count(
+                lambda chunk: writer.put_chunk(data, chunk.at, chunk.content), compression, progress, warn, threads
+            )
+            attributes = measurement.attributes(totals)
+            with writer.writing():
+                set_attributes(writer.file, attributes)
+                set_attributes(data, {"unit": layout.COUNTS_UNIT, "meaning": "counts per bin, of all bounces"})
+    return MeasureReport(output, measurement.statistics(totals))
+
+
+def add_counts(writer: HDF5Writer, path: Path, *, warn: Warn = lambda text: None) -> dict[str, object]:
+    """Add a dataset ``counts`` to a complete capture that is open for writing, as its configuration has a sensor.
+
+    It has the axes of ``data``; one that is there already is replaced.
+
+    Returns
+    -------
+    dict
+        Attributes for the file.
+
+    Raises
+    ------
+    ConfigError, FileError, OSError
+        As ``measure_capture``.
+    """
+    capture = StoredCapture(writer.file, path)
+    measurement = _measurement(capture, None, ()).scaled()
+    header = measurement.header
+    gzip = capture.header.compression != "none"
+    with writer.writing():
+        if COUNTS in writer.file:
+            del writer.file[COUNTS]
+        shape = layout.data_shape(header.sizes, header.confocal)
+        filters = {"compression": "gzip", "shuffle": True} if gzip else {}
+        dataset = writer.file.create_dataset(
+            COUNTS, shape, layout.FLOAT, chunks=header.chunks, fillvalue=0.0, **filters
+        )
+        set_attributes(
+            dataset,
+            {
+                "unit": layout.COUNTS_UNIT,
+                "meaning": f"counts per bin, of all bounces, in index {SUMMED_INDEX} of the bounce axis",
+                "axes": " ".join(layout.file_axes(header.confocal)),
+                "t0": header.start_opl,
+                "deltaT": header.bin_width_opl,
+            },
+        )
+    totals = measurement.count(
+        lambda chunk: writer.put_chunk(dataset, chunk.at, chunk.content),
+        "gzip" if gzip else "none",
+        lambda share: None,
+        warn,
+    )
+    return measurement.attributes(totals)
+
+
+def sensor_of(header: StoredHeader) -> SensorConfig | None:
+    """Return the sensor that a file was measured with, or that its configuration has; None: there is none."""
+    stored = json_object(header.attributes.get(SENSOR))
+    values = stored or json_object(header.attributes.get("config")).get("sensor")
+    return stored_sensor(values) if isinstance(values, Mapping) and values else None
+
+
+def few_counts(header: StoredHeader) -> str | None:
+    """Return a warning where the histograms of a measured file hold few counts; None where they do not."""
+    stated = json_object(header.attributes.get(MEASUREMENT)).get("counts_per_histogram")
+    if not header.is_measured or not isinstance(stated, (int, float)) or stated >= TOO_FEW:
+        return None
+    return (
+        f"{header.path}: holds {stated:.3g} counts per histogram: shot noise is more than {TOO_FEW**-0.5:.0%} of their "
+        "sum. Measure longer (sensor.exposure_time)."
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Measurement:
+    """A detector before a capture."""
+
+    capture: StoredCapture
+    detector: Detector
+    header: CaptureHeader  # of the counts
+    zones: csr_array | None  # (zones, points)
+    corrections: tuple[str, ...]
+    is_counts: bool  # the capture is measured already, and is corrected
+
+    @cached_property
+    def blocks(self) -> list[Block]:
+        """(laser row, laser column, rows of sensor points or of zones): whole chunks of the counts."""
+        sizes = self.header.sizes
+        lasers = np.ndindex(sizes["laser_y"], sizes["laser_x"])
+        tile = dict(zip(layout.file_axes(self.header.confocal), self.header.chunks, strict=True))["sensor_y"]
+        bins = max(sizes["bin"], self.capture.header.n_bins)
+        step = (
+            sizes["sensor_y"]
+            if self.zones is not None
+            else max(BLOCK_SAMPLES // (bins * sizes["sensor_x"] * tile), 1) * tile
+        )
+        rows = [slice(y, min(y + step, sizes["sensor_y"])) for y in range(0, sizes["sensor_y"], step)]
+        return [(y, x, part) for y, x in lasers for part in rows]
+
+    def light(self, block: Block) -> NDArray[np.float32]:
+        """Return the light of a block, (source bins, points)."""
+        if self.zones is None:
+            return self._light(block[:2], block[2]).T
+        found = np.zeros((self.zones.shape[0], self.capture.header.n_bins), np.float32)
+        columns, done = self.capture.header.sizes["sensor_x"], 0
+        step = max(BLOCK_SAMPLES // (columns * self.capture.header.n_bins), 1)
+        for y in range(0, self.capture.header.sizes["sensor_y"], step):
+            band = self._light(block[:2], slice(y, y + step))
+            found += self.zones[:, done : done + len(band)] @ band
+            done += len(band)
+        return found.T
+
+    def _light(self, laser: tuple[int, int], rows: slice) -> NDArray[np.float32]:
+        """Return (points, bins) of rows of sensor points, bounces summed, colours averaged."""
+        capture = self.capture
+        samples = finite(capture.path, capture.read_block(laser, (rows, None)))
+        light = intensity(capture.header, samples).sum(axis=0).reshape(-1, capture.header.n_bins)
+        if light.min(initial=0.0) < 0 and not self.is_counts:
+            raise FileError(
+                f"{capture.path}: holds negative light, {light.min():.3g}, of which no photons can be counted."
+            )
+        return light
+
+    def scaled(self, threads: int | None = None) -> _Measurement:
+        """Return the same with the scale of the capture's light, all of which is looked at for a relative one."""
+        return dataclasses.replace(self, detector=dataclasses.replace(self.detector, scale=self._scale(threads)))
+
+    def count(self, put: Put, compression: str, progress: Progress, warn: Warn, threads: int | None = None) -> Totals:
+        """Measure all blocks, hand out the chunks in their order, and return the sums."""
+        for text in () if self.is_counts else detector_warnings(self.detector):
+            warn(text)
+        chunker, totals = Chunker(self.header, compression), Totals()
+        for number, (chunks, part) in enumerate(
+            _in_order(lambda block: self._measured(block, chunker), self.blocks, threads)
+        ):
+            for chunk in chunks:
+                put(chunk)
+            totals.add(part)
+            progress((number + 1) / len(self.blocks))
+        if totals.without_ready:
+            warn(
+                f"{totals.without_ready} histograms have bins after which no pulse was left: pile-up cannot be undone "
+                "there, they are 0. Measure with less light."
+            )
+        return totals
+
+    def _measured(self, block: Block, chunker: Chunker) -> tuple[list[PackedChunk], Totals]:
+        y, x, rows = block
+        light, sizes = self.light(block), self.header.sizes
+        if self.is_counts:
+            counts, totals = light.astype(np.float64), Totals(light.shape[1])
+        else:
+            config = self.detector.config
+            stream = Philox(key=[config.seed, y * sizes["laser_x"] + x], counter=[0, 0, 0, rows.start])
+            counts, totals = self.detector.measure(light, Generator(stream) if config.shot_noise else None)
+        counts, totals.without_ready = self.detector.corrected(counts, self.corrections)
+        shaped = counts.reshape(1, 1, 1, 1, sizes["bin"], -1, sizes["sensor_x"])
+        return [*chunker.pack({layout.DATA: np.moveaxis(shaped, 4, -1)}, (y, x), (rows.start, 0))], totals
+
+    def _scale(self, threads: int | None) -> float:
+        config = self.detector.config
+        if self.is_counts:
+            return 1.0
+        if config.photons_per_pulse is None:
+            unit, size = self.capture.header.data_attributes.get("unit"), self.capture.header.sensor_grid_size
+            if unit != layout.DATA_UNIT:
+                message = f"missing: {self.capture.path} does not say that its data are in {layout.DATA_UNIT}, "
+                raise ConfigError.at(
+                    "sensor.photons_per_pulse", message + "so they make no photons; need a relative scale."
+                )
+            rows, columns = self.capture.header.sensor_grid
+            area = float(np.prod(size)) / (rows * columns) if size else 0.0
+            if config.footprint_area is None and area <= 0:
+                raise ConfigError.at("sensor.footprint_area", "missing: the sensor grid has no size.")
+            return physical_scale(config, area)
+        sums = _in_order(lambda block: self.light(block).sum(axis=0, dtype=np.float64), self.blocks, threads)
+        total, brightest, points = 0.0, 0.0, 0
+        for part in sums:
+            total, brightest, points = total + float(part.sum()), max(brightest, float(part.max())), points + len(part)
+        if not total > 0:
+            return 0.0  # no light, which no scale makes photons of
+        wanted = config.photons_per_pulse
+        return wanted.brightest / brightest if wanted.brightest is not None else (wanted.mean or 0.0) * points / total
+
+    def attributes(self, totals: Totals) -> dict[str, object]:
+        """Return the attributes that say how the counts came about."""
+        config = self.detector.config
+        earlier = self.capture.header.attributes
+        described = {name: field.description for name, field in SensorConfig.model_fields.items()}
+        return {
+            SENSOR: json.dumps(config.model_dump(mode="json")),
+            "sensor_keys": json.dumps(described),
+            MEASUREMENT: earlier[MEASUREMENT]
+            if self.is_counts and MEASUREMENT in earlier
+            else json.dumps(self.statistics(totals)),
+            CORRECTIONS: [*(text_list(earlier, CORRECTIONS) if self.is_counts else ()), *self.corrections] or "none",
+        }
+
+    def statistics(self, totals: Totals) -> dict[str, object]:
+        """Return what ``info`` shows: plain numbers."""
+        if self.is_counts:
+            return json_object(self.capture.header.attributes.get(MEASUREMENT))
+        config, n, response = self.detector.config, totals.histograms, self.detector.response
+        pulses, free = config.n_pulses * n, totals.signal + totals.background
+        return {
+            "pulses": config.n_pulses,
+            "photons_per_pulse": totals.photons / n,
+            "scale": self.detector.scale,
+            "counts": totals.counts,
+            "counts_per_histogram": totals.counts / n,
+            "expected_counts": totals.expected,
+            "detections_per_pulse": totals.detected / pulses,
+            "detections_per_pulse_brightest": totals.brightest,
+            "lost_to_pile_up": 1 - totals.detected / free if free else 0.0,
+            "signal_to_background": totals.signal / totals.background if totals.background else None,
+            "outside_the_bins": 1 - totals.in_bins / totals.photons if totals.photons else 0.0,
+            "afterpulses": totals.expected - totals.detected,
+            "response_fwhm_opl": response.fwhm,
+            "response_mean_delay_opl": response.mean_delay,
+        }
+
+
+def _measurement(capture: StoredCapture, config: SensorConfig | None, corrections: tuple[str, ...]) -> _Measurement:
+    """Put a detector before a capture (ConfigError, FileError: it does not fit)."""
+    header = capture.header
+    counts = header.is_measured
+    config = config or sensor_of(header)
+    if config is None:
+        raise FileError(
+            f"{header.path}: names no sensor. Use --sensor; nlosrender measure --list lists those there are."
+        )
+    _refuse(header, config, corrections, counts)
+    detector = detector_of(config, TimeBins(header.start_opl, header.bin_width_opl, header.n_bins))
+    zones = None if counts else config.zones
+    described, sums = _counts_header(capture, detector, zones)
+    return _Measurement(capture, detector, described, sums, corrections, counts)
+
+
+def _refuse(header: StoredHeader, config: SensorConfig, corrections: tuple[str, ...], counts: bool) -> None:
+    path, done = header.path, text_list(header.attributes, CORRECTIONS) if counts else ()
+    if PART in header.attributes:
+        raise FileError(f"{path}: is a part of a capture, whose brightness is not known yet. Merge the parts first.")
+    if counts and not corrections:
+        raise FileError(f"{path}: holds counts already. Measure the ideal capture, or name a --correct.")
+    if set(done) & set(corrections):
+        raise FileError(f"{path}: has been corrected for {', '.join(done)} already.")
+    undone = "pile_up" not in (*corrections, *done)
+    if "background" in corrections and config.pile_up != "none" and undone:
+        raise FileError(f"{path}: background adds up where nothing is lost only: also use --correct pile_up.")
+    if "pile_up" in corrections and config.afterpulse_probability:
+        raise FileError(
+            f"{path}: pile-up cannot be undone with afterpulses (sensor.afterpulse_probability) among the counts."
+        )
+    for key, message in () if counts else misfits(config, header.scan_type):
+        raise ConfigError.at(f"sensor.{key}", message)
+
+
+def _counts_header(capture: StoredCapture, detector: Detector, zones: object) -> tuple[CaptureHeader, csr_array | None]:
+    """Describe the file of the counts: the capture's, with the detector's bins, and with zones for sensor points."""
+    header, stored, to_wall = capture.header, capture.positions, wall_frame(capture.header)
+    if (
+        stored.sensor_normals is None
+        or stored.laser_normals is None
+        or header.sensor_position is None
+        or header.laser_position is None
+    ):
+        raise FileError(
+            f"{capture.path}: lacks normals, cameraPosition or laserPosition, which a Z-NLOS file of its counts needs."
+        )
+    turn = to_wall.copy()
+    turn[:3, 3] = 0.0
+    sensors, lasers = moved(stored.sensor_positions, to_wall), moved(stored.laser_positions, to_wall)
+    normals, laser_normals = moved(stored.sensor_normals, turn), moved(stored.laser_normals, turn)
+    sensor = moved(np.asarray(header.sensor_position), to_wall)
+    size, sums = header.sensor_grid_size or (0.0, 0.0), None
+    if detector.config.zones is not None and zones is not None:
+        config = detector.config.zones
+        sums = zone_sums(zone_of_points(config, sensors, sensor, (size[0], size[1])), config.nx * config.ny)
+        share = sums / sums.sum(axis=1)[:, None]
+        shape = (config.ny, config.nx, 3)
+        sensors = (share @ sensors.reshape(-1, 3)).reshape(shape)
+        normals = (share @ normals.reshape(-1, 3)).reshape(shape)
+        normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
+    laser_size = header.laser_grid_size or (0.0, 0.0)
+    limit = header.attributes.get("max_bounces")
+    frame = str(header.attributes.get("frame", "znlos"))
+    bins = detector.bins
+    try:
+        return CaptureHeader(
+            scan_type=header.scan_type,
+            sensor_positions=sensors,
+            sensor_normals=normals,
+            laser_positions=lasers,
+            laser_normals=laser_normals,
+            sensor_position=sensor,
+            laser_position=moved(np.asarray(header.laser_position), to_wall),
+            sensor_grid_size=(size[0], size[1]),
+            laser_grid_size=(laser_size[0], laser_size[1]),
+            n_bins=bins.count,
+            bin_width_opl=bins.width,
+            start_opl=bins.start,
+            max_bounces=limit if isinstance(limit, int) else None,
+            account_first_and_last_bounces=bool(header.attributes.get("account_first_and_last_bounces", True)),
+            hidden_bounds=hidden_box(header, to_wall),
+            pose=wall_pose(header),
+            frame=frame if frame in layout.FRAMES else "znlos",
+            planar_wall=bool(header.attributes.get("planar_wall", np.ptp(sensors[..., 2]) < 1e-6)),
+            n_channels=1,
+            bounce_indices=(SUMMED_INDEX,),
+            split_bounces=False,
+        ), sums
+    except ValueError as error:
+        raise FileError(f"{capture.path}: {error}") from error
+
+
+def _in_order(function: Callable[[Block], Result], blocks: Sequence[Block], threads: int | None) -> Iterator[Result]:
+    """Yield the results for blocks in their order, computed by several threads a little ahead of the reader.
+
+    BLAS has one thread: its own would wait for each other, and the processors are busy.
+    """
+    workers = threads or (len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1)
+    waiting: deque[Future[Result]] = deque()
+    with threadpool_limits(1, "blas"), ThreadPoolExecutor(workers) as pool:
+        try:
+            for block in blocks:
+                waiting.append(pool.submit(function, block))
+                if len(waiting) > workers:
+                    yield waiting.popleft().result()
+            while waiting:
+                yield waiting.popleft().result()
+        finally:
+            for future in waiting:
+                future.cancel()
