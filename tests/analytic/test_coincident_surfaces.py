@@ -234,6 +234,31 @@ def test_a_sheet_cut_twice_becomes_two_layers() -> None:
     assert np.isclose(np.median(off), STEP * GAP * (1 + np.median(z)), rtol=0.2)  # of float32 coordinates: 1e-7
 
 
+@pytest.mark.parametrize("level", [0.5, 0.7311])
+def test_small_triangles_on_large_ones_are_found_at_once(level: float) -> None:
+    """The undersides of 4 x 4 legs on a floor of two triangles: few of its points lie in any, rays meet either."""
+    start_backend("llvm", colored=False, polarized=False)
+    import mitsuba as mi
+
+    from nlosrender.scene.loading.coincident import moved_apart, overlaps
+
+    random, legs = np.random.default_rng(3), []
+    for x, y in np.ndindex(4, 4):
+        one = sheet(30, random, 0.0)
+        legs.append(replace(one, vertices=one.vertices * [0.03, 0.03, 0] + [0.2 * x - 0.31, 0.2 * y - 0.3, level]))
+    corners = np.array([[-1, -1, level], [1, -1, level], [1, 1, level], [-1, 1, level]])
+    meshes = {0: TriangleMesh(corners, np.array([[0, 1, 2], [0, 2, 3]])), 1: TriangleMesh.merged(legs)}
+    counts = []
+    for seed in range(2):
+        shapes = [device_mesh(mi, f"m{number}", mesh) for number, mesh in meshes.items()]
+        scene = mi.load_dict({"type": "scene", **{f"m{i}": shape for i, shape in enumerate(shapes)}})
+        found = overlaps(scene, shapes, meshes, seed)
+        counts.append(int(found[0].faces.sum()) if found else 0)
+        for overlap in found:
+            meshes[1] = moved_apart(meshes[1], overlap.faces, both_sides=False)
+    assert counts == [16 * 2 * 30**2, 0]
+
+
 def device_mesh(mi: Any, name: str, mesh: TriangleMesh) -> Any:
     """Return a mesh on the device."""
     shape = mi.Mesh(name, len(mesh.vertices), len(mesh.faces))

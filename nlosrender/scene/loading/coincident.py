@@ -17,7 +17,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nlosrender.scene.meshes.triangle_mesh import TriangleMesh, unit_rows
-from nlosrender.scene.pose import Float64
 from nlosrender.scene.triangle_point import triangle_weights
 
 # over 1 + the largest coordinate [engine units]: four times the ray offset of 5e-7. A shadow ray leaves one surface by
@@ -25,8 +24,10 @@ from nlosrender.scene.triangle_point import triangle_weights
 GAP = 2e-6
 STEP = 1.25  # gaps by which triangles are moved: farther than the gap, so that they are not found again
 FLATNESS = 4.0  # gaps that the corners of a triangle may be off the plane of the other; surfaces that cross are farther
-EDGE = 1e-3  # barycentric distance from an edge within which float32 may meet a neighbour in the same plane
+SHIFT = GAP / 2  # more than float32 rounds by; rays from a gap off still meet what they would
+EDGE = 1e-3  # barycentric distance from an edge, at most two gaps, in which float32 may meet a neighbour in the plane
 MIN_POINTS = 2**16  # tried on all meshes of a scene: 65 of them lie in an overlap of 1e-3 of the area
+NEXT_POINTS = 64  # tried on each triangle beside one that coincides
 DISK_POINTS = 4096  # tried on each disk
 MIN_DISK_SHARE = 0.01  # of these within the gap: of surfaces that cross the disk only a thin strip is
 MAX_LAYERS = 32  # in one place that are moved apart: each takes a pass, which loads the scene anew
@@ -48,7 +49,10 @@ def overlaps(
     """Find triangles that lie within ``GAP`` of earlier ones.
 
     Points of all triangles are tried, in proportion to area but two of each at least, by a ray that comes from just
-    outside and goes to just inside: about every second one meets the other of two surfaces in one place first.
+    outside and goes to just inside. Of two triangles in one plane the ray tracer meets the one that it keeps last, so
+    that only the larger ones' points may tell. Once any is found, rays from either side are sent through triangles that
+    are shifted by random parts of the gap: of two in one place one way meets the other one. More points are tried on
+    the neighbours of those found, until none is.
 
     Parameters
     ----------
@@ -68,9 +72,18 @@ def overlaps(
     for number in meshes:
         first[in_scene.index(shapes[number])] = np.searchsorted(owners, number) + 1
     areas = joined.areas()
-    pairs = _pairs(scene, joined, areas, mi.UInt32(first), seed)
-    if not pairs.size:
+    points = 1 + np.ceil(areas / areas.sum() * max(MIN_POINTS, len(areas))).astype(np.intp)
+    if not _pairs(scene, joined, points, mi.UInt32(first), seed).size:
         return []
+    shifted, tried, found = _shifted(joined, seed), np.zeros(len(areas), bool), []
+    while points.any():
+        found += [_pairs(shifted, joined, points, mi.UInt32(1), seed, way) for way in (-1, 1)]
+        touched = np.zeros(len(joined.vertices), bool)
+        touched[joined.faces[np.concatenate(found[-2:], axis=1)]] = True
+        is_next = touched[joined.faces].any(axis=1) & ~tried
+        tried |= is_next
+        points = NEXT_POINTS * is_next
+    pairs = np.concatenate(found, axis=1)
     # in a mesh what faces away from the wall counts as later: both sides of a sheet are then one layer each
     turned_away = np.einsum("ij,ij->i", joined.face_normals(), joined.vertices[joined.faces[:, 0]]) > 0
     rank = (2 * owners + turned_away) * len(owners) + np.arange(len(owners))
@@ -123,15 +136,28 @@ def moved_apart(mesh: TriangleMesh, faces: NDArray[np.bool_], *, both_sides: boo
     return TriangleMesh.merged([mesh.subset(~faces), moved]) if not faces.all() else moved
 
 
-def _pairs(scene: mi.Scene, mesh: TriangleMesh, areas: Float64, first: mi.UInt32, seed: int) -> NDArray[np.uint32]:
+def _shifted(mesh: TriangleMesh, seed: int) -> mi.Scene:
+    """Return a scene of the triangles of a mesh, each moved along its normal by a random part of ``SHIFT``."""
+    corners = mesh.vertices[mesh.faces]
+    parts = SHIFT * (1 + np.abs(corners).max(axis=(1, 2))) * np.random.default_rng(seed).random(len(corners))
+    corners += (mesh.face_normals() * parts[:, None])[:, None]
+    shape = mi.Mesh("shifted", vertex_count=3 * len(corners), face_count=len(corners))
+    parameters = mi.traverse(shape)
+    parameters["faces"] = np.arange(3 * len(corners), dtype=np.uint32)
+    parameters["vertex_positions"] = corners.ravel().astype(np.float32)
+    parameters.update()
+    return mi.load_dict({"type": "scene", "shifted": shape})
+
+
+def _pairs(
+    scene: mi.Scene, mesh: TriangleMesh, points: NDArray[np.intp], first: mi.UInt32, seed: int, way: int = -1
+) -> NDArray[np.uint32]:
     """Return pairs (2, n) of triangles of ``mesh`` in one plane, one within ``GAP`` before a point of the other.
 
-    ``areas`` (m,) are those of its triangles. ``first`` is, for each shape of the scene, the triangle of ``mesh`` that
-    it begins with, plus 1; 0 for other shapes.
+    ``points`` (m,) of each triangle are tried. ``first`` is, for each shape of the scene, the triangle of ``mesh`` that
+    it begins with, plus 1; 0 for other shapes. ``way`` of the rays: -1 against the normals, 1 along them.
     """
-    count = max(MIN_POINTS, len(areas))
-    copies = 1 + np.ceil(areas / areas.sum() * count).astype(np.intp)
-    own = mi.UInt32(np.repeat(np.arange(len(areas), dtype=np.uint32), copies))
+    own = mi.UInt32(np.repeat(np.arange(len(points), dtype=np.uint32), points))
     faces, vertices = mi.UInt32(np.ravel(mesh.faces)), mi.Float(np.ravel(mesh.vertices).astype(np.float32))
 
     def corners(face: mi.UInt32) -> list[mi.Point3f]:
@@ -143,15 +169,18 @@ def _pairs(scene: mi.Scene, mesh: TriangleMesh, areas: Float64, first: mi.UInt32
     a, b, c = corners(own)
     point = a + (b - a) * at_b + (c - a) * at_c
     normal = dr.normalize(dr.cross(b - a, c - a))
-    reach = normal * (GAP * (1 + dr.max(dr.abs(point))))
-    hit = scene.ray_intersect_preliminary(mi.Ray3f(point + reach, -2 * reach, mi.Float(1), mi.Float(0), []))
+    reach = normal * (way * GAP * (1 + dr.max(dr.abs(point))))
+    hit = scene.ray_intersect_preliminary(mi.Ray3f(point - reach, 2 * reach, mi.Float(1), mi.Float(0), []))
     start = dr.gather(mi.UInt32, first, hit.shape_index, hit.is_valid())
     met = start - 1 + hit.prim_index
-    u, v = hit.prim_uv
-    chosen = (start > 0) & (met != own) & (dr.minimum(dr.minimum(u, v), 1 - u - v) > EDGE)
+    chosen = (start > 0) & (met != own)
     # in one plane, not across each other: surfaces that cross are in one place in a thin strip alone
     here, there = [a, b, c], corners(dr.select(chosen, met, 0))
     normals = [dr.cross(q - p, r - p) for p, q, r in (here, there)]
+    (u, v), (p, q, r) = hit.prim_uv, there
+    longest = dr.sqrt(dr.maximum(dr.maximum(*map(dr.squared_norm, (q - p, r - p))), dr.squared_norm(r - q)))
+    margin = dr.minimum(EDGE, 2 * GAP * (1 + dr.max(dr.abs(point))) * longest / dr.norm(normals[1]))
+    chosen &= dr.minimum(dr.minimum(u, v), 1 - u - v) > margin
     is_larger = dr.squared_norm(normals[0]) > dr.squared_norm(normals[1])
     plane, corner = dr.normalize(dr.select(is_larger, *normals)), dr.select(is_larger, here[0], there[0])
     for k in range(3):
