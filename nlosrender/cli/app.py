@@ -59,6 +59,7 @@ _COMMANDS: tuple[Callable[..., Any], ...] = (
 for _command in _COMMANDS:
     _add(_command)
 _add(dataset_commands.info, datasets)
+_add(dataset_commands.pack, datasets)
 app.add_typer(datasets, name="dataset")
 
 

@@ -72,6 +72,34 @@ def info(folder: Folder, as_json: AsJson = False) -> None:
     print_table(rows)
 
 
+def pack(
+    folder: Folder,
+    file_format: Annotated[
+        str | None,
+        typer.Option("--format", metavar="webdataset|lfe|nlos3d", help="Which.", show_default="the configuration's"),
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Write the finished captures of a data set once more as training programs read them, in a folder beside them.
+
+    Example: `nlosrender dataset pack letters --format webdataset` creates letters/webdataset with tar shards.
+    """
+    from nlosrender.files.packages.package import pack as pack_folder
+
+    found = pack_folder(folder, file_format)
+    if as_json:
+        OUTPUT.print(found)
+    else:
+        print_packed(found)
+
+
+def print_packed(found: dict[str, Any]) -> None:
+    """Print what a package holds, and notes on stderr."""
+    typer.echo(f"wrote {found['path']}: {found['captures']} captures")
+    for note in found["notes"]:
+        typer.echo(f"note: {note}", err=True)
+
+
 def _counts(counts: dict[str, int]) -> str:
     return ", ".join(f"{name} {count}" for name, count in counts.items())
 

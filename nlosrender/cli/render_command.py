@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from nlosrender.capture.bounces import LINE_OF_SIGHT
+from nlosrender.cli.dataset_commands import print_packed
 from nlosrender.cli.json_output import OUTPUT
 from nlosrender.cli.options import AsJson, ConfigFile, Overrides, Quiet, refuse_folder, two_numbers
 from nlosrender.cli.progress import reporting
@@ -130,6 +131,7 @@ def _render_all(
 ) -> None:
     """Render the captures of a sweep, each by ``render_capture``, and print the report."""
     from nlosrender.errors import EXIT_FAILURE, EXIT_OK, RenderError
+    from nlosrender.files.packages.package import pack
     from nlosrender.rendering.sweep_render import render_sweep
 
     with reporting("sweep", quiet) as listeners:
@@ -139,14 +141,18 @@ def _render_all(
                 return render_capture(config, progress, warn, resume=resume, watch=listeners.watch)
 
         report = render_sweep(sweep, render, shard=shard, resume=resume, **listeners._asdict())
+    # a shard does not know whether the others are done
+    is_packed = sweep.dataset.format != "znlos" and shard is None and len(report.failed) < report.captures
+    package = pack(sweep.output_folder) if is_packed else None
     if as_json:
-        OUTPUT.print(
-            dataclasses.asdict(report) | {"index": str(report.index)}, EXIT_FAILURE if report.failed else EXIT_OK
-        )
+        told = dataclasses.asdict(report) | {"index": str(report.index), "package": package}
+        OUTPUT.print(told, EXIT_FAILURE if report.failed else EXIT_OK)
     elif not quiet:
         typer.echo(f"wrote {report.index}: {report.captures} captures")
         rendered = f"{report.rendered}, finished by earlier runs {report.earlier}"
         print_table([("rendered", rendered), ("took", readable_duration(report.seconds))], indent=2)
+        if package is not None:
+            print_packed(package)
     if report.failed:
         listed = "\n".join(f"{entry.file}: {entry.message}" for entry in report.failed)
         raise RenderError(f"{listed}\n{len(report.failed)} of {report.captures} captures failed.")

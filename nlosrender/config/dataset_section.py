@@ -63,15 +63,15 @@ class DatasetConfig(Section):
     shard_size: MemoryLimit = "1GB"
     """of a tar shard, before it is begun anew"""
     dtype: Annotated[Literal["float32", "float16"], ONE_OF] = "float32"
-    """of the samples in webdataset and nlos3d packages; the rounding of float16 is added to the stated error"""
+    """of the samples in webdataset packages; the rounding of float16 is added to the stated error"""
     crop: Flag = False
-    """leave out the first and last bins that are dark in all captures of a package"""
+    """webdataset: leave out the first and last bins, those that are dark in all captures"""
 
     def rule_package(self) -> Iterator[ValidationIssue]:
-        """Z-NLOS files are float32, as their readers need, and so are LFE pictures."""
-        if self.dtype == "float16" and self.format in ("znlos", "lfe"):
+        """Z-NLOS files, LFE pictures and .mat files have a type of their own, and time counted from a fixed start."""
+        if self.dtype == "float16" and self.format != "webdataset":
             yield ValidationIssue(("dtype",), f"got float16, need float32 in format {self.format}.")
-        if self.crop and self.format in ("znlos", "lfe"):
+        if self.crop and self.format != "webdataset":
             yield ValidationIssue(("crop",), f"got true, need false in format {self.format}, which has a fixed start.")
 
     @property

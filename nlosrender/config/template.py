@@ -186,6 +186,10 @@ output:
 #   split: {{by: capture, train: 0.8, val: 0.1, test: 0.1, seed: 0}}  # by: capture | file | folder; default null
 #   label: null                  # a swept key; default null: the folder of the drawn file, or the letters
 #   index: csv                   # csv | parquet, the table beside index.json; default csv
+#   format: znlos                # znlos | webdataset | lfe | nlos3d: also a package for training; default znlos
+#   shard_size: 1GB              # of webdataset's tar files; default 1GB
+#   dtype: float32               # float32 | float16 (webdataset); default float32
+#   crop: false                  # webdataset: leave out bins that are dark in all captures; default false
 """
 
 

@@ -160,7 +160,7 @@ def test_warnings_go_to_stderr(starter: Path) -> None:
 def test_schema_describes_every_section() -> None:
     """The JSON Schema is one JSON document with the keys, units and required keys of the config."""
     schema = json.loads(runner.invoke(app, ["schema"]).stdout)
-    sections = {"name", "scene", "capture", "time_axis", "render", "output", "sweep", "dataset"}
+    sections = {"name", "scene", "capture", "time_axis", "render", "output", "sensor", "sweep", "dataset"}
     assert set(schema["properties"]) == sections
     assert schema["required"] == ["scene", "capture"]
     assert schema["additionalProperties"] is False
