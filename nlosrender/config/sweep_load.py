@@ -262,6 +262,8 @@ class _Drawing:
         drawer = self._drawer(suffix)
         drawer.lead = self.lead
         raw: dict[str, Any] = self._filled(drawer).tree["scene"]["hidden_geometry"][item]
+        if number and isinstance(raw, dict) and isinstance(raw.get("name"), str):
+            raw["name"] += f"-{number + 1}"  # items have names of their own
         self._drawn[item, number] = [one for one in drawer.drawn if _own_key(one.key, item) is not None]
         return raw
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from nlosrender.config import sweep_load
+from nlosrender.config import families, sweep_load
 from nlosrender.config.draws import Draw
 from nlosrender.config.families import FLOOR_GAP
 from nlosrender.config.hidden_geometry import MESH_SUFFIXES
@@ -122,7 +122,7 @@ def test_a_choice_between_items_with_draws() -> None:
 def family(count: str, more: str = "") -> str:
     """Return random keys of a family of boxes."""
     size = "{inside: [[0.1, 0.4], [0.1, 0.4], [0.1, 0.4]]}"
-    return f"""{{scene.hidden_geometry.0: {{type: box, size: {size}, count: {count},
+    return f"""{{scene.hidden_geometry.0: {{name: brick, type: box, size: {size}, count: {count},
       rotate_deg: {{rotation: uniform}}, center: {{inside: [[-0.8, 0.8], [-0.3, 0.7], [0.5, 1.7]]}}{more}}}}}"""
 
 
@@ -135,6 +135,8 @@ def test_copies_have_draws_of_their_own() -> None:
         config, facts = sweep.capture(index)
         types = [item.type for item in config.scene.hidden_geometry]
         assert types == ["box"] * (count > 0) + ["rectangle"] + ["box"] * max(count - 1, 0)
+        names = [item.name for item in config.scene.hidden_geometry if item.type == "box"]
+        assert names == ["brick", "brick-2", "brick-3"][:count]
         sizes = [item.size for item in config.scene.hidden_geometry if item.type == "box"]
         assert len(set(sizes)) == count
         for number in range(1, count):
@@ -182,14 +184,14 @@ def test_a_capture_is_known_by_its_index() -> None:
     assert [long.config(i) for i in (3, 1)] == [short.config(i) for i in (3, 1)]
 
 
-def test_no_place_without_overlap() -> None:
+def test_no_place_without_overlap(monkeypatch: pytest.MonkeyPatch) -> None:
     """Where no place is free the capture fails with its place in the file, and the sweep itself is valid."""
+    monkeypatch.setattr(families, "ROUNDS", 2)
+    monkeypatch.setattr(families, "MAX_TRIES", 5)
     keys = family("9", ", no_overlap: true").replace(
         "[-0.8, 0.8], [-0.3, 0.7], [0.5, 1.7]", "[0, 0.1], [0, 0.1], [1, 1.1]"
     )
-    with pytest.raises(
-        ConfigError, match=r"hidden_geometry.0: found no place without overlap for copy \d+ in 200 tries"
-    ):
+    with pytest.raises(ConfigError, match=r"hidden_geometry.0: found no place without overlap for copy \d in 2 arr"):
         sweep_of(keys, count=1).config(0)
 
 

@@ -14,7 +14,8 @@ from nlosrender.bench.generated_meshes import grid_faces, write_ply
 from nlosrender.bench.paper.room_meshes import block, ellipsoid, write_furniture, write_statue
 from nlosrender.bench.paper.rooms import ROOMS, Room, write_meshes
 from nlosrender.bench.paper.study import Study
-from nlosrender.config.load import config_hash, load_config
+from nlosrender.config.load import config_hash, load_config, load_document
+from nlosrender.config.sweep_load import sweep_of
 from nlosrender.errors import ConfigError, FileError
 from nlosrender.scene.meshes.mesh_file import read_mesh
 from nlosrender.scene.meshes.triangle_mesh import TriangleMesh
@@ -96,6 +97,10 @@ def test_a_room_that_has_no_mesh_yet_says_what_makes_it(tmp_path: Path) -> None:
 @pytest.mark.parametrize("path", sorted((PROJECT / "configs").rglob("*.yaml")), ids=lambda path: path.stem)
 def test_every_configuration_is_valid_or_names_the_command_that_makes_its_mesh(path: Path) -> None:
     """On a fresh clone nothing else is missing."""
+    document = load_document(path)
+    if document.tree.get("sweep") is not None:
+        assert sweep_of(document) is not None
+        return
     with contextlib.suppress(ConfigError):
         load_config(path)
         return
