@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
@@ -19,6 +20,7 @@ from nlosrender.analysis.laser_view import (
     row_over_time,
     wall_frames,
 )
+from nlosrender.analysis.measured_plot import MeasuredPair, draw_counts, draw_response, measured_pair
 from nlosrender.analysis.theme import (
     COLORMAP,
     FAINT,
@@ -39,7 +41,6 @@ from nlosrender.constants import opl_to_seconds
 from nlosrender.errors import OptionError
 from nlosrender.files.atomic_write import check_writable, replacing
 from nlosrender.files.file_kinds import PICTURES
-from nlosrender.files.layout import data_unit
 from nlosrender.files.reading.reader import StoredCapture, open_capture
 from nlosrender.files.reading.stored_header import StoredHeader
 
@@ -53,7 +54,11 @@ MAX_ROW_LINES = 1200  # of the row over time, whose panel is about 500 pixels hi
 
 
 def plot_capture(
-    path: str | Path, picture: str | Path, laser: tuple[int, int] | None = None, pixel: tuple[int, int] | None = None
+    path: str | Path,
+    picture: str | Path,
+    laser: tuple[int, int] | None = None,
+    pixel: tuple[int, int] | None = None,
+    ideal: Path | None = None,
 ) -> Path:
     """Draw one laser point's part of a capture; only that part is read, a few rows at a time.
 
@@ -64,6 +69,8 @@ def plot_capture(
     laser, pixel
         (row, column) of the laser point, by default in the middle of its grid, and of the sensor point whose histogram
         is shown, by default the brightest.
+    ideal
+        The capture that a file of counts was measured from: its histogram is drawn beside the counts.
 
     Raises
     ------
@@ -77,11 +84,11 @@ def plot_capture(
         raise OptionError(f"--output: got {str(picture)!r}, need a name that ends in one of {', '.join(FORMATS)}")
     kind = PICTURES[picture.suffix.lower()]
     check_writable(picture, kind, [path])  # before the work, not after it
-    with open_capture(path) as capture:
+    with open_capture(path) as capture, ExitStack() as stack:
         sizes = capture.header.sizes
         _check_point("--laser", laser, sizes["laser_y"], sizes["laser_x"])
         _check_point("--pixel", pixel, sizes["sensor_y"], sizes["sensor_x"])
-        figure = _draw(capture, laser, pixel)
+        figure = _draw(capture, laser, pixel, measured_pair(capture, ideal, stack))
     with replacing(picture, kind, [path]) as partial:
         figure.savefig(partial, format=picture.suffix[1:].lower(), dpi=130, facecolor=GROUND)
     return picture
@@ -94,7 +101,12 @@ def _check_point(option: str, point: tuple[int, int] | None, rows: int, columns:
         )
 
 
-def _draw(capture: StoredCapture, laser: tuple[int, int] | None, pixel: tuple[int, int] | None) -> Figure:
+def _draw(
+    capture: StoredCapture,
+    laser: tuple[int, int] | None,
+    pixel: tuple[int, int] | None,
+    measured: MeasuredPair | None = None,
+) -> Figure:
     from matplotlib.figure import Figure
     from matplotlib.layout_engine import ConstrainedLayoutEngine
 
@@ -113,8 +125,12 @@ def _draw(capture: StoredCapture, laser: tuple[int, int] | None, pixel: tuple[in
     heading.text(0.012, 0.12, _subtitle(header, view), color=FAINT, size=10.5, va="center", parse_math=False)
     _draw_frames(upper, capture, view, pixel)
     left, center, right = lower.subplots(1, 3, width_ratios=[1.55, 0.75, 1.2])
-    _draw_histogram(left, capture, view, pixel)
-    _draw_bounces(center, header, view)
+    if measured is not None:
+        draw_counts(left, measured, view.laser, pixel, "pixel" if _is_view(header) else "sensor point")
+        draw_response(center, measured)
+    else:
+        _draw_histogram(left, capture, view, pixel)
+        _draw_bounces(center, header, view)
     _draw_row(right, capture, view)
     return figure
 
@@ -128,6 +144,8 @@ def _subtitle(header: StoredHeader, view: LaserView) -> str:
     width = header.bin_width_opl
     parts.append(f"{header.n_bins} bins of {1000 * width:.4g} mm ({opl_to_seconds(width) * 1e12:.3g} ps)")
     engine, error = header.attributes.get("render_engine"), header.attributes.get("error_estimate")
+    if header.is_measured:
+        parts.append("counts")
     if isinstance(engine, str):
         parts.append(f"engine {engine[:40]}")
     if isinstance(error, float) and math.isnan(error):
@@ -229,11 +247,13 @@ def _is_view(header: StoredHeader) -> bool:
 
 
 def _per_bin(header: StoredHeader, power: str) -> str:
+    if header.is_measured:
+        return f"counts per bin{f' [{power.strip()}]' if power else ''}"
     return f"{'radiance' if _is_view(header) else 'H'} per bin [{power}{_unit(header)}]"
 
 
 def _unit(header: StoredHeader) -> str:
-    return re.sub(r"\^(-\d)", r"$^{\1}$", data_unit(header.scan_type))
+    return re.sub(r"\^(-\d)", r"$^{\1}$", header.unit)
 
 
 def _bounce_label(header: StoredHeader, slot: int) -> str:

@@ -66,6 +66,13 @@ def table(report: dict[str, Any]) -> str:
             f"  {skip['what']} ({skip['scene']}): {skip['seconds']:.2f} instead of {skip['seconds_without']:.2f} s, "
             f"{skip['saved']:.0%} saved; {skip['difference']:.1e} apart"
         )
+    if report["measure"]:
+        lines += ["", "counting photons of 65536 histograms of 512 bins: response and pile-up"]
+    for rate in report["measure"]:
+        lines.append(
+            f"  {rate['pile_up']}: {rate['seconds']:.2f} s on {rate['threads']} threads ({rate['cpu_seconds']:.2f} CPU "
+            f"s), {rate['points_per_second']:.0f} histograms/s"
+        )
     if report["process"]:
         lines += ["", _process_line(report["process"])]
     return "\n".join(lines)

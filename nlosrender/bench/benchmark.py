@@ -10,6 +10,7 @@ from dataclasses import asdict
 from datetime import UTC, datetime
 from typing import Any
 
+from nlosrender.bench.counting import counting_rates
 from nlosrender.bench.curve import Curve
 from nlosrender.bench.peer import UNBIASED_NAME, Peer, PeerContender, matched, peer_contenders
 from nlosrender.bench.race import FIXED_POINT, Contender, own_contenders, race
@@ -21,8 +22,15 @@ from nlosrender.bench.scenes import BenchScene
 from nlosrender.bench.skips import measure_skips
 from nlosrender.files.provenance import package_versions
 
-PARTS = ("curves", "scaling", "rates", "skips", "process")
-SHARES = {"curves": 0.72, "scaling": 0.16, "rates": 0.05, "skips": 0.03, "process": 0.04}  # of the time
+PARTS = ("curves", "scaling", "rates", "skips", "process", "measure")
+SHARES = {
+    "curves": 0.72,
+    "scaling": 0.16,
+    "rates": 0.05,
+    "skips": 0.03,
+    "process": 0.03,
+    "measure": 0.01,
+}  # of the time
 REFERENCE_SHARE = 0.4  # of a scene's time
 
 Report = dict[str, Any]  # plain values, ready for JSON; None: not known, or never reached
@@ -71,6 +79,7 @@ def run_benchmark(
         "versions": package_versions(),
     }
     report: Report = {"facts": facts, "scenes": [], "scaling": [], "rates": [], "skips": [], "process": None}
+    report["measure"] = []
     with ExitStack() as stack:
         peer = stack.enter_context(Peer(peer_command)) if peer_command is not None else None
         facts["peer"] = peer.title if peer is not None else None
@@ -92,6 +101,9 @@ def run_benchmark(
         if "process" in wanted and third:
             progress(f"nlosrender render of {third[0].name}, whole process")
             report["process"] = whole_process(third[0])
+        if "measure" in wanted:
+            progress("counting photons")
+            report["measure"] = counting_rates()
     report["facts"] |= {"seconds": timer.read()[0], "load_average_at_end": os.getloadavg()}
     return report
 

@@ -18,7 +18,9 @@ def bench(
     part: Annotated[
         list[str] | None,
         typer.Option(
-            metavar="PART", help="curves, scaling, rates, skips or process; may be repeated.", show_default="all"
+            metavar="PART",
+            help="curves, scaling, rates, skips, process or measure; may be repeated.",
+            show_default="all",
         ),
     ] = None,
     seconds: Annotated[float, typer.Option(min=1.0, help="Time for all of it, compilation on top.")] = 300.0,

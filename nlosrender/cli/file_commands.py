@@ -78,8 +78,14 @@ def plot(
             metavar="IY,IX", help="Sensor point (row, column) of the histogram.", show_default="the brightest"
         ),
     ] = None,
+    ideal: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Of counts: the capture they were measured from.", readable=False),
+    ] = None,
 ) -> None:
     """Draw a capture: the relay wall over time, one histogram, the light of each bounce, one row over time.
+
+    Of a measured capture: the counts of a point beside its ideal histogram, and the detector's response.
 
     Example: `nlosrender plot z.hdf5 --pixel 6,8` creates z.png and prints its path.
     """
@@ -88,7 +94,7 @@ def plot(
     need = "a row and a column counted from 0, such as 6,8"
     laser_at, pixel_at = two_numbers(laser, ",", "--laser", need), two_numbers(pixel, ",", "--pixel", need)
     picture = output or beside(file, ".png")
-    typer.echo(str(plot_capture(file, picture, laser=laser_at, pixel=pixel_at)))
+    typer.echo(str(plot_capture(file, picture, laser=laser_at, pixel=pixel_at, ideal=ideal)))
 
 
 def frames(

@@ -47,6 +47,8 @@ class DatasetSpec:
 
 
 DATA = "data"
+COUNTS = "counts"  # what a detector counts of data, beside it
+SUMMED_INDEX = 1  # of the bounce axis, for the sum of all: where every loader looks
 VARIANCE = "variance"
 
 DATASETS: tuple[DatasetSpec, ...] = (
@@ -92,7 +94,6 @@ STOKES = "stokes"
 CHANNELS = {3: "rgb", 4: STOKES}  # grey: files without the attribute
 DATA_UNIT = "J m^-2 sr^-1"  # radiance leaving a sensor point, integrated over the bin, for one pulse
 VIEW_UNIT = "W m^-2 sr^-1"  # line_of_sight: of a pixel's steady radiance the share that arrives in the bin
-
 COUNTS_UNIT = "counts"  # of measured captures: detections of all pulses
 
 

@@ -43,9 +43,7 @@ from nlosrender.sensor.detector import Detector, Totals, detector_of, detector_w
 from nlosrender.sensor.rebinning import TimeBins
 from nlosrender.sensor.zones import zone_of_points, zone_sums
 
-COUNTS = "counts"  # the dataset beside the ideal samples
 SENSOR, MEASUREMENT, CORRECTIONS = "sensor", "measurement", "corrections"  # attributes
-SUMMED_INDEX = 1  # of the bounce axis: where every loader looks
 BLOCK_SAMPLES = 2**21  # of light or counts at a time and thread: some ten arrays of 16 MB
 # of the ideal capture's attributes, what stays true of its counts
 KEPT = ("config", "config_hash", "versions", "render_engine", "meshes", UNSAMPLED, ZERO)
@@ -120,6 +118,8 @@ def measure_capture(
                     "ideal_error_estimate": header.attributes.get("error_estimate", np.nan),
                 }
                 set_attributes(writer.file, kept)
+                if measurement.zones is None:  # which have a grid of their own
+                    capture.copy_ground_truth(writer.file)
             data = writer.file[layout.DATA]
             totals = measurement.count(
                 lambda chunk: writer.put_chunk(data, chunk.at, chunk.content), compression, progress, warn, threads
@@ -151,18 +151,18 @@ def add_counts(writer: HDF5Writer, path: Path, *, warn: Warn = lambda text: None
     header = measurement.header
     gzip = capture.header.compression != "none"
     with writer.writing():
-        if COUNTS in writer.file:
-            del writer.file[COUNTS]
+        if layout.COUNTS in writer.file:
+            del writer.file[layout.COUNTS]
         shape = layout.data_shape(header.sizes, header.confocal)
         filters = {"compression": "gzip", "shuffle": True} if gzip else {}
         dataset = writer.file.create_dataset(
-            COUNTS, shape, layout.FLOAT, chunks=header.chunks, fillvalue=0.0, **filters
+            layout.COUNTS, shape, layout.FLOAT, chunks=header.chunks, fillvalue=0.0, **filters
         )
         set_attributes(
             dataset,
             {
                 "unit": layout.COUNTS_UNIT,
-                "meaning": f"counts per bin, of all bounces, in index {SUMMED_INDEX} of the bounce axis",
+                "meaning": f"counts per bin, of all bounces, in index {layout.SUMMED_INDEX} of the bounce axis",
                 "axes": " ".join(layout.file_axes(header.confocal)),
                 "t0": header.start_opl,
                 "deltaT": header.bin_width_opl,
@@ -184,15 +184,14 @@ def sensor_of(header: StoredHeader) -> SensorConfig | None:
     return stored_sensor(values) if isinstance(values, Mapping) and values else None
 
 
-def few_counts(header: StoredHeader) -> str | None:
-    """Return a warning where the histograms of a measured file hold few counts; None where they do not."""
+def few_counts(header: StoredHeader) -> Iterator[str]:
+    """Yield a warning where the histograms of a measured file hold few counts."""
     stated = json_object(header.attributes.get(MEASUREMENT)).get("counts_per_histogram")
-    if not header.is_measured or not isinstance(stated, (int, float)) or stated >= TOO_FEW:
-        return None
-    return (
-        f"{header.path}: holds {stated:.3g} counts per histogram: shot noise is more than {TOO_FEW**-0.5:.0%} of their "
-        "sum. Measure longer (sensor.exposure_time)."
-    )
+    if header.is_measured and isinstance(stated, (int, float)) and stated < TOO_FEW:
+        yield (
+            f"{header.path}: holds {stated:.3g} counts per histogram: shot noise is more than {TOO_FEW**-0.5:.0%} of "
+            "their sum. Measure longer (sensor.exposure_time)."
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -430,7 +429,7 @@ def _counts_header(capture: StoredCapture, detector: Detector, zones: object) ->
             frame=frame if frame in layout.FRAMES else "znlos",
             planar_wall=bool(header.attributes.get("planar_wall", np.ptp(sensors[..., 2]) < 1e-6)),
             n_channels=1,
-            bounce_indices=(SUMMED_INDEX,),
+            bounce_indices=(layout.SUMMED_INDEX,),
             split_bounces=False,
         ), sums
     except ValueError as error:

@@ -206,3 +206,48 @@ def test_a_sensor_that_does_not_fit_is_told_before_the_render(tmp_path: Path) ->
         tmp_path, "validate", configuration(tmp_path, zones={"nx": 2, "ny": 2}), "--set", "capture.scan_type=confocal"
     )
     assert "got zones with scan type confocal" in zones.stderr
+
+
+def test_a_camera_counts_relative_photons(tmp_path: Path) -> None:
+    """A line_of_sight capture is scaled to photons per pulse; a physical scale has no meaning there."""
+    lamp = {"type": "rectangle", "width": 1, "height": 1, "center": [0, 0, 0], "normal": [0, 0, 1], "radiance": 1}
+    camera = {"position": [0, 0, 2], "look_at": [0, 0, 0], "width": 5, "height": 4}
+    config = {
+        "scene": {"emitters": [lamp]},
+        "capture": {"scan_type": "line_of_sight", "camera": camera},
+        "time_axis": {"bin_width_opl": 0.05, "n_bins": 80},
+        "render": {"spp": 16},
+        "output": {"path": str(tmp_path / "view.hdf5")},
+        "sensor": {"photons_per_pulse": {"mean": 0.1}, "pulses": 1000},
+    }
+    (tmp_path / "view.yaml").write_text(yaml.safe_dump(config))
+    render_capture(load_config(tmp_path / "view.yaml"))
+    assert counts(tmp_path / "view.hdf5").sum() == pytest.approx(20 * 100, abs=5 * 45)  # 5 sigma of 2000
+    done = run(tmp_path, "measure", "view.hdf5", "-o", "counts.hdf5")
+    assert done.returncode == 0, done.stderr
+    assert run(tmp_path, "info", "counts.hdf5", "--check").returncode == 0
+    physical = ("--set", "sensor.photons_per_pulse=null", "--set", "sensor.wavelength_nm=532")
+    done = run(tmp_path, "measure", "view.hdf5", "-o", "b.hdf5", *physical, "--set", "sensor.aperture_solid_angle=1e-5")
+    assert "of steady lamps, which have no energy per pulse" in done.stderr
+
+
+def test_pictures_of_counts(capture: Path) -> None:
+    """Counts alone, beside the ideal capture, and what is not its ideal capture; comparisons tell counts from light."""
+    folder = capture.parent
+    run(folder, "measure", capture, "-o", "counts.hdf5", "--sensor", "spad-532", *EXPOSURE)
+    for options in ((), ("--ideal", capture)):
+        done = run(folder, "plot", "counts.hdf5", *options)
+        assert done.returncode == 0, done.stderr
+    assert (folder / "counts.png").read_bytes().startswith(b"\x89PNG")
+    assert "holds no counts that" in run(folder, "plot", capture, "--ideal", "counts.hdf5").stderr
+    assert "is not the ideal capture of" in run(folder, "plot", "counts.hdf5", "--ideal", "counts.hdf5").stderr
+    assert "samples" in run(folder, "compare", "counts.hdf5", capture).stdout
+
+
+def test_few_counts_are_told_before_a_reconstruction(capture: Path) -> None:
+    """A warning with the number; the volume is written."""
+    few = ("--set", "sensor.pulses=100", "--set", "sensor.photons_per_pulse.mean=0.05")
+    run(capture.parent, "measure", capture, "-o", "counts.hdf5", "--sensor", "poisson", *few)
+    done = run(capture.parent, "reconstruct", "counts.hdf5", "--voxels", "8")
+    assert done.returncode == 0, done.stderr
+    assert "counts per histogram: shot noise is more than 10%" in done.stderr

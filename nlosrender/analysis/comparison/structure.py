@@ -48,9 +48,10 @@ def structure_differences(
 def _header_differences(a: StoredHeader, b: StoredHeader, alignment: Alignment) -> Iterator[StructureDifference]:
     moved_in_time = bool(alignment.lead or alignment.reference_lead)
     same_axis = a.sizes["bounce"] == b.sizes["bounce"]
-    pairs: dict[str, tuple[object, object]] = {
+    pairs: dict[str, tuple[object, ...]] = {
         "scan type": (a.scan_type, b.scan_type),
         "channels": (a.sizes["channel"], b.sizes["channel"]),
+        "samples": tuple("counts" if header.is_measured else "light" for header in (a, b)),
         "bins": (b.n_bins if moved_in_time else a.n_bins, b.n_bins),
         "sensor points": (_size(alignment.sensors.turned_shape), _size(b.sensor_grid)),
         "laser points": (_size(alignment.lasers.turned_shape), _size(b.laser_grid)),

@@ -15,6 +15,7 @@ from nlosrender.analysis.reconstruction.voxel_grid import VoxelGrid, expected_bo
 from nlosrender.config.fields import MAX_LENGTH
 from nlosrender.errors import FileError, OptionError
 from nlosrender.files.layout import Float64
+from nlosrender.files.measured import few_counts
 from nlosrender.files.reading.reader import open_capture
 from nlosrender.files.reading.scan import Float32, chosen_bounces, read_scan
 from nlosrender.rendering.render_report import Progress, Warn, Warnings
@@ -120,6 +121,7 @@ def reconstruct_capture(
     warnings = Warnings(warn)
     with open_capture(path) as capture:
         scan = read_scan(capture)
+        warnings.emit(few_counts(capture.header))
         phasor = settings.method == "phasor"
         if phasor:
             refuse_curved(scan)

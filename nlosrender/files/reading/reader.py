@@ -7,7 +7,7 @@ import os
 import stat
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import h5py
@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from nlosrender.errors import FileError
 from nlosrender.files import layout
+from nlosrender.files.attributes import get_attributes
 from nlosrender.files.reading.locking import open_for_reading
 from nlosrender.files.reading.stored_axes import in_memory_order
 from nlosrender.files.reading.stored_header import StoredHeader, header_of, samples_of
@@ -44,8 +45,48 @@ class StoredCapture:
 
     def __init__(self, file: h5py.File, path: Path):
         self._file = file
+        self._samples = layout.DATA
         self.path = path
         self.header: StoredHeader = header_of(file, path)
+
+    def counts(self) -> StoredCapture | None:
+        """Return the counts beside the ideal samples as a capture of their own; None: there are none.
+
+        Raises
+        ------
+        FileError
+            They are damaged.
+        """
+        with explained_read(self.path):
+            if dataset_in(self._file, self.path, layout.COUNTS) is None:
+                return None
+            samples = samples_of(self._file, self.path, layout.COUNTS)
+            stated = get_attributes(samples)
+            beside = StoredCapture(self._file, self.path)
+            beside._samples = layout.COUNTS
+            beside.header = replace(
+                self.header,
+                sizes=dict(zip(self.header.axes, samples.shape, strict=True)) | self._single_laser,
+                data_shape=tuple(samples.shape),
+                start_opl=float(str(stated["t0"])),
+                bin_width_opl=float(str(stated["deltaT"])),
+                bounce_indices=(layout.SUMMED_INDEX,),
+                split_bounces=False,
+                data_attributes=stated,
+            )
+            return beside
+
+    @property
+    def _single_laser(self) -> dict[str, int]:
+        """Lengths of axes that the file does not have."""
+        return {axis: length for axis, length in self.header.sizes.items() if axis not in self.header.axes}
+
+    def copy_ground_truth(self, target: h5py.File) -> None:
+        """Copy what the file has of the hidden scene's truth into another file."""
+        with explained_read(self.path):
+            for spec in layout.GROUND_TRUTH:
+                if dataset_in(self._file, self.path, spec.name) is not None:
+                    self._file.copy(spec.name, target)
 
     @property
     def positions(self) -> StoredPositions:
@@ -110,7 +151,7 @@ class StoredCapture:
         if any(not 0 <= bounce < sizes["bounce"] for bounce in chosen):
             raise FileError(f"{self.path}: no bounce index {chosen}, the file has 0 to {sizes['bounce'] - 1}")
         with explained_read(self.path):
-            samples = samples_of(self._file, self.path, dataset)
+            samples = samples_of(self._file, self.path, self._samples if dataset == layout.DATA else dataset)
             if samples.shape != self.header.data_shape:
                 raise FileError(f"{self.path}: {dataset} has shape {samples.shape}, data {self.header.data_shape}")
             return self._gather(samples, where, chosen)

@@ -95,6 +95,11 @@ class StoredHeader:
         """Whether the samples are a detector's counts."""
         return self.data_attributes.get("unit") == layout.COUNTS_UNIT
 
+    @property
+    def unit(self) -> str:
+        """Unit of the samples."""
+        return layout.COUNTS_UNIT if self.is_measured else layout.data_unit(self.scan_type)
+
     def bounce_name(self, index: int) -> str:
         """Return what an index of the bounce axis holds: a bounce number, "7 and above" or "all"."""
         limit = self.attributes.get("max_bounces")
