@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nlosrender.config.dataset_section import DatasetConfig
-from nlosrender.files.measured import COUNTS
+from nlosrender.files.layout import COUNTS
 from nlosrender.files.packages.package import Packing, splits_of
 from nlosrender.files.packages.samples import rounding
 from nlosrender.files.reading.reader import explained_read, open_hdf5
