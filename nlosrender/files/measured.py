@@ -1,7 +1,7 @@
-"""Measured captures: a detector in front of a capture file, a few rows of sensor points at a time.
+"""Measured captures: a detector in front of a capture file, some sensor points at a time.
 
 Counts go into a file of their own (``measure_capture``) or, in a render, into a dataset beside the ideal samples
-(``add_counts``). Random numbers are those of the seed, the laser point and the first row of a block of rows; blocks
+(``add_counts``). Random numbers are those of the seed, the laser point and the first point of a block; blocks
 follow from the grid and the detector's bins alone. So counts do not depend on who measures what when.
 """
 
@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
 import os
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -48,9 +49,9 @@ BLOCK_SAMPLES = 2**21  # of light or counts at a time and thread: some ten array
 # of the ideal capture's attributes, what stays true of its counts
 KEPT = ("config", "config_hash", "versions", "render_engine", "meshes", UNSAMPLED, ZERO)
 CORRECTABLE = ("pile_up", "background")
-TOO_FEW = 100  # counts per histogram: below, shot noise alone is more than 10 % of their sum
+LARGE_NOISE = 10  # signal over noise of the sum of a histogram
 
-Block = tuple[int, int, slice]  # laser row, laser column, rows of sensor points or of zones
+Block = tuple[tuple[int, int], slice, slice]  # laser point, rows and columns of sensor points or of zones
 Result = TypeVar("Result")
 Progress = Callable[[float], None]
 Warn = Callable[[str], None]
@@ -185,13 +186,16 @@ def sensor_of(header: StoredHeader) -> SensorConfig | None:
 
 
 def few_counts(header: StoredHeader) -> Iterator[str]:
-    """Yield a warning where the histograms of a measured file hold few counts."""
-    stated = json_object(header.attributes.get(MEASUREMENT)).get("counts_per_histogram")
-    if header.is_measured and isinstance(stated, (int, float)) and stated < TOO_FEW:
-        yield (
-            f"{header.path}: holds {stated:.3g} counts per histogram: shot noise is more than {TOO_FEW**-0.5:.0%} of "
-            "their sum. Measure longer (sensor.exposure_time)."
-        )
+    """Yield a warning where the shot noise of a measured file's histograms is large beside their signal."""
+    stated = json_object(header.attributes.get(MEASUREMENT))
+    counts, ratio = stated.get("counts_per_histogram"), stated.get("signal_to_background")
+    if header.is_measured and isinstance(counts, (int, float)) and counts >= 0:
+        signal = counts * ratio / (1 + ratio) if isinstance(ratio, (int, float)) else counts
+        if signal < LARGE_NOISE * math.sqrt(counts) or not counts:
+            yield (
+                f"{header.path}: holds {signal:.3g} counts of light per histogram among {counts:.3g}: shot noise is "
+                f"more than {1 / LARGE_NOISE:.0%} of their sum. Measure longer (sensor.exposure_time)."
+            )
 
 
 @dataclass(frozen=True, eq=False)
@@ -207,36 +211,45 @@ class _Measurement:
 
     @cached_property
     def blocks(self) -> list[Block]:
-        """(laser row, laser column, rows of sensor points or of zones): whole chunks of the counts."""
-        sizes = self.header.sizes
-        lasers = np.ndindex(sizes["laser_y"], sizes["laser_x"])
-        tile = dict(zip(layout.file_axes(self.header.confocal), self.header.chunks, strict=True))["sensor_y"]
-        bins = max(sizes["bin"], self.capture.header.n_bins)
-        step = (
-            sizes["sensor_y"]
-            if self.zones is not None
-            else max(BLOCK_SAMPLES // (bins * sizes["sensor_x"] * tile), 1) * tile
+        """Laser point, rows and columns of sensor points or of zones: whole chunks of the counts, or all zones."""
+        sizes, chunk = (
+            self.header.sizes,
+            dict(zip(layout.file_axes(self.header.confocal), self.header.chunks, strict=True)),
         )
-        rows = [slice(y, min(y + step, sizes["sensor_y"])) for y in range(0, sizes["sensor_y"], step)]
-        return [(y, x, part) for y, x in lasers for part in rows]
+        rows, columns = sizes["sensor_y"], sizes["sensor_x"]
+        if self.zones is None:
+            points = max(BLOCK_SAMPLES // max(sizes["bin"], self.capture.header.n_bins), 1)
+            tile_rows, tile_columns = chunk["sensor_y"], chunk["sensor_x"]
+            columns = min(max(points // tile_rows // tile_columns, 1) * tile_columns, columns)
+            rows = max(points // columns // tile_rows, 1) * tile_rows
+        return [
+            (
+                (y, x),
+                slice(row, min(row + rows, sizes["sensor_y"])),
+                slice(column, min(column + columns, sizes["sensor_x"])),
+            )
+            for y, x in np.ndindex(sizes["laser_y"], sizes["laser_x"])
+            for row in range(0, sizes["sensor_y"], rows)
+            for column in range(0, sizes["sensor_x"], columns)
+        ]
 
     def light(self, block: Block) -> NDArray[np.float32]:
         """Return the light of a block, (source bins, points)."""
         if self.zones is None:
-            return self._light(block[:2], block[2]).T
+            return self._light(*block).T
         found = np.zeros((self.zones.shape[0], self.capture.header.n_bins), np.float32)
         columns, done = self.capture.header.sizes["sensor_x"], 0
         step = max(BLOCK_SAMPLES // (columns * self.capture.header.n_bins), 1)
         for y in range(0, self.capture.header.sizes["sensor_y"], step):
-            band = self._light(block[:2], slice(y, y + step))
+            band = self._light(block[0], slice(y, y + step), None)
             found += self.zones[:, done : done + len(band)] @ band
             done += len(band)
         return found.T
 
-    def _light(self, laser: tuple[int, int], rows: slice) -> NDArray[np.float32]:
-        """Return (points, bins) of rows of sensor points, bounces summed, colours averaged."""
+    def _light(self, laser: tuple[int, int], rows: slice, columns: slice | None) -> NDArray[np.float32]:
+        """Return (points, bins) of some sensor points, bounces summed, colours averaged."""
         capture = self.capture
-        samples = finite(capture.path, capture.read_block(laser, (rows, None)))
+        samples = finite(capture.path, capture.read_block(laser, (rows, columns)))
         light = intensity(capture.header, samples).sum(axis=0).reshape(-1, capture.header.n_bins)
         if light.min(initial=0.0) < 0 and not self.is_counts:
             raise FileError(
@@ -268,17 +281,17 @@ class _Measurement:
         return totals
 
     def _measured(self, block: Block, chunker: Chunker) -> tuple[list[PackedChunk], Totals]:
-        y, x, rows = block
+        (y, x), rows, columns = block
         light, sizes = self.light(block), self.header.sizes
         if self.is_counts:
             counts, totals = light.astype(np.float64), Totals(light.shape[1])
         else:
             config = self.detector.config
-            stream = Philox(key=[config.seed, y * sizes["laser_x"] + x], counter=[0, 0, 0, rows.start])
+            stream = Philox(key=[config.seed, y * sizes["laser_x"] + x], counter=[0, 0, columns.start, rows.start])
             counts, totals = self.detector.measure(light, Generator(stream) if config.shot_noise else None)
         counts, totals.without_ready = self.detector.corrected(counts, self.corrections)
-        shaped = counts.reshape(1, 1, 1, 1, sizes["bin"], -1, sizes["sensor_x"])
-        return [*chunker.pack({layout.DATA: np.moveaxis(shaped, 4, -1)}, (y, x), (rows.start, 0))], totals
+        shaped = counts.reshape(1, 1, 1, 1, sizes["bin"], -1, columns.stop - columns.start)
+        return [*chunker.pack({layout.DATA: np.moveaxis(shaped, 4, -1)}, (y, x), (rows.start, columns.start))], totals
 
     def _scale(self, threads: int | None) -> float:
         config = self.detector.config
@@ -431,6 +444,8 @@ def _counts_header(capture: StoredCapture, detector: Detector, zones: object) ->
             n_channels=1,
             bounce_indices=(layout.SUMMED_INDEX,),
             split_bounces=False,
+            # a chunk is counted at once: of few bins as few points as of the many they are made of
+            chunk_samples=max(layout.CHUNK_SAMPLES * bins.count // max(bins.count, header.n_bins), bins.count),
         ), sums
     except ValueError as error:
         raise FileError(f"{capture.path}: {error}") from error
