@@ -45,6 +45,7 @@ def dataset_summary(folder: str | Path) -> dict[str, Any]:
         "bytes_per_capture": _spread(sizes),
         "energy": _spread([sum(entry["energy"].values()) for entry in done if entry["energy"]]),
         "error_estimate": _spread([entry["error_estimate"] for entry in done]),
+        "target_missed": sum(entry["target_missed"] for entry in done),
         "error_unknown": sum(entry["error_estimate"] is None for entry in done),
         "seconds": _spread([entry["seconds"] for entry in done]),
         "seconds_in_all": sum(entry["seconds"] or 0.0 for entry in done),

@@ -64,7 +64,7 @@ def info(folder: Folder, as_json: AsJson = False) -> None:
         ("drawn files", str(found["files_drawn"])),
         ("size", f"{readable_size(found['bytes'])}; each {_spread(found['bytes_per_capture'], readable_size)}"),
         ("energy", _spread(found["energy"])),
-        ("stated error", _spread(found["error_estimate"]) + _unknown(found["error_unknown"])),
+        ("stated error", _spread(found["error_estimate"]) + _others(found)),
         ("seconds", f"{readable_duration(found['seconds_in_all'])}; each {_spread(found['seconds'])}"),
     ]
     rows += [("in two splits", name) for name in found["in_two_splits"]]
@@ -104,8 +104,9 @@ def _counts(counts: dict[str, int]) -> str:
     return ", ".join(f"{name} {count}" for name, count in counts.items())
 
 
-def _unknown(count: int) -> str:
-    return f"; unknown in {count}" if count else ""
+def _others(found: dict[str, Any]) -> str:
+    missed, unknown = found["target_missed"], found["error_unknown"]
+    return f"; above the target in {missed}" * bool(missed) + f"; unknown in {unknown}" * bool(unknown)
 
 
 def _spread(spread: dict[str, float] | None, written: Any = lambda value: f"{value:.3g}") -> str:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from nlosrender.errors import FileError
 from nlosrender.files.atomic_write import replacing
 from nlosrender.files.attributes import json_object, text_list
-from nlosrender.files.capture_results import UNSAMPLED
+from nlosrender.files.capture_results import MISSED, UNSAMPLED
 from nlosrender.files.file_kinds import INDEX, TABLES
 from nlosrender.files.identity import file_digest
 from nlosrender.files.parts.shards import PART
@@ -47,6 +47,7 @@ class IndexEntry:
     files: Mapping[str, Any] = field(default_factory=dict)  # drawn ones by key: {"file": name, "sha256": digest}
     split: str | None = None  # train, val or test
     label: Any = None  # what it shows
+    target_missed: bool = False  # whether the stated error is above render.target_error
 
 
 def entry_of(index: int, file: str, facts: CaptureFacts, folder: Path | None = None) -> IndexEntry:
@@ -84,6 +85,7 @@ def stored_entry(entry: IndexEntry, path: Path) -> IndexEntry:
         energy=json_object(attributes.get("energy")),
         error_estimate=error if isinstance(error, float) and math.isfinite(error) else None,
         unsampled_paths=text_list(attributes, UNSAMPLED),
+        target_missed=MISSED in attributes,
         seconds=json_object(attributes.get("seconds")).get("total"),
     )
 
@@ -134,7 +136,7 @@ def write_table(path: Path, captures: Sequence[Mapping[str, Any]], shards: Mappi
         It cannot be written, or the package pyarrow is missing.
     """
     keys = list(dict.fromkeys(key for capture in captures for key in capture["values"]))
-    plain = ("index", "file", "status", "split", "label", "error_estimate", "seconds", "message")
+    plain = ("index", "file", "status", "split", "label", "error_estimate", "target_missed", "seconds", "message")
     rows = []
     for capture in captures:
         row = {name: capture.get(name) for name in plain} | {"shard": (shards or {}).get(capture["index"])}

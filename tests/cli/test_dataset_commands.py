@@ -107,7 +107,7 @@ def test_info(dataset: Path) -> None:
     errors = [entry["error_estimate"] for entry in done]
     assert found["error_estimate"] == {"lowest": min(errors), "median": np.median(errors), "highest": max(errors)}
     assert [failure["index"] for failure in found["failures"]] == [3]
-    assert (found["in_two_splits"], found["missing_files"]) == ([], 0)
+    assert (found["in_two_splits"], found["missing_files"], found["target_missed"]) == ([], 0, 0)
     shown = run(dataset, "dataset", "info", "set")
     assert shown.returncode == EXIT_OK
     assert "done 4, failed 1" in shown.stdout
