@@ -143,7 +143,9 @@ def render_capture(
             counted: dict[str, object] = {}
             if config.sensor is not None and selection == WHOLE:  # parts are measured once they are merged
                 with stopwatch.stage("measure"):
-                    counted |= partial.extend(functools.partial(add_counts, warn=lambda text: warnings.emit([text])))
+                    counted |= partial.extend(
+                        functools.partial(add_counts, config=config.sensor, warn=lambda text: warnings.emit([text]))
+                    )
             # --- results -> attributes, and the partial capture becomes the file ---
             summed = summed_capture(engine, unsampled, partial.finished.sums)
             missed = missed_target(config.render, summed.stated_error)

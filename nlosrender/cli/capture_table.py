@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -99,7 +100,9 @@ def measurement_rows(found: Mapping[str, object]) -> list[tuple[str, str]]:
         ("outside the bins", text("outside_the_bins", ".3%", " of the photons")),
         (
             "response",
-            f"{text('response_fwhm_opl')} m at half maximum, mean delay {text('response_mean_delay_opl', '.3g')} m",
+            f"{text('response_fwhm_opl')} m at half maximum, mean delay {text('response_mean_delay_opl', '.3g')} m"
+            if number.get("response_fwhm_opl")
+            else "",
         ),
     ]
 
@@ -172,9 +175,23 @@ def _joined(values: object, separator: str = ", ") -> str:
 
 
 def _sensor(sensor: object) -> str:
-    """Return the values of a sensor that are set, by their keys."""
-    known = _object(sensor)
-    return ", ".join(f"{key} {_text(value)}" for key, value in known.items() if value not in (None, 0.0, 1.0))
+    """Return what of a sensor is not its default, by its keys."""
+    from nlosrender.config.sensor import SensorConfig
+
+    fields = SensorConfig.model_fields
+    given = {key: value for key, value in _object(sensor).items() if key in fields and value is not None}
+    changed = {key: value for key, value in given.items() if _as_json(fields[key].default) != value}
+    return json.dumps(_without_none(changed))[1:-1].replace('"', "")
+
+
+def _as_json(value: object) -> object:
+    return list(value) if isinstance(value, tuple) else value
+
+
+def _without_none(value: object) -> object:
+    if isinstance(value, dict):
+        return {key: _without_none(item) for key, item in value.items() if item is not None}
+    return value
 
 
 def _sequence(value: object) -> Sequence[object]:

@@ -72,7 +72,7 @@ def measure(
         from nlosrender.cli.capture_table import measurement_rows
 
         typer.echo(f"wrote {report.output}")
-        print_table(measurement_rows(report.measurement), indent=2)
+        print_table([row for row in measurement_rows(report.measurement) if row[1]], indent=2)
 
 
 def _sensor(file: Path, sensor: str | None, changes: list[str]) -> SensorConfig | None:

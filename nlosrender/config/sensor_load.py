@@ -8,7 +8,7 @@ from pathlib import Path
 from nlosrender.config.load import in_order, load_document, validated
 from nlosrender.config.overrides import apply_overrides
 from nlosrender.config.sensor import SensorConfig, profile_names
-from nlosrender.config.yaml_tree import Document
+from nlosrender.config.yaml_tree import Document, Place
 from nlosrender.errors import ConfigError
 
 
@@ -36,7 +36,8 @@ def load_sensor(name: str | None, known: SensorConfig | None, overrides: Sequenc
             document.places = {("sensor", *path): place for path, place in document.places.items()}
     else:
         values = {"profile": name} if name is not None else known.model_dump(mode="json") if known else {}
-        document = Document("--sensor" if name is not None else "sensor of the capture", Path.cwd(), "sensor")
+        source = f"--sensor {name}" if name is not None else "sensor of the capture"
+        document = Document(source, Path.cwd(), "sensor", places={(): Place(source, source)})
         document.tree = {"sensor": {key: value for key, value in values.items() if value is not None}}
     apply_overrides(document, overrides)
     sensor, found = validated(SensorConfig, document.tree["sensor"], document, ("sensor",))

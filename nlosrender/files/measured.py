@@ -19,6 +19,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import TypeVar
 
+import h5py
 import numpy as np
 from numpy.random import Generator, Philox
 from numpy.typing import NDArray
@@ -40,7 +41,14 @@ from nlosrender.files.parts.shards import PART
 from nlosrender.files.reading.reader import StoredCapture, finite, open_capture
 from nlosrender.files.reading.scan import hidden_box, moved, wall_frame, wall_pose
 from nlosrender.files.reading.stored_header import StoredHeader, intensity
-from nlosrender.sensor.detector import Detector, Totals, detector_of, detector_warnings, physical_scale
+from nlosrender.sensor.detector import (
+    Detector,
+    Totals,
+    detector_of,
+    detector_warnings,
+    measurement_of,
+    physical_scale,
+)
 from nlosrender.sensor.rebinning import TimeBins
 from nlosrender.sensor.zones import zone_of_points, zone_sums
 
@@ -55,7 +63,6 @@ Block = tuple[tuple[int, int], slice, slice]  # laser point, rows and columns of
 Result = TypeVar("Result")
 Progress = Callable[[float], None]
 Warn = Callable[[str], None]
-Put = Callable[[PackedChunk], object]
 
 
 @dataclass(frozen=True)
@@ -122,18 +129,17 @@ def measure_capture(
                 if measurement.zones is None:  # which have a grid of their own
                     capture.copy_ground_truth(writer.file)
             data = writer.file[layout.DATA]
-            totals = measurement.count(
-                lambda chunk: writer.put_chunk(data, chunk.at, chunk.content), compression, progress, warn, threads
-            )
-            attributes = measurement.attributes(totals)
+            found = measurement.write(writer, data, progress, warn, threads)
             with writer.writing():
-                set_attributes(writer.file, attributes)
+                set_attributes(writer.file, measurement.attributes(found))
                 set_attributes(data, {"unit": layout.COUNTS_UNIT, "meaning": "counts per bin, of all bounces"})
-    return MeasureReport(output, measurement.statistics(totals))
+    return MeasureReport(output, found)
 
 
-def add_counts(writer: HDF5Writer, path: Path, *, warn: Warn = lambda text: None) -> dict[str, object]:
-    """Add a dataset ``counts`` to a complete capture that is open for writing, as its configuration has a sensor.
+def add_counts(
+    writer: HDF5Writer, path: Path, config: SensorConfig | None = None, *, warn: Warn = lambda text: None
+) -> dict[str, object]:
+    """Add a dataset ``counts`` to a complete capture that is open for writing; no config: by the sensor of its own.
 
     It has the axes of ``data``; one that is there already is replaced.
 
@@ -148,7 +154,7 @@ def add_counts(writer: HDF5Writer, path: Path, *, warn: Warn = lambda text: None
         As ``measure_capture``.
     """
     capture = StoredCapture(writer.file, path)
-    measurement = _measurement(capture, None, ()).scaled()
+    measurement = _measurement(capture, config, ()).scaled()
     header = measurement.header
     gzip = capture.header.compression != "none"
     with writer.writing():
@@ -169,13 +175,7 @@ def add_counts(writer: HDF5Writer, path: Path, *, warn: Warn = lambda text: None
                 "deltaT": header.bin_width_opl,
             },
         )
-    totals = measurement.count(
-        lambda chunk: writer.put_chunk(dataset, chunk.at, chunk.content),
-        "gzip" if gzip else "none",
-        lambda share: None,
-        warn,
-    )
-    return measurement.attributes(totals)
+    return measurement.attributes(measurement.write(writer, dataset, lambda share: None, warn))
 
 
 def sensor_of(header: StoredHeader) -> SensorConfig | None:
@@ -261,16 +261,17 @@ class _Measurement:
         """Return the same with the scale of the capture's light, all of which is looked at for a relative one."""
         return dataclasses.replace(self, detector=dataclasses.replace(self.detector, scale=self._scale(threads)))
 
-    def count(self, put: Put, compression: str, progress: Progress, warn: Warn, threads: int | None = None) -> Totals:
-        """Measure all blocks, hand out the chunks in their order, and return the sums."""
+    def write(
+        self, writer: HDF5Writer, dataset: h5py.Dataset, progress: Progress, warn: Warn, threads: int | None = None
+    ) -> Mapping[str, object]:
+        """Measure all blocks into a dataset, and return what ``info`` shows."""
         for text in () if self.is_counts else detector_warnings(self.detector):
             warn(text)
-        chunker, totals = Chunker(self.header, compression), Totals()
-        for number, (chunks, part) in enumerate(
-            _in_order(lambda block: self._measured(block, chunker), self.blocks, threads)
-        ):
+        chunker, totals = Chunker(self.header, dataset.compression or "none"), Totals()
+        results = _in_order(lambda block: self._measured(block, chunker), self.blocks, threads)
+        for number, (chunks, part) in enumerate(results):
             for chunk in chunks:
-                put(chunk)
+                writer.put_chunk(dataset, chunk.at, chunk.content)
             totals.add(part)
             progress((number + 1) / len(self.blocks))
         if totals.without_ready:
@@ -278,7 +279,9 @@ class _Measurement:
                 f"{totals.without_ready} histograms have bins after which no pulse was left: pile-up cannot be undone "
                 "there, they are 0. Measure with less light."
             )
-        return totals
+        if self.is_counts:
+            return json_object(self.capture.header.attributes.get(MEASUREMENT))
+        return measurement_of(self.detector, totals)
 
     def _measured(self, block: Block, chunker: Chunker) -> tuple[list[PackedChunk], Totals]:
         (y, x), rows, columns = block
@@ -297,15 +300,14 @@ class _Measurement:
         config = self.detector.config
         if self.is_counts:
             return 1.0
+        header = self.capture.header
         if config.photons_per_pulse is None:
-            unit, size = self.capture.header.data_attributes.get("unit"), self.capture.header.sensor_grid_size
-            if unit != layout.DATA_UNIT:
-                message = f"missing: {self.capture.path} does not say that its data are in {layout.DATA_UNIT}, "
-                raise ConfigError.at(
-                    "sensor.photons_per_pulse", message + "so they make no photons; need a relative scale."
+            if header.data_attributes.get("unit") != layout.DATA_UNIT:
+                message = (
+                    f"missing: {header.path} does not say that its data are in {layout.DATA_UNIT}, so they make no "
                 )
-            rows, columns = self.capture.header.sensor_grid
-            area = float(np.prod(size)) / (rows * columns) if size else 0.0
+                raise ConfigError.at("sensor.photons_per_pulse", message + "photons; need a relative scale.")
+            area = float(np.prod(header.sensor_grid_size or 0.0)) / math.prod(header.sensor_grid)
             if config.footprint_area is None and area <= 0:
                 raise ConfigError.at("sensor.footprint_area", "missing: the sensor grid has no size.")
             return physical_scale(config, area)
@@ -318,41 +320,15 @@ class _Measurement:
         wanted = config.photons_per_pulse
         return wanted.brightest / brightest if wanted.brightest is not None else (wanted.mean or 0.0) * points / total
 
-    def attributes(self, totals: Totals) -> dict[str, object]:
-        """Return the attributes that say how the counts came about."""
-        config = self.detector.config
-        earlier = self.capture.header.attributes
+    def attributes(self, found: Mapping[str, object]) -> dict[str, object]:
+        """Return the attributes that say how the counts came about, and what ``write`` returned."""
+        done = text_list(self.capture.header.attributes, CORRECTIONS) if self.is_counts else ()
         described = {name: field.description for name, field in SensorConfig.model_fields.items()}
         return {
-            SENSOR: json.dumps(config.model_dump(mode="json")),
+            SENSOR: json.dumps(self.detector.config.model_dump(mode="json")),
             "sensor_keys": json.dumps(described),
-            MEASUREMENT: earlier[MEASUREMENT]
-            if self.is_counts and MEASUREMENT in earlier
-            else json.dumps(self.statistics(totals)),
-            CORRECTIONS: [*(text_list(earlier, CORRECTIONS) if self.is_counts else ()), *self.corrections] or "none",
-        }
-
-    def statistics(self, totals: Totals) -> dict[str, object]:
-        """Return what ``info`` shows: plain numbers."""
-        if self.is_counts:
-            return json_object(self.capture.header.attributes.get(MEASUREMENT))
-        config, n, response = self.detector.config, totals.histograms, self.detector.response
-        pulses, free = config.n_pulses * n, totals.signal + totals.background
-        return {
-            "pulses": config.n_pulses,
-            "photons_per_pulse": totals.photons / n,
-            "scale": self.detector.scale,
-            "counts": totals.counts,
-            "counts_per_histogram": totals.counts / n,
-            "expected_counts": totals.expected,
-            "detections_per_pulse": totals.detected / pulses,
-            "detections_per_pulse_brightest": totals.brightest,
-            "lost_to_pile_up": 1 - totals.detected / free if free else 0.0,
-            "signal_to_background": totals.signal / totals.background if totals.background else None,
-            "outside_the_bins": 1 - totals.in_bins / totals.photons if totals.photons else 0.0,
-            "afterpulses": totals.expected - totals.detected,
-            "response_fwhm_opl": response.fwhm,
-            "response_mean_delay_opl": response.mean_delay,
+            MEASUREMENT: json.dumps(found),
+            CORRECTIONS: [*done, *self.corrections] or "none",
         }
 
 

@@ -87,22 +87,17 @@ class Detector:
             return None
         return DeadTime(self.bins, self.config.dead_time_ps * OPL_PER_PS, self.config.period_opl)
 
-    def rates(self, light: Float32) -> tuple[Float64, Totals]:
-        """Return r: detections per pulse and bin if none were lost, (bins, points), and sums of them.
-
-        ``light`` is (source bins, points) of the capture.
-        """
-        config, pulses = self.config, self.config.n_pulses
+    def _rates(self, light: Float32) -> tuple[Float64, Totals]:
+        """Return r: detections per pulse and bin if none were lost, (bins, points), and sums of them."""
         r = self.rebinning.apply(light).astype(np.float64)
-        total = light.sum(axis=0, dtype=np.float64)
-        inside = float(r.sum())
+        photons, ratio = light.sum(axis=0, dtype=np.float64), self.config.photon_detection_ratio
+        totals = Totals(light.shape[1], float(photons.sum()) * self.scale, float(r.sum()) * self.scale)
         if self._crosstalk is not None:
-            r += np.outer(self._crosstalk, total)
-        r *= self.scale * config.photon_detection_ratio
-        signal = float(r.sum())
+            r += np.outer(self._crosstalk, photons)
+        r *= self.scale * ratio
+        totals.signal = float(r.sum()) * self.config.n_pulses
+        totals.background = float(self.background.sum()) * self.config.n_pulses * light.shape[1]
         r += self.background[:, None]
-        totals = Totals(light.shape[1], float(total.sum()) * self.scale, inside * self.scale, signal * pulses)
-        totals.background = pulses * float(self.background.sum()) * light.shape[1]
         return r, totals
 
     def measure(self, light: Float32, random: Generator | None) -> tuple[Float64, Totals]:
@@ -111,7 +106,7 @@ class Detector:
         The expectation of a dead time is not computed twice: the sums of a draw have the drawn counts in its place.
         """
         config, pulses = self.config, self.config.n_pulses
-        r, totals = self.rates(light)
+        r, totals = self._rates(light)
         if config.pile_up == "first_photon":
             per_pulse = -np.expm1(-r.sum(axis=0))
             counts = first_photon_counts(r, pulses, random) if random else pulses * first_photon_mean(r)
@@ -251,6 +246,28 @@ def detector_warnings(detector: Detector) -> Iterator[str]:
         )
     if detector.config.dead_time_ps and detector.config.pile_up != "dead_time":
         yield f"sensor.dead_time_ps has no effect with pile_up: {detector.config.pile_up}, but on afterpulses."
+
+
+def measurement_of(detector: Detector, totals: Totals) -> dict[str, object]:
+    """Return what is worth knowing of all counts: plain numbers."""
+    config, n, response = detector.config, totals.histograms, detector.response
+    free = totals.signal + totals.background
+    return {
+        "pulses": config.n_pulses,
+        "photons_per_pulse": totals.photons / n,
+        "scale": detector.scale,  # photons per pulse of a unit of the capture's data
+        "counts": totals.counts,
+        "counts_per_histogram": totals.counts / n,
+        "expected_counts": totals.expected,
+        "detections_per_pulse": totals.detected / (config.n_pulses * n),
+        "detections_per_pulse_brightest": totals.brightest,
+        "lost_to_pile_up": 1 - totals.detected / free if free and config.pile_up != "none" else 0.0,
+        "signal_to_background": totals.signal / totals.background if totals.background else None,
+        "outside_the_bins": max(1 - totals.in_bins / totals.photons, 0.0) if totals.photons else 0.0,
+        "afterpulses": totals.expected - totals.detected,
+        "response_fwhm_opl": response.fwhm,
+        "response_mean_delay_opl": response.mean_delay,
+    }
 
 
 def physical_scale(config: SensorConfig, cell_area: float) -> float:

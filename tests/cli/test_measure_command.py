@@ -15,9 +15,10 @@ from support.rendering import flat_wall
 
 from nlosrender.capture.part import Selection
 from nlosrender.config.load import load_config, parse_config
-from nlosrender.errors import EXIT_BAD_INPUT, EXIT_USAGE, ConfigError
+from nlosrender.errors import EXIT_BAD_INPUT, EXIT_USAGE, ConfigError, InterruptedRender
 from nlosrender.files.parts.merge import merge_captures
 from nlosrender.pipeline import render_capture
+from nlosrender.sensor.detector import Detector
 
 EXPOSURE = ("--set", "sensor.exposure_time=0.01", "--set", "sensor.photons_per_pulse.mean=0.05")
 
@@ -36,7 +37,7 @@ def test_a_profile_an_exposure_and_what_is_told(capture: Path) -> None:
     assert "wrote counts.hdf5" in done.stdout
     assert "110000 pulses" in done.stdout
     shown = run(capture.parent, "info", "counts.hdf5", "--check")
-    for text in ("lost to pile-up", "profile spad-532", "seed 7", "measured from", "matches the Z-NLOS layout"):
+    for text in ("lost to pile-up", "profile: spad-532", "seed: 7", "measured from", "matches the Z-NLOS layout"):
         assert text in shown.stdout
     with h5py.File(capture.parent / "counts.hdf5") as file:
         sensor, units = json.loads(file.attrs["sensor"]), json.loads(file.attrs["sensor_keys"])
@@ -235,9 +236,8 @@ def test_pictures_of_counts(capture: Path) -> None:
     """Counts alone, beside the ideal capture, and what is not its ideal capture; comparisons tell counts from light."""
     folder = capture.parent
     run(folder, "measure", capture, "-o", "counts.hdf5", "--sensor", "spad-532", *EXPOSURE)
-    for options in ((), ("--ideal", capture)):
-        done = run(folder, "plot", "counts.hdf5", *options)
-        assert done.returncode == 0, done.stderr
+    done = run(folder, "plot", "counts.hdf5", "--ideal", capture)
+    assert done.returncode == 0, done.stderr
     assert (folder / "counts.png").read_bytes().startswith(b"\x89PNG")
     assert "holds no counts that" in run(folder, "plot", capture, "--ideal", "counts.hdf5").stderr
     assert "is not the ideal capture of" in run(folder, "plot", "counts.hdf5", "--ideal", "counts.hdf5").stderr
@@ -251,3 +251,34 @@ def test_few_counts_are_told_before_a_reconstruction(capture: Path) -> None:
     done = run(capture.parent, "reconstruct", "counts.hdf5", "--voxels", "8")
     assert done.returncode == 0, done.stderr
     assert "shot noise is more than 10%" in done.stderr
+
+
+def test_a_render_that_is_stopped_while_it_counts_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """All light is kept, and counted by another sensor then."""
+    config, output = configuration(tmp_path), tmp_path / "a.hdf5"
+
+    def stopped(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Detector, "measure", stopped)
+        with pytest.raises((KeyboardInterrupt, InterruptedRender)):
+            render_capture(load_config(config, [f"output.path={output}"]))
+    assert not output.exists()
+    report = render_capture(load_config(config, [f"output.path={output}", "sensor.pulses=77"]))
+    assert report.resumed_units == report.units
+    with h5py.File(output) as file:
+        assert json.loads(file.attrs["measurement"])["pulses"] == 77
+        assert json.loads(file.attrs["config"])["sensor"]["pulses"] == 77
+        assert file["counts"][()].any()
+
+
+def test_a_sweep_over_a_sensor(tmp_path: Path) -> None:
+    """Keys of the sensor are swept like any other, by their names."""
+    config = configuration(tmp_path)
+    text = yaml.safe_load(config.read_text())
+    text |= {"sweep": {"keys": {"sensor.pulses": [10, 20000]}}, "output": {"path": str(tmp_path / "{index}.hdf5")}}
+    config.write_text(yaml.safe_dump(text))
+    assert run(tmp_path, "render", config).returncode == 0
+    few, many = counts(tmp_path / "0.hdf5").sum(), counts(tmp_path / "1.hdf5").sum()
+    assert many > 500 * few

@@ -246,7 +246,7 @@ def test_light_of_no_capture_makes_background_alone(tmp_path: Path) -> None:
     """A dark capture is measured like any other."""
     source, target = ideal(tmp_path), tmp_path / "counts.hdf5"
     with h5py.File(source, "r+") as file:
-        file["data"][...] = 0
+        file["data"][...] = np.zeros(file["data"].shape, np.float32)
     report = measure_capture(source, target, sensor(ambient_rate=1e6))
     assert report.measurement["signal_to_background"] == 0
     assert isinstance(report.measurement, dict)
@@ -280,7 +280,7 @@ def test_a_detector_knows_no_colour(tmp_path: Path, channels: int, name: str) ->
     assert not check_file(target).violations
 
 
-@pytest.mark.parametrize("detector_bins", [1500, 30])
+@pytest.mark.parametrize("detector_bins", [1500, pytest.param(30, marks=pytest.mark.slow)])
 def test_many_blocks_are_the_whole(tmp_path: Path, detector_bins: int) -> None:
     """More points than are counted at once, and fewer bins than the capture has: nothing is missing or there twice."""
     header = points_header("confocal", cells(70, 47, 1.4, 1.0), bins=(0.9, 0.004, 1500), bounce_indices=(1,))

@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
+from nlosrender.config.sensor import SensorConfig
 from nlosrender.sensor.detection import DeadTime, coates, first_photon_counts, first_photon_mean
+from nlosrender.sensor.detector import detector_of
 from nlosrender.sensor.rebinning import TimeBins
 
 BINS = TimeBins(0.0, 1.0, 40)
@@ -49,6 +51,22 @@ def simulated(r: np.ndarray, dead_time: float, seed: int, first_only: bool = Fal
                 ready = time + dead_time
         detected = np.array(kept)
     return np.bincount((detected % BINS.count).astype(int), minlength=BINS.count)
+
+
+def test_without_pile_up_the_mean_is_the_variance() -> None:
+    """1e6 Poisson draws of two rates, by the index of dispersion: chi-square with as many degrees of freedom."""
+    config = SensorConfig.model_validate({"pulses": 1000, "photons_per_pulse": {"mean": 1}})
+    detector = detector_of(config, TimeBins(0.0, 0.003, 100))
+    light = np.repeat(np.array([[0.002], [0.05]], np.float32), 50, axis=0) * np.ones((1, 10_000), np.float32)
+    counts, totals = detector.measure(light, np.random.default_rng(8))
+    for rate, rows in ((2.0, counts[:50]), (50.0, counts[50:])):
+        dispersion = ((rows - rate) ** 2).sum() / rate
+        low, high = chi2.ppf([SURE / 2, 1 - SURE / 2], rows.size)
+        # the variance of (n - m)^2 / m is 2 + 1 / m of a Poisson, 2 of chi-square
+        spread = math.sqrt(1 + 1 / (2 * rate))
+        assert rows.size + (low - rows.size) * spread < dispersion < rows.size + (high - rows.size) * spread
+        assert rows.mean() == pytest.approx(rate, abs=5 * math.sqrt(rate / rows.size))
+    assert totals.counts == counts.sum()
 
 
 def test_coates_inverts_the_expected_first_photons() -> None:
