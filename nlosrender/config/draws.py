@@ -9,6 +9,7 @@ import glob
 import math
 import random
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -217,6 +218,7 @@ def _files(value: Mapping[str, Any], folder: Path) -> Draw:
 
 
 def _matches(pattern: str, folder: Path) -> Iterator[str]:
-    for name in glob.iglob(pattern, root_dir=folder, recursive=True):
-        if (folder / name).is_file():
-            yield Path(name).as_posix()
+    with suppress(ValueError, OSError):  # a zero byte, half of a character: no file has such a name
+        for name in glob.iglob(pattern, root_dir=folder, recursive=True):
+            if (folder / name).is_file():
+                yield Path(name).as_posix()

@@ -159,6 +159,10 @@ def _issues(item: dict[str, Any], path: KeyPath) -> Iterator[ValidationIssue]:
         yield ValidationIssue((*path, "no_overlap"), mismatch(item["no_overlap"], "true or false"))
     if floor is not None and as_finite(floor) is None:
         yield ValidationIssue((*path, "on_floor"), mismatch(floor, "a height [m], or null"))
+    if floor is not None and item.get("type") in ("room", "mitsuba"):
+        yield ValidationIssue(
+            (*path, "on_floor"), f"is not for {item['type']}, which has no place of its own; remove it."
+        )
 
 
 def _taken(item: dict[str, Any]) -> tuple[int, bool, float | None]:
@@ -173,8 +177,7 @@ def _lifted(item: dict[str, Any], box: Box | None, member: Member) -> Box:
     """Move a raw item up or down so that its box stands on the floor, and return the box then."""
     key = next((key for key in PLACES if key in item), "translate" if item.get("type") == "mesh" else None)
     if box is None or member.floor is None or key is None:
-        message = f"got {item.get('type')}, whose extent is not known before it is built; on_floor is for other items."
-        raise ConfigError(ValidationIssue((*_ITEMS, member.item, "on_floor"), message))
+        raise ValueError(f"{item.get('type')} cannot stand on a floor")  # refused by ``_issues``
     rise = member.floor + FLOOR_GAP - float(box[0][_UP])
     place = [float(number) for number in item.get(key, (0.0, 0.0, 0.0))]
     place[_UP] += rise

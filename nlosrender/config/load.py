@@ -126,7 +126,8 @@ def config_of(document: Document) -> Config:
         With every issue found, the document's own included; a sweep is one.
     """
     if document.tree.get("sweep") is None:
-        return capture_config(document)
+        unused = document.tree.get("dataset") is not None
+        return capture_config(document).with_notes(["dataset has no effect without a sweep."] * unused)
     message = "this makes many captures, and a single one is needed here; remove it, or --set sweep=null."
     sweep = document.issue(("sweep",), message, "key")
     single = {key: value for key, value in document.tree.items() if key != "sweep"}

@@ -8,9 +8,11 @@ import h5py
 import numpy as np
 import pytest
 
+from nlosrender.capture.part import Selection
 from nlosrender.config.document import Config
 from nlosrender.config.load import parse_config
 from nlosrender.errors import ConfigError
+from nlosrender.files.parts.merge import merge_captures
 from nlosrender.files.truth_datasets import GroundTruth
 from nlosrender.files.validation import check_file
 from nlosrender.pipeline import render_capture
@@ -224,12 +226,36 @@ def test_in_the_file(tmp_path: Path) -> None:
     assert "gt_normal: shape (3, 15, 20)" in check_file(tmp_path / "a.hdf5").violations[0]
 
 
+def test_parts_have_it(tmp_path: Path) -> None:
+    """The parts of a capture hold all of its ground truth, and so does the capture that is made of them."""
+    config = config_of(ITEMS[0], more=f", path: {tmp_path / 'a.hdf5'}")
+    parts = []
+    for number in (1, 2):
+        parts.append(tmp_path / f"{number}.hdf5")
+        output = config.output.model_copy(update={"path": parts[-1]})
+        render_capture(config.model_copy(update={"output": output}), selection=Selection(shard=(number, 2)))
+    merge_captures(parts, tmp_path / "whole.hdf5")
+    render_capture(config)
+    with h5py.File(tmp_path / "whole.hdf5") as whole, h5py.File(tmp_path / "a.hdf5") as alone:
+        assert set(whole) == set(alone)
+        assert all(whole[name][()].tobytes() == alone[name][()].tobytes() for name in alone if name.startswith("gt_"))
+
+
 def test_mistakes() -> None:
     """Kinds are told; a camera sees the scene itself."""
     with pytest.raises(ConfigError, match=r"ground_truth\.0: got 'deph' .* Did you mean depth"):
         parse_config(
             "scene: {relay_wall: {type: rectangle, width: 1, height: 1}}\n"
             "capture: {scan_type: confocal, sensor_grid: {nx: 2, ny: 2}}\noutput: {ground_truth: [deph]}",
+            "z.yaml",
+            Path("/tmp"),
+        )
+    with pytest.raises(ConfigError, match=r"ground_truth: is seen from a relay wall"):
+        parse_config(
+            "scene: {emitters: [{type: point, position: [0, 1, 1], intensity: 1}]}\n"
+            "capture:\n  scan_type: line_of_sight\n"
+            "  camera: {position: [0, 0, 0], look_at: [0, 0, 1], width: 4, height: 3}\n"
+            "output: {ground_truth: [depth]}",
             "z.yaml",
             Path("/tmp"),
         )

@@ -212,6 +212,11 @@ def test_no_place_without_overlap(monkeypatch: pytest.MonkeyPatch) -> None:
             "count: got -[12], need an integer from 0 to 100",
         ),
         ("{scene.hidden_geometry.0.no_overlap: {choice: [maybe]}}", "no_overlap: got 'maybe'"),
+        ("{scene.hidden_geometry.0.radius: {files: ['a\\0b']}}", "a pattern that some file matches"),
+        (
+            "{scene.hidden_geometry.0: {choice: [{type: room, size: [3, 3, {uniform: [1, 2]}], on_floor: 0}]}}",
+            "not for room",
+        ),
         ("{scene.hidden_geometry.0.on_floor: {choice: [low]}}", "on_floor: got 'low' \\(text\\), need a height"),
     ],
 )

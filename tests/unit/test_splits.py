@@ -98,6 +98,9 @@ def test_labels(meshes: Path) -> None:
 def test_no_part_of_a_capture(tmp_path: Path) -> None:
     """The section changes no capture's hash."""
     config = parse_config(BASE, "z.yaml", tmp_path)
+    assert parse_config(f"{BASE}dataset: {{}}\n", "z.yaml", tmp_path).notes == (
+        "dataset has no effect without a sweep.",
+    )
     assert config_hash(parse_config(f"{BASE}dataset: {{split: {{}}}}\n", "z.yaml", tmp_path)) == config_hash(config)
 
 

@@ -1,8 +1,9 @@
 """The folders of learned feature embeddings (Chen et al. 2020), as its renderer writes and its loaders read them.
 
-``0/MODEL/shine_0.0000-rot_X_Y_Z-shift_X_Y_Z.../`` holds ``light-1-MAX-LAST-FIRST.hdr``, the confocal transient as one
-picture of 600 blocks of rows, ``depth-0-MAX-MIN.hdr`` and ``confocal-0-MAX-MIN.hdr``. Lengths are in half wall widths;
-a bin is 0.01 of them, and depth is 1 at the wall, 0 two of them away and where there is nothing.
+``0/MODEL/shine_0.0000-rot_X_Y_Z-shift_X_Y_Z.../`` holds ``light-1-MAX-LAST-FIRST.hdr``, the confocal transient (of one
+laser point ``light-0-...``) as one picture of 600 blocks of rows, ``depth-0-MAX-MIN.hdr``, ``confocal-0-MAX-MIN.hdr``.
+Lengths are in half wall widths; a bin is 0.01 of them, and depth is 1 at the wall, 0 two of them away and where there
+is nothing.
 """
 
 from __future__ import annotations
@@ -49,7 +50,7 @@ def _write(packing: Packing, entry: dict[str, Any], model: Path) -> None:
         packing.note(f"light after bin {BINS} is left out")
     lit = np.flatnonzero(light.any(axis=(1, 2)))
     first, last = (lit[0] * BIN, lit[-1] * BIN) if len(lit) else (0.0, 0.0)
-    name = f"light-1-{light.max():.4f}-{last:.4f}-{first:.4f}.hdr"
+    name = f"light-{int(sample.confocal)}-{light.max():.4f}-{last:.4f}-{first:.4f}.hdr"
     stored = write_hdr(folder / name, light.reshape(-1, light.shape[2]))
     packing.stated_error(entry, rounding(stored, light.reshape(stored.shape)))
     for kind, picture in (("depth", lfe_depth(sample)), ("confocal", sample.image)):

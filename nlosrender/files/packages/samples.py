@@ -30,6 +30,7 @@ class WallSample:
     image: Float32 | None  # (row, column) what a flash at the wall shows: albedo times cosine
     depth: Float32 | None  # (row, column) from the wall, NaN: nothing
     width: float  # of the wall's grid [m]
+    confocal: bool
 
 
 def wall_sample(path: Path) -> WallSample:
@@ -63,6 +64,7 @@ def wall_sample(path: Path) -> WallSample:
         image=_image(path, truth),
         depth=None if depth is None else (depth[::-1, ::-1] / width).astype(np.float32),
         width=width,
+        confocal=scan.confocal,
     )
 
 
