@@ -46,7 +46,11 @@ def measured_pair(capture: StoredCapture, ideal: Path | None, stack: ExitStack) 
     FileError
         A file cannot be read; ``ideal`` has another grid, holds counts, or is given where there are none.
     """
-    sensor, beside = sensor_of(capture.header), capture.counts()
+    beside = capture.counts()
+    try:
+        sensor = sensor_of(capture.header)
+    except FileError:  # its response cannot be drawn, all else can
+        sensor = None
     if capture.header.is_measured and sensor is not None:
         other = None if ideal is None else stack.enter_context(open_capture(ideal))
         if other is not None and (other.header.is_measured or other.header.sensor_grid != capture.header.sensor_grid):

@@ -179,10 +179,22 @@ def add_counts(
 
 
 def sensor_of(header: StoredHeader) -> SensorConfig | None:
-    """Return the sensor that a file was measured with, or that its configuration has; None: there is none."""
+    """Return the sensor that a file was measured with, or that its configuration has; None: there is none.
+
+    Raises
+    ------
+    FileError
+        It cannot be used: its measured response lies elsewhere by now, or another program wrote it.
+    """
     stored = json_object(header.attributes.get(SENSOR))
     values = stored or json_object(header.attributes.get("config")).get("sensor")
-    return stored_sensor(values) if isinstance(values, Mapping) and values else None
+    if not isinstance(values, Mapping) or not values:
+        return None
+    sensor = stored_sensor(values)
+    wrong = [*sensor.issues(("sensor",), SensorConfig)]
+    if wrong:
+        raise FileError(f"{header.path}: its sensor cannot be used: {wrong[0]} Name another one with --sensor.")
+    return sensor
 
 
 def few_counts(header: StoredHeader) -> Iterator[str]:
@@ -328,8 +340,7 @@ class _Measurement:
             SENSOR: json.dumps(self.detector.config.model_dump(mode="json")),
             "sensor_keys": json.dumps(described),
             MEASUREMENT: json.dumps(found),
-            CORRECTIONS: [*done, *self.corrections] or "none",
-        }
+        } | ({CORRECTIONS: [*done, *self.corrections]} if done or self.corrections else {})
 
 
 def _measurement(capture: StoredCapture, config: SensorConfig | None, corrections: tuple[str, ...]) -> _Measurement:

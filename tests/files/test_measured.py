@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ import pytest
 from support.partial_captures import write_capture
 from support.point_captures import cells, point_light, points_header, write_light
 
+from nlosrender.analysis.measured_plot import measured_pair
 from nlosrender.config.sensor import SensorConfig
 from nlosrender.config.sensor_load import load_sensor
 from nlosrender.errors import ConfigError, FileError, NlosError
@@ -290,3 +292,27 @@ def test_many_blocks_are_the_whole(tmp_path: Path, detector_bins: int) -> None:
     counts, light = counts_of(target), counts_of(source)
     joined = light.reshape(detector_bins, -1, 47, 70).sum(axis=1)
     np.testing.assert_allclose(counts, joined * counts.sum() / joined.sum(), rtol=1e-4, atol=1e-7)
+
+
+def test_a_response_that_is_gone(tmp_path: Path) -> None:
+    """Its counts can be read, and drawn as any capture; another measurement needs another sensor."""
+    source, target, curve = ideal(tmp_path), tmp_path / "counts.hdf5", tmp_path / "curve.npy"
+    np.save(curve, [1.0, 3.0, 1.0])
+    measure_capture(source, target, sensor(jitter_file=str(curve), jitter_file_bin_ps=40))
+    curve.unlink()
+    with pytest.raises(FileError, match=r"its sensor cannot be used: sensor.jitter_file: got .*curve.npy"):
+        measure_capture(target, tmp_path / "b.hdf5", None, corrections=("pile_up",))
+    with open_capture(target) as capture, ExitStack() as stack:
+        assert measured_pair(capture, None, stack) is None
+
+
+@pytest.mark.parametrize(
+    ("values", "message"), [([1, -2], "holds -2"), ([0, 0], "holds no light"), ([], "holds no light")]
+)
+def test_a_response_of_nonsense(tmp_path: Path, values: list[float], message: str) -> None:
+    """Told with the file's name, by its key."""
+    np.save(tmp_path / "curve.npy", np.array(values, float))
+    with pytest.raises(ConfigError, match=rf"sensor.jitter_file: .*curve.npy {message}"):
+        measure_capture(
+            ideal(tmp_path), tmp_path / "b.hdf5", sensor(jitter_file=str(tmp_path / "curve.npy"), jitter_file_bin_ps=40)
+        )
