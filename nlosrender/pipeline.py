@@ -37,8 +37,6 @@ from nlosrender.rendering.process_layout import ONE_PROCESS
 from nlosrender.rendering.render_report import Monitor, Progress, RenderReport, Stopwatch, Warn, Warnings, Watch
 from nlosrender.rendering.render_warnings import render_warnings
 from nlosrender.rendering.stages import calibrated_budget, set_up_engine, started_backend
-from nlosrender.sensor.detector import detector_of, detector_warnings
-from nlosrender.sensor.rebinning import TimeBins
 
 if TYPE_CHECKING:
     from nlosrender.rendering.dask_cluster import Cluster
@@ -112,9 +110,6 @@ def render_capture(
         # --- scene -> capture and plan -> engine ---
         with stopwatch.stage("scene"):
             plan, engine, header = set_up_engine(config, backend, selection, processes)
-            if config.sensor is not None:
-                bins = TimeBins(header.start_opl, header.bin_width_opl, header.n_bins)
-                warnings.emit(detector_warnings(detector_of(config.sensor, bins)))
             unsampled = missing_light(engine, strict)
             warnings.emit(paths.warning for paths in unsampled)
             warnings.emit(render_warnings(config, backend, plan, engine, header, processes))

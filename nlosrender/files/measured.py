@@ -347,6 +347,8 @@ def _measurement(capture: StoredCapture, config: SensorConfig | None, correction
     """Put a detector before a capture (ConfigError, FileError: it does not fit)."""
     header = capture.header
     counts = header.is_measured
+    if counts and config is not None and corrections:
+        raise FileError(f"{header.path}: counts are corrected by the sensor that counted them, which the file names.")
     config = config or sensor_of(header)
     if config is None:
         raise FileError(

@@ -14,6 +14,8 @@ from nlosrender.engine.backend.start import Backend
 from nlosrender.files.capture_header import CaptureHeader
 from nlosrender.files.size_estimate import FileSize, disk_warnings, forecast_size
 from nlosrender.rendering.process_layout import ONE_PROCESS, ProcessLayout
+from nlosrender.sensor.detector import detector_of, detector_warnings
+from nlosrender.sensor.rebinning import TimeBins
 
 if TYPE_CHECKING:
     from nlosrender.engine.interface import Engine
@@ -32,12 +34,15 @@ def render_warnings(
     Raises
     ------
     ConfigError
-        A batch does not fit the memory.
+        A batch does not fit the memory, or the detector the time axis.
     """
     from nlosrender.engine.preflight.batch_memory import memory_warnings
     from nlosrender.engine.preflight.scene_warnings import scene_warnings
 
     yield from scene_warnings(engine)
+    if config.sensor is not None:
+        bins = TimeBins(header.start_opl, header.bin_width_opl, header.n_bins)
+        yield from detector_warnings(detector_of(config.sensor, bins))
     yield from memory_warnings(engine, plan, processes.memory_limit(config.render.memory_limit_bytes), backend.lanes)
     share = plan.part.share_of(plan.tiling.everything(header.sizes["laser_y"] * header.sizes["laser_x"]))
     size = expected_file_size(config, header, engine)

@@ -108,6 +108,8 @@ def test_expectations_and_their_corrections(tmp_path: Path) -> None:
         np.testing.assert_allclose(counts_of(undone), truth, rtol=0.01)
         measure_capture(source, undone, sensor(**background, **mode), corrections=("pile_up", "background"))
         assert counts_of(undone).sum() == pytest.approx(6 * 7 * 100_000 * 0.2, rel=1e-3)
+        with pytest.raises(FileError, match="corrected by the sensor that counted them"):
+            measure_capture(target, undone, sensor(), corrections=("pile_up",))
         with pytest.raises(FileError, match="corrected for pile_up, background already"):
             measure_capture(undone, tmp_path / "twice.hdf5", None, corrections=("pile_up",))
 
