@@ -78,14 +78,30 @@ def test_clusters_send_on_the_light_of_their_members(
     elements, normals, areas = tessellator.elements, tessellator.shared.normals, tessellator.shared.areas
     assert np.allclose(elements.shading_normals, normals, atol=1e-6) == face_normals
     to_light = np.array([0.2, -0.1, -1.0]) / np.linalg.norm([0.2, -0.1, -1.0])
-    merger = Merger(elements, normals, areas, tessellator.shared.allowed, 1e9 * to_light, tessellator.tuning)
-    patches = merger.clusters(np.ones(len(areas), bool), 2.0)
+    allowed, ratios = tessellator.shared.allowed, np.zeros(len(areas))
+    merger = Merger(elements, normals, areas, allowed, ratios, 1e9 * to_light, True, tessellator.tuning)
+    patches = merger.clusters(2.0)
     expected = np.einsum("n,n,n->", areas, elements.shading_normals @ to_light, normals @ np.array(to_sensor))
     found = np.einsum("n,n,n->", patches.areas, patches.normals @ to_light, patches.normals @ np.array(to_sensor))
     # 1e9 units away directions differ by 1e-9; nothing is steeper than 60 degrees to the laser. A cluster's area is no
     # more than its members', which binds where it is flat and its shading normals lie off by their float32 rounding.
     assert found == pytest.approx(expected, rel=1e-6)
     assert patches.areas.sum() < 0.99 * areas.sum()  # what bends away from the laser sends less
+
+
+def test_facets_of_rough_clusters_send_on_the_light_of_their_members(tmp_path: Path) -> None:
+    """From anywhere to anywhere, exactly, where several laser points leave no direction to be right for."""
+    from nlosrender.engine.virtual_lights.elements.clusters import Merger
+
+    tessellator = tessellated(crumpled(tmp_path, 60, 0.003), folder=tmp_path)
+    elements, normals, areas = tessellator.elements, tessellator.shared.normals, tessellator.shared.areas
+    allowed, ratios, light = tessellator.shared.allowed, np.zeros(len(areas)), tessellator.size_field.light
+    patches = Merger(elements, normals, areas, allowed, ratios, light, False, tessellator.tuning).clusters(0.5)
+    assert len(np.unique(patches.centres, axis=0)) < 0.5 * len(patches)
+    found = np.einsum("n,ni,nj->ij", patches.areas, patches.normals, patches.normals)
+    expected = np.einsum("n,ni,nj->ij", areas, normals, normals)
+    np.testing.assert_allclose(found, expected, atol=2e-3 * expected.max())  # some clusters are flat enough for one
+    assert np.linalg.norm(patches.normals, axis=1) == pytest.approx(1, rel=1e-12)
 
 
 @pytest.mark.parametrize("patch_scale", [1.0, 0.4])

@@ -108,19 +108,17 @@ def refined_to(
         in_vain = error < tuning.max_regular_error and (is_stuck or is_beyond)
         if error <= target or in_vain or 2 * fine.n_patches > tuning.max_patches:
             return patch_scale, fine, error
-        more = (tuning.refinement_margin * error / target) ** (
-            1 / _order(levels, fine.n_patches, error, tuning.max_order)
-        )
+        more = (tuning.refinement_margin * error / target) ** (1 / _order(levels, fine.n_patches, error, tuning.orders))
         levels.append((fine.n_patches, error))
         patch_scale = finer_scale(tessellator, patch_scale, min(max(more, tuning.min_refinement), tuning.refinement))
 
 
-def _order(levels: list[tuple[int, float]], n_patches: int, error: float, most: float) -> float:
-    """Return the power of the number of patches that the error falls by from the last level on: 1 to ``most``."""
+def _order(levels: list[tuple[int, float]], n_patches: int, error: float, bounds: tuple[float, float]) -> float:
+    """Return the power of the number of patches that the error falls by from the last level on, within bounds."""
     if not levels or levels[-1][0] >= n_patches:
         return 1.0
     count, earlier = levels[-1]
-    return min(max(math.log(earlier / error) / math.log(n_patches / count), 1.0), most)
+    return float(np.clip(math.log(earlier / error) / math.log(n_patches / count), *bounds))
 
 
 def _squares(values: NDArray[np.float64]) -> float:

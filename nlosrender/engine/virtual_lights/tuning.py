@@ -47,6 +47,10 @@ class VirtualLightTuning:
     # Width of the classes of slopes in rough boxes, at scale 1. Crumpled: 7.2 / 7.6 / 7.5 % with 2074 / 964 / 935
     # clusters at half / as is / twice; waves: no box is rough.
     slope_class: float = 3.0
+    # Variance of the slopes in a box, at scale 1, above which three facets stand for it if laser points lie in several
+    # places. Crumpled, confocal, 3 %: energy 0.989 / 0.998 / 0.999 with 4481 / 2301 / 3035 patches at 4 times / as is /
+    # a quarter, 0.937 with one facet each.
+    facet_roughness: float = 0.25
     # Boxes that are filled less join a neighbour. Two sheets: 7.3 / 7.3 / 8.0 % with 297 / 285 / 252 clusters.
     min_box_fill: float = 0.3
     # Cosine of a cluster's mean normal to the lasers below which some members may face away from them (4.3). Energy of
@@ -106,9 +110,10 @@ class VirtualLightTuning:
     stagnation: float = 0.9
     # Errors above it follow no law yet (table in 6.4). No effect at half and twice (letters, screen).
     max_regular_error: float = 0.2
-    # Power of the number of patches that errors are extrapolated by, at most: lobes fall by -2 while patches are wider
-    # than they are (bunny, GGX 0.2: 24, 2.7 and 0.4 % with 2693, 7529 and 22023 patches), matt surfaces by -1.25 (6.4).
-    max_order: float = 2.0
+    # Power of the number of patches that errors are extrapolated by: shadow rays leave noise by -0.5 to -0.6 (furnished
+    # room: 7.3, 4.4, 3.5 % with 7263, 18749, 27894 patches), matt surfaces -1.25 (6.4), lobes -2 while patches are
+    # wider than they are (bunny, GGX 0.2: 24, 2.7 and 0.4 % with 2693, 7529 and 22023 patches).
+    orders: tuple[float, float] = (0.6, 2.0)
     # On the patches that an extrapolated error asks for, in steps of ``min_refinement`` at least: one more level costs
     # more than 10 % of the patches.
     refinement_margin: float = 1.1

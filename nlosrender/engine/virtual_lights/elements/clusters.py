@@ -6,7 +6,8 @@ direction s by l^T M s, with M the sum of A_i n_i n_i^T. With u = M r for one di
 u u^T / (r . u) does the same wherever l or s is r, and errs elsewhere by the product of their differences from r
 (Nystrom approximation); so n = u / |u| and A = |u|^2 / (r . u), with r towards the lasers. Half a sphere, lit and seen
 from above, would be 3 times too bright with the sum of the A_i for A, 1.5 times with the length of the sum of the
-A_i n_i: docs/virtual-lights.md, 4.3.
+A_i n_i: docs/virtual-lights.md, 4.3. Laser points in several places leave no such r: there a rough cluster is three of
+one place, whose normals make up M.
 
 Visibility is that of one member, drawn by area: two sheets in one cluster still hide each other, on average, and the
 difference of two resolutions shows the noise of the draw.
@@ -15,6 +16,7 @@ difference of two resolutions shows the noise of the draw.
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -33,7 +35,8 @@ if TYPE_CHECKING:
 class Merger:
     """Merges elements far smaller than they need to be into one patch per box, at any scale.
 
-    Coarse clusters are made of finer area moments where these are far fewer than the elements.
+    Coarse clusters are made of finer area moments where these are far fewer than the elements, and of the elements that
+    are too large for these.
 
     Parameters
     ----------
@@ -41,8 +44,12 @@ class Merger:
         Elements of all shapes, their unit normals (n, 3) and areas (n,).
     allowed
         (n,) size a patch may have at scale 1 [engine units].
+    ratios
+        (n,) sizes of the elements over these.
     light
         (3,) mean of the laser points [engine units].
+    is_one_point
+        Whether all laser points are there.
     """
 
     def __init__(
@@ -51,10 +58,14 @@ class Merger:
         normals: Float64,
         areas: Float64,
         allowed: Float64,
+        ratios: Float64,
         light: Float64,
+        is_one_point: bool,
         tuning: VirtualLightTuning,
     ):
         self.elements, self.normals, self.light, self.tuning = elements, normals, light, tuning
+        self._is_one_point = is_one_point
+        self._ratios = ratios
         self._element_moments = AreaMoments.of(elements, normals, areas, allowed, tuning)
         self._moments_at: dict[float, AreaMoments] = {}  # per scale, powers of two
 
@@ -62,16 +73,20 @@ class Merger:
         """Sum up the elements at all scales at which that leaves far fewer."""
         self._moments_of(2.0**-self.tuning.moment_halvings)
 
-    def clusters(self, chosen: NDArray[np.bool_], patch_scale: float, seed: int = 0) -> Patches:
-        """Return the clusters of the ``chosen`` elements (n,), at least one; ``seed`` draws representatives."""
+    def is_small(self, patch_scale: float) -> NDArray[np.bool_]:
+        """Return which elements (n,) are merged at a scale."""
+        return self._ratios < self.tuning.merge_ratio * patch_scale
+
+    def clusters(self, patch_scale: float, seed: int = 0) -> Patches:
+        """Return the clusters of the elements that are merged, at least one; ``seed`` draws representatives."""
         level = 2.0 ** (math.floor(math.log2(patch_scale)) - self.tuning.moment_halvings)
-        moments = self._moments_of(level) if chosen.all() else self._element_moments.select(chosen)
+        moments = self._with_larger(self._moments_of(level), level, patch_scale)
         merged = moments.merged(patch_scale, np.random.default_rng(seed), self.tuning)
         representative, plane = merged.representative, BoxPlane.of(merged.places, merged.upright)
         centres = _from_box(plane.mean, merged.upright)
         areas, normals = self._as_one(merged, self.light - centres)
         barycentric = centroids(self.elements.weights[representative])[:, 1:]
-        return Patches(
+        clusters = Patches(
             corners=_parallelograms(plane, merged, centres),
             areas=areas,
             centres=centres,
@@ -84,16 +99,29 @@ class Merger:
             member_normals=self.normals[representative],
             is_cluster=np.ones(len(merged), bool),
         )
+        if self._is_one_point:
+            return clusters
+        areas, normals, roughness = three_facets(merged)
+        is_rough = roughness > self.tuning.facet_roughness * patch_scale**2
+        rough = clusters.select(np.repeat(np.flatnonzero(is_rough), 3))
+        rough = replace(rough, areas=areas[is_rough].ravel(), normals=normals[is_rough].reshape(-1, 3))
+        return Patches.joined([clusters.select(~is_rough), rough])
 
     def _moments_of(self, patch_scale: float) -> AreaMoments:
-        """Return all elements, merged to a scale that is a power of two where that leaves far fewer."""
-        moments, tuning = self._element_moments, self.tuning
-        if tuning.min_elements_per_moment * moments.boxes.sum() > patch_scale**2 * len(moments):
-            return moments
+        """Return the elements merged at a scale that is a power of two, summed up where that leaves far fewer."""
         if patch_scale not in self._moments_at:
-            finer = self._moments_of(patch_scale / 2)
+            tuning, elements, chosen = self.tuning, self._element_moments, self.is_small(patch_scale)
+            boxes = elements.boxes[chosen].sum() / patch_scale**2
+            if tuning.min_elements_per_moment * boxes >= np.count_nonzero(chosen):
+                return elements.select(chosen)
+            finer = self._with_larger(self._moments_of(patch_scale / 2), patch_scale / 2, patch_scale)
             self._moments_at[patch_scale] = finer.merged(patch_scale, np.random.default_rng(1), tuning)
         return self._moments_at[patch_scale]
+
+    def _with_larger(self, moments: AreaMoments, finer: float, coarser: float) -> AreaMoments:
+        """Return moments, and the elements that are merged at the ``coarser`` scale, but not at the ``finer`` one."""
+        larger = self.is_small(coarser) & ~self.is_small(finer)
+        return AreaMoments.joined([moments, self._element_moments.select(larger)]) if larger.any() else moments
 
     def _as_one(self, merged: AreaMoments, to_lasers: Float64) -> tuple[Float64, Float64]:
         """Return the area (n,) and normal (n, 3) that stand for those of all members, see the top of the module."""
@@ -109,6 +137,30 @@ class Merger:
         # shading normals against those of the triangles: nothing is lit
         areas = np.where(onto > 0, np.einsum("nx,nx->n", light, light) / np.maximum(onto, 1e-300), 0.0)
         return np.minimum(areas, merged.areas), unit_vectors(light)
+
+
+def three_facets(merged: AreaMoments) -> tuple[Float64, Float64, Float64]:
+    """Return areas (n, 3) and normals (n, 3, 3) of three facets that send on what all members do, and the roughness.
+
+    With slopes p, normals are (p, 1) over its length and M is the sum of w (p, 1) (p, 1)^T: three equal w, their slopes
+    on an ellipse about the mean at 120 degrees, have its sum, mean and covariance. The roughness (n,) is the trace of
+    the latter.
+    """
+    index, axes = np.arange(len(merged)), (merged.upright[:, None] + np.array([1, 2, 0])) % 3
+    moments = merged.light.reshape(-1, 3, 3)[index[:, None, None], axes[:, :, None], axes[:, None, :]]
+    moments = (moments + moments.swapaxes(1, 2)) / 2
+    weights = np.maximum(moments[:, 2, 2], 1e-300)
+    mean = moments[:, :2, 2] / weights[:, None]
+    covariance = moments[:, :2, :2] / weights[:, None, None] - mean[:, :, None] * mean[:, None, :]
+    values, vectors = np.linalg.eigh(covariance)
+    along = vectors * np.sqrt(2 * np.maximum(values, 0))[:, None, :]
+    turns = 2 * np.pi / 3 * np.arange(3)
+    slopes = mean[:, None] + np.einsum("nij,kj->nki", along, np.stack([np.cos(turns), np.sin(turns)], axis=1))
+    sign = (2 * (merged.facing % 2) - 1)[:, None, None]
+    facets: Float64 = sign * np.concatenate([slopes, np.ones((len(merged), 3, 1))], axis=2)
+    squares = np.square(facets).sum(axis=2)
+    normals = np.stack([_from_box(facets[:, k], merged.upright) for k in range(3)], axis=1)
+    return weights[:, None] / 3 * squares, normals / np.sqrt(squares)[:, :, None], values.sum(axis=1)
 
 
 def _parallelograms(plane: BoxPlane, merged: AreaMoments, centres: Float64) -> Float64:

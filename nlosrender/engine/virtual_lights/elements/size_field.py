@@ -30,6 +30,7 @@ class SizeField:
     bin_width: float  # [engine units]
     wall_index: int | None  # of the wall among the scene's shapes, where it is cut as well
     light: Float64  # (3,) mean of the laser points [engine units]
+    is_one_point: bool  # all laser points are there
     tuning: VirtualLightTuning = DEFAULT_TUNING
 
     def allowed_size(self, distance: Float64) -> Float64:
@@ -59,7 +60,7 @@ class SizedElements:
         is_small = self._ratios < self.size_field.tuning.merge_ratio * patch_scale
         splits = np.ceil(self._ratios[~is_small] / patch_scale).astype(np.int64)
         cut = split_elements(self.elements.select(~is_small), splits)
-        return Patches.joined([self.merger.clusters(is_small, patch_scale), cut]) if is_small.any() else cut
+        return Patches.joined([self.merger.clusters(patch_scale), cut]) if is_small.any() else cut
 
     def counts(self, patch_scale: float) -> tuple[int, int]:
         """Return about how many patches there would be of the hidden surfaces, and of a wall that sees itself.
@@ -86,8 +87,9 @@ class SizedElements:
     @cached_property
     def merger(self) -> Merger:
         """What makes clusters of the elements."""
-        size_field = self.size_field
-        return Merger(self.elements, self.normals, self.areas, self.allowed, size_field.light, size_field.tuning)
+        field = self.size_field
+        allowed, light, tuning = self.allowed, field.light, field.tuning
+        return Merger(self.elements, self.normals, self.areas, allowed, self._ratios, light, field.is_one_point, tuning)
 
 
 class _PatchCount:

@@ -81,7 +81,7 @@ class Tessellator:
             else:
                 self.round_shapes.append(RoundShape.of(index, shape))
         light = capture.laser_grid.positions.reshape(-1, 3).mean(axis=0) / built.metres_per_engine_unit
-        self.size_field = SizeField(bin_width, self.wall_index, light, tuning)
+        self.size_field = SizeField(bin_width, self.wall_index, light, capture.n_lasers == 1, tuning)
         joined = Elements.joined(triangles or [Elements.none()])
         self.elements = subdivide(joined, self.distance, self.wall_index)
         whole = SizedElements(self.elements, self.size_field)
