@@ -16,7 +16,7 @@ import numpy as np
 from nlosrender.engine.interface import Budget
 from nlosrender.engine.launch.pilot_points import Pilot, pilot_of
 from nlosrender.engine.launch.schedule import DEFAULT_TARGET
-from nlosrender.engine.virtual_lights.refinement import estimated_error, finer_scale, refined_to
+from nlosrender.engine.virtual_lights.refinement import Gathered, estimated_error, finer_scale, refined_to
 
 if TYPE_CHECKING:
     from nlosrender.engine.virtual_lights.third_bounce import ThirdBounce
@@ -83,19 +83,28 @@ def _pilot_of_patches(third: ThirdBounce, pilot: Pilot) -> Pilot:
 
 
 def _patch_scale_in_time(third: ThirdBounce, time_limit_s: float, target: float) -> float:
-    """Return the patch scale for ``target``, or the one that half of the time is predicted to suffice for."""
+    """Return the patch scale for ``target``, or the one that half of the time is predicted to suffice for.
+
+    Of the pilot's seconds only what grows with the patches grows with the points, too: the rest is set-up.
+    """
     capture = third.device.capture
     pilot = pilot_of(capture)
     pairs = capture.n_sensors * (capture.n_lasers if third.device.is_exhaustive else 1)
     more = pairs / (pilot.sensors.size * (pilot.lasers.size if third.device.is_exhaustive else 1))
-    patch_scale = third.tuning.coarsest_scale
-    coarse, known_squares = third.gather(pilot, patch_scale), third.device.exact_squares(pilot)
+
+    def timed(scale: float) -> tuple[Gathered, float]:
+        begun = time.perf_counter()
+        return third.gather(pilot, scale), time.perf_counter() - begun
+
+    patch_scale, known_squares = third.tuning.coarsest_scale, third.device.exact_squares(pilot)
+    coarse, before = timed(patch_scale)
     while True:
         finer = finer_scale(third.tessellator, patch_scale, third.tuning.refinement)
-        begun = time.perf_counter()
-        fine = third.gather(pilot, finer)
-        predicted = (time.perf_counter() - begun) * more * 4
+        fine, seconds = timed(finer)
+        per_patch = max(seconds - before, 0.0) / max(fine.n_patches - coarse.n_patches, 1)
+        both = 1 + 1 / third.tuning.refinement  # resolutions
+        predicted = both * (seconds + per_patch * fine.n_patches * (more - 1))
         error = estimated_error(coarse, fine, known_squares)
-        if error <= target or predicted > time_limit_s / 2:
+        if error <= target or predicted > time_limit_s / 2 or 2 * fine.n_patches > third.tuning.max_patches:
             return finer if error <= target else patch_scale
-        patch_scale, coarse = finer, fine
+        patch_scale, coarse, before = finer, fine, seconds
