@@ -237,12 +237,21 @@ def _has_direction(vector: Sequence[float]) -> bool:
 
 
 _LENGTHS = (MIN_LENGTH, MAX_LENGTH, "m")
+_PICOSECONDS, _RATES = (1e-3, 1e9, "ps"), (1e-9, 1e15, "1/s")
 _NOT_ZERO = {"type": "number", "not": {"const": 0}}
 _XYZ = "3 finite numbers [x, y, z]"
 _TEXT = {"type": "string", "minLength": 1}
 
 Positive = Annotated[float, _number("a number > 0", exclusiveMinimum=0)]
-NonNegative = Annotated[float, _number("a number >= 0", minimum=0)]
+NonNegative = Annotated[float, _number("a number >= 0", (1e-12, 1e6, ""), minimum=0)]
+Wavelength = Annotated[float, _number("a number > 0", (1.0, 1e6, "nm"), exclusiveMinimum=0)]
+SolidAngle = Annotated[float, _number("a number > 0", (1e-15, 4 * math.pi, "sr"), exclusiveMinimum=0)]
+Area = Annotated[float, _number("a number > 0", (1e-15, 1e12, "m^2"), exclusiveMinimum=0)]
+Photons = Annotated[float, _number("a number > 0", (1e-12, 1e6, "photons"), exclusiveMinimum=0)]
+Delay = Annotated[float, _number("a number > 0", _PICOSECONDS, exclusiveMinimum=0)]
+DelayOrZero = Annotated[float, _number("a number >= 0", _PICOSECONDS, minimum=0)]
+Rate = Annotated[float, _number("a number > 0", _RATES, exclusiveMinimum=0)]
+RateOrZero = Annotated[float, _number("a number >= 0", _RATES, minimum=0)]
 Share = Annotated[float, Checked(_share, {"type": "number", "minimum": 0, "maximum": 1})]
 Energy = Annotated[float, _number("a number > 0", (_MIN_JOULES, _MAX_JOULES, "J"), exclusiveMinimum=0)]
 Coordinate = Annotated[

@@ -10,14 +10,22 @@ from typing import Annotated, Any, Literal
 from pydantic import ValidationInfo
 
 from nlosrender.config.fields import (
+    Area,
     Checked,
     Coordinate,
+    Delay,
+    DelayOrZero,
     Flag,
     Length,
     NonNegative,
+    Photons,
     Positive,
+    Rate,
+    RateOrZero,
     Seed,
     Share,
+    SolidAngle,
+    Wavelength,
     as_finite,
     finite_numbers,
     integer,
@@ -30,7 +38,7 @@ from nlosrender.constants import SPEED_OF_LIGHT
 from nlosrender.errors import ConfigError, ValidationIssue
 
 PROFILES = Path(__file__).parent.parent / "sensor" / "profiles"
-MAX_PULSES = 2**53  # of which a float64 counts every one
+MAX_PULSES, MAX_BINS = 10**12, 2**24  # a day at 11 MHz; beyond them they are slips of the pen
 PLANCK = 6.62607015e-34  # J s, exact by definition of the kilogram
 OPL_PER_PS = SPEED_OF_LIGHT * 1e-12
 # Other names of keys: those of y-tal's noise simulation, and times where metres of optical path are the rule.
@@ -88,8 +96,8 @@ def _span(value: object) -> tuple[float, ...]:
 def _decays(value: object) -> tuple[float, ...]:
     items = value if isinstance(value, (list, tuple)) else [value]
     numbers = [as_finite(item) for item in items]
-    if not numbers or not all(number is not None and number > 0 for number in numbers):
-        raise invalid_value(value, "a number > 0, or a list of them")
+    if not numbers or not all(number is not None and 1e-3 <= number <= 1e9 for number in numbers):
+        raise invalid_value(value, "a number from 0.001 to 1e9 ps, or a list of them")
     return tuple(float(number) for number in numbers if number is not None)
 
 
@@ -114,15 +122,15 @@ CurveFile = Annotated[Path, Checked(_file, {"type": "string"}, with_context=True
 ProfileName = Annotated[str, Checked(_profile, {"type": "string"})]
 PulseCount = Annotated[int, integer("an integer >= 1", 1, MAX_PULSES, f"at most {MAX_PULSES:_}")]
 ZoneCount = Annotated[int, integer("an integer >= 1", 1, 4096, "at most 4096")]
-DetectorBins = Annotated[int, integer("an integer >= 1, or null", 1, 2**24, f"at most {2**24:_}")]
+DetectorBins = Annotated[int, integer("an integer >= 1, or null", 1, MAX_BINS, f"at most {MAX_BINS:_}")]
 
 
 class RelativeBrightness(Section):
     """Photons that reach the detector per pulse, over all bins of a histogram: the capture is scaled to it."""
 
-    brightest: Positive | None = None
+    brightest: Photons | None = None
     """of the brightest histogram of the capture"""
-    mean: Positive | None = None
+    mean: Photons | None = None
     """of all histograms of the capture, on average"""
 
     def rule_one_of_them(self) -> Iterator[ValidationIssue]:
@@ -177,28 +185,28 @@ class SensorConfig(Section):
     # --- photons ---
     photons_per_pulse: RelativeBrightness | None = None
     """scale the capture: {brightest: x} or {mean: x}; null: physical, by the four keys below"""
-    wavelength_nm: Positive | None = None
+    wavelength_nm: Wavelength | None = None
     """nm, of the laser: energy of a photon"""
-    aperture_solid_angle: Positive | None = None
+    aperture_solid_angle: SolidAngle | None = None
     """sr, of the detector's aperture seen from the wall"""
-    footprint_area: Positive | None = None
+    footprint_area: Area | None = None
     """m^2 seen as one sensor point, projected along the line of sight; null: its cell of the sensor grid"""
     transmission: Share = 1.0
     """0..1, of filter and optics"""
     photon_detection_ratio: Share = 1.0
     """0..1, detections per photon"""
     # --- response ---
-    laser_jitter_fwhm_ps: NonNegative = 0.0
+    laser_jitter_fwhm_ps: DelayOrZero = 0.0
     """ps, full width at half maximum of the laser pulse, a Gaussian"""
-    jitter_fwhm_ps: NonNegative = 0.0
+    jitter_fwhm_ps: DelayOrZero = 0.0
     """ps, the same of the detector's jitter"""
-    jitter_tail_ps: NonNegative = 0.0
+    jitter_tail_ps: DelayOrZero = 0.0
     """ps, decay constant of the jitter's exponential tail"""
     jitter_tail_share: Share | None = None
     """0..1, share of the detections that are in the tail; default 1 with jitter_tail_ps, else 0"""
     jitter_file: CurveFile | None = None
     """measured curve instead of jitter: .csv (time in ps, counts), .npy, or .hdf5 (counts, timebin_width_ps)"""
-    jitter_file_bin_ps: Positive | None = None
+    jitter_file_bin_ps: Delay | None = None
     """ps, width of the cells of a curve whose file does not say: .npy, or one column of .csv"""
     zero_delay: Annotated[Literal["peak", "mean"], ONE_OF] = "peak"
     """what of the response counts as no delay"""
@@ -216,16 +224,16 @@ class SensorConfig(Section):
     """laser pulses per histogram; or:"""
     exposure_time: Positive | None = None
     """s per histogram; needs repetition_rate"""
-    repetition_rate: Positive | None = None
+    repetition_rate: Rate | None = None
     """1/s, of the laser (or frequency in MHz): later light is counted with the next pulse; null: pulses far apart"""
-    ambient_rate: NonNegative = 0.0
+    ambient_rate: RateOrZero = 0.0
     """1/s, detections of ambient light"""
-    dark_count_rate: NonNegative = 0.0
+    dark_count_rate: RateOrZero = 0.0
     """1/s, detections without light"""
     # --- detection ---
     pile_up: Annotated[Literal["none", "first_photon", "dead_time"], ONE_OF] = "none"
     """none: every photon; first_photon: at most one detection a pulse; dead_time: blind for dead_time_ps after each"""
-    dead_time_ps: Positive | None = None
+    dead_time_ps: Delay | None = None
     """ps, of a free-running detector that light in the meantime does not prolong"""
     afterpulse_probability: Share = 0.0
     """0..1, that a detection is followed by a false one, and that by the next"""

@@ -202,7 +202,7 @@ def few_counts(header: StoredHeader) -> Iterator[str]:
     stated = json_object(header.attributes.get(MEASUREMENT))
     counts, ratio = stated.get("counts_per_histogram"), stated.get("signal_to_background")
     if header.is_measured and isinstance(counts, (int, float)) and counts >= 0:
-        signal = counts * ratio / (1 + ratio) if isinstance(ratio, (int, float)) else counts
+        signal = counts * ratio / (1 + ratio) if isinstance(ratio, (int, float)) and ratio >= 0 else counts
         if signal < LARGE_NOISE * math.sqrt(counts) or not counts:
             yield (
                 f"{header.path}: holds {signal:.3g} counts of light per histogram among {counts:.3g}: shot noise is "

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.random import Generator
 from scipy.signal import fftconvolve
 
-from nlosrender.config.sensor import OPL_PER_PS, PLANCK, SensorConfig
+from nlosrender.config.sensor import MAX_BINS, OPL_PER_PS, PLANCK, SensorConfig
 from nlosrender.constants import SPEED_OF_LIGHT
 from nlosrender.errors import ConfigError
 from nlosrender.sensor.curve_file import KEY, read_curve
@@ -25,6 +25,7 @@ from nlosrender.sensor.detection import (
 from nlosrender.sensor.rebinning import Float32, Rebinning, TimeBins
 from nlosrender.sensor.response import FWHM_OF_SIGMA, Response, measured_response, parametric_response
 
+MOST_COUNTS = 1e18  # of a bin: numpy draws integers of 64 bits
 LONGEST_AFTERPULSES = 40  # decay constants after which none are followed: exp(-40)
 LEAST_CASCADE = 1e-9  # of a detection: afterpulses of afterpulses below it are not followed
 AFTERPULSE_CELLS = 2**22  # at most, of their distribution
@@ -98,6 +99,12 @@ class Detector:
         totals.signal = float(r.sum()) * self.config.n_pulses
         totals.background = float(self.background.sum()) * self.config.n_pulses * light.shape[1]
         r += self.background[:, None]
+        most = float(r.max(initial=0.0))
+        if not most * self.config.n_pulses < MOST_COUNTS:
+            message = (
+                f"makes {most:.3g} detections per pulse and bin in {self.config.n_pulses} pulses; need less light."
+            )
+            raise ConfigError.at("sensor.photons_per_pulse", message)
         return r, totals
 
     def measure(self, light: Float32, random: Generator | None) -> tuple[Float64, Totals]:
@@ -201,6 +208,10 @@ def detector_of(config: SensorConfig, source: TimeBins) -> Detector:
             max(math.ceil(extent / width - 1e-6), 1) if extent < period else max(math.floor(period / width + 1e-6), 1)
         )
     bins = TimeBins(start, width, count)
+    if count > MAX_BINS:
+        raise ConfigError.at(
+            "sensor.bin_width_opl", f"got {width:.3g} m, which makes {count} bins; need at most {MAX_BINS}."
+        )
     if bins.count * width > period * (1 + 1e-9):
         most = f"at most {math.floor(period / width)}: repetition_rate has a period of {period:.6g} m"
         raise ConfigError.at("sensor.n_bins", f"got {count} bins of {width:.6g} m, need {most}.")

@@ -58,10 +58,11 @@ class StoredCapture:
             They are damaged.
         """
         with explained_read(self.path):
-            if dataset_in(self._file, self.path, layout.COUNTS) is None:
+            dataset = dataset_in(self._file, self.path, layout.COUNTS)
+            stated = {} if dataset is None else get_attributes(dataset)
+            if stated.get("unit") != layout.COUNTS_UNIT:  # another program's may be anything
                 return None
             samples = samples_of(self._file, self.path, layout.COUNTS)
-            stated = get_attributes(samples)
             beside = StoredCapture(self._file, self.path)
             beside._samples = layout.COUNTS
             beside.header = replace(
