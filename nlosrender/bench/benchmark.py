@@ -12,6 +12,7 @@ from typing import Any
 
 from nlosrender.bench.counting import counting_rates
 from nlosrender.bench.curve import Curve
+from nlosrender.bench.factory import factory_rates
 from nlosrender.bench.peer import UNBIASED_NAME, Peer, PeerContender, matched, peer_contenders
 from nlosrender.bench.race import FIXED_POINT, Contender, own_contenders, race
 from nlosrender.bench.rates import gather_rate, whole_process
@@ -22,7 +23,7 @@ from nlosrender.bench.scenes import BenchScene
 from nlosrender.bench.skips import measure_skips
 from nlosrender.files.provenance import package_versions
 
-PARTS = ("curves", "scaling", "rates", "skips", "process", "measure")
+PARTS = ("curves", "scaling", "rates", "skips", "process", "measure", "factory")
 SHARES = {
     "curves": 0.72,
     "scaling": 0.16,
@@ -30,7 +31,9 @@ SHARES = {
     "skips": 0.03,
     "process": 0.03,
     "measure": 0.01,
+    "factory": 1.0,  # minutes for the large grids, so only when it is asked for
 }  # of the time
+DEFAULT_PARTS = PARTS[:-1]
 REFERENCE_SHARE = 0.4  # of a scene's time
 
 Report = dict[str, Any]  # plain values, ready for JSON; None: not known, or never reached
@@ -40,7 +43,7 @@ Progress = Callable[[str], None]  # called with what is being measured
 def run_benchmark(
     scenes: Sequence[BenchScene],
     seconds: float,
-    parts: Iterable[str] = PARTS,
+    parts: Iterable[str] = DEFAULT_PARTS,
     peer_command: str | None = None,
     progress: Progress = lambda what: None,
 ) -> Report:
@@ -79,7 +82,7 @@ def run_benchmark(
         "versions": package_versions(),
     }
     report: Report = {"facts": facts, "scenes": [], "scaling": [], "rates": [], "skips": [], "process": None}
-    report["measure"] = []
+    report |= {"measure": [], "factory": []}
     with ExitStack() as stack:
         peer = stack.enter_context(Peer(peer_command)) if peer_command is not None else None
         facts["peer"] = peer.title if peer is not None else None
@@ -104,6 +107,9 @@ def run_benchmark(
         if "measure" in wanted:
             progress("counting photons")
             report["measure"] = counting_rates()
+        if "factory" in wanted:
+            progress("captures an hour of a data set")
+            report["factory"] = factory_rates(share["factory"])
     report["facts"] |= {"seconds": timer.read()[0], "load_average_at_end": os.getloadavg()}
     return report
 

@@ -19,8 +19,8 @@ def bench(
         list[str] | None,
         typer.Option(
             metavar="PART",
-            help="curves, scaling, rates, skips, process or measure; may be repeated.",
-            show_default="all",
+            help="curves, scaling, rates, skips, process, measure or factory; may be repeated.",
+            show_default="all but factory",
         ),
     ] = None,
     seconds: Annotated[float, typer.Option(min=1.0, help="Time for all of it, compilation on top.")] = 300.0,
@@ -44,7 +44,7 @@ def bench(
     out/bench.json and out/bench.png)
     """
     from nlosrender.bench.bench_report import table, write_json, write_plot
-    from nlosrender.bench.benchmark import PARTS, run_benchmark
+    from nlosrender.bench.benchmark import DEFAULT_PARTS, PARTS, run_benchmark
     from nlosrender.bench.scenes import built_in_scenes
     from nlosrender.engine.backend.start import start_backend
 
@@ -54,7 +54,7 @@ def bench(
     # a real mesh tells more than the letters, which stand in for one
     names = scene or [name for name in known if mesh is None or name != "letters"]
     scenes = [known[one_of(name, known, "--scene", _remark(name))] for name in names]
-    parts = [one_of(name, PARTS, "--part") for name in part or PARTS]
+    parts = [one_of(name, PARTS, "--part") for name in part or DEFAULT_PARTS]
     json_path, png_path = _outputs(output)
     start_backend()
     report = run_benchmark(scenes, seconds, parts, peer, lambda what: typer.echo(what, err=True))

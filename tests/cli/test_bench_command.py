@@ -12,6 +12,7 @@ from typer.testing import CliRunner
 
 from nlosrender.bench import references, skips
 from nlosrender.bench.curve import Curve, Point, power_law
+from nlosrender.bench.factory import CELLS, crumpled_ball
 from nlosrender.bench.peer import PeerContender, matched
 from nlosrender.bench.race import race
 from nlosrender.bench.rates import gather_rate
@@ -189,3 +190,16 @@ def test_a_short_benchmark_leaves_its_files(tmp_path):
     assert set(curves) == {"auto", "path", "path, BSDF sampling"}
     # unbiased within a wide margin: 64 paths for each of 4096 sensor points
     assert all(abs(found["energy_bias"]) < 0.05 for found in curves.values())
+
+
+def test_balls_of_a_data_set_are_new_and_closed():
+    """Each mesh is another one, its outside is its front, and its longest triangles do not tear it."""
+    volumes = []
+    for number in range(3):
+        vertices, faces = crumpled_ball(number)
+        a, b, c = (vertices[faces[:, corner]] for corner in range(3))
+        volumes.append(np.einsum("ij,ij->i", a, np.cross(b, c)).sum() / 6)
+        assert len(faces) == 2 * CELLS**2
+        assert np.isfinite(vertices).all()
+    assert min(volumes) > 1
+    assert len(set(volumes)) == 3
