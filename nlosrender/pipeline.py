@@ -23,7 +23,6 @@ from nlosrender.files.atomic_write import check_writable
 from nlosrender.files.capture_results import MISSED
 from nlosrender.files.file_kinds import CAPTURE
 from nlosrender.files.identity import capture_identity, files_read, identity_attributes
-from nlosrender.files.measured import add_counts
 from nlosrender.files.partial.partial_capture import PartialCapture
 from nlosrender.files.parts.shards import part_attributes
 from nlosrender.files.provenance import provenance_attributes
@@ -137,6 +136,8 @@ def render_capture(
             # --- ideal histograms -> what a detector counts of them ---
             counted: dict[str, object] = {}
             if config.sensor is not None and selection == WHOLE:  # parts are measured once they are merged
+                from nlosrender.files.measured import add_counts  # SciPy takes time to import
+
                 with stopwatch.stage("measure"):
                     counted |= partial.extend(
                         functools.partial(add_counts, config=config.sensor, warn=lambda text: warnings.emit([text]))

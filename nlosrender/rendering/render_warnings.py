@@ -14,8 +14,6 @@ from nlosrender.engine.backend.start import Backend
 from nlosrender.files.capture_header import CaptureHeader
 from nlosrender.files.size_estimate import FileSize, disk_warnings, forecast_size
 from nlosrender.rendering.process_layout import ONE_PROCESS, ProcessLayout
-from nlosrender.sensor.detector import detector_of, detector_warnings
-from nlosrender.sensor.rebinning import TimeBins
 
 if TYPE_CHECKING:
     from nlosrender.engine.interface import Engine
@@ -41,6 +39,9 @@ def render_warnings(
 
     yield from scene_warnings(engine)
     if config.sensor is not None:
+        from nlosrender.sensor.detector import detector_of, detector_warnings
+        from nlosrender.sensor.rebinning import TimeBins
+
         bins = TimeBins(header.start_opl, header.bin_width_opl, header.n_bins)
         yield from detector_warnings(detector_of(config.sensor, bins))
     yield from memory_warnings(engine, plan, processes.memory_limit(config.render.memory_limit_bytes), backend.lanes)

@@ -9,7 +9,6 @@ from functools import cached_property
 
 import numpy as np
 from numpy.random import Generator
-from scipy.signal import fftconvolve
 
 from nlosrender.config.sensor import MAX_BINS, OPL_PER_PS, PLANCK, SensorConfig
 from nlosrender.constants import SPEED_OF_LIGHT
@@ -23,7 +22,7 @@ from nlosrender.sensor.detection import (
     first_photon_mean,
 )
 from nlosrender.sensor.rebinning import Float32, Rebinning, TimeBins
-from nlosrender.sensor.response import FWHM_OF_SIGMA, Response, measured_response, parametric_response
+from nlosrender.sensor.response import FWHM_OF_SIGMA, Response, convolved, measured_response, parametric_response
 
 MOST_COUNTS = 1e18  # of a bin: numpy draws integers of 64 bits
 LONGEST_AFTERPULSES = 40  # decay constants after which none are followed: exp(-40)
@@ -129,7 +128,7 @@ class Detector:
         totals.brightest = float(per_pulse.max(initial=0.0))
         totals.expected = totals.detected
         if config.afterpulse_probability:
-            followed = np.maximum(fftconvolve(counts, self._afterpulses[:, None], axes=0), 0.0)
+            followed = np.maximum(convolved(counts, self._afterpulses), 0.0)
             followed = followed[self.bins.count - 1 : 2 * self.bins.count - 1]
             totals.expected += float(followed.sum())
             counts = counts + (random.poisson(followed) if random else followed)

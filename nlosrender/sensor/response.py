@@ -16,7 +16,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import fftconvolve
 from scipy.special import erfcx, ndtr, ndtri
 
 Float64 = NDArray[np.float64]
@@ -147,8 +146,16 @@ def measured_response(light: Float64, cell: float, sigma: float = 0.0, zero_dela
     reach = math.ceil(-float(ndtri(CUT)) * sigma / cell)
     if sigma:
         edges = (np.arange(2 * reach + 2) - reach - 0.5) * cell
-        shares = np.maximum(fftconvolve(shares, np.diff(ndtr(edges / sigma))), 0.0)
+        shares = np.maximum(convolved(shares, np.diff(ndtr(edges / sigma))), 0.0)
     return _normalised(shares, cell, -reach * cell, zero_delay)
+
+
+def convolved(values: Float64, kernel: Float64) -> Float64:
+    """Return the convolution of values (n, ...) along their first axis with a kernel (m,), (n + m - 1, ...)."""
+    length = len(values) + len(kernel) - 1
+    size = 2 ** math.ceil(math.log2(length))
+    spectrum = np.fft.rfft(kernel, size).reshape(-1, *[1] * (values.ndim - 1))
+    return np.fft.irfft(spectrum * np.fft.rfft(values, size, axis=0), size, axis=0)[:length]
 
 
 def _normalised(shares: Float64, cell: float, start: float, zero_delay: str) -> Response:

@@ -25,7 +25,6 @@ from nlosrender.files.capture_results import UNKNOWN_FROM, UNSAMPLED, ZERO, Capt
 from nlosrender.files.file_kinds import CAPTURE, FileKind, same_capture
 from nlosrender.files.hdf5_writer import HDF5Writer
 from nlosrender.files.identity import SELECTION
-from nlosrender.files.measured import add_counts
 from nlosrender.files.partial.work_item_log import CHECKSUM_RANGE, placed_checksum
 from nlosrender.files.parts.shards import CHECKSUMS, NOTE, PART, SUMS, Shard, read_shards
 from nlosrender.files.reading.reader import explained_read, open_hdf5
@@ -85,6 +84,8 @@ def merge_captures(
                     writer.file.attrs.pop(name, None)
                 set_attributes(writer.file, _attributes(shards, summed, output))
             if json_object(shards[0].header.attributes.get("config")).get("sensor"):
+                from nlosrender.files.measured import add_counts  # SciPy takes time to import
+
                 with explained_write(output):
                     counted = add_counts(writer, output, warn=warn)
                     with writer.writing():
