@@ -137,7 +137,7 @@ output:
 
 # What a detector counts of it, in a dataset counts beside the ideal data; docs/measured.md.
 # sensor:
-#   profile: spad-532            # one of `nlosrender measure --list`, or a YAML file; keys beside it win; default null
+#   profile: spad-532            # one of `nlosrender measure --list`, or a YAML file; keys below win; default null
 #   photons_per_pulse: {{mean: 0.05}}  # or {{brightest: x}}: photons per histogram; null: physical, by the next four
 #   wavelength_nm: null          # nm, > 0
 #   aperture_solid_angle: null   # sr, > 0
@@ -157,7 +157,7 @@ output:
 #   gate: null                   # [from, to] m of optical path; null: always on
 #   pulses: null                 # integer >= 1, per histogram; or:
 #   exposure_time: 1.0           # s per histogram
-#   repetition_rate: null        # 1/s, or frequency in MHz; null: pulses far apart
+#   repetition_rate: 1.1e+7      # 1/s, or frequency in MHz; null: pulses far apart; default null
 #   ambient_rate: 0              # 1/s; default 0
 #   dark_count_rate: 0           # 1/s; default 0
 #   pile_up: none                # none | first_photon | dead_time; default none

@@ -15,6 +15,7 @@ from support.rendering import flat_wall
 
 from nlosrender.capture.part import Selection
 from nlosrender.config.load import load_config, parse_config
+from nlosrender.config.template import starter_config
 from nlosrender.errors import EXIT_BAD_INPUT, EXIT_USAGE, ConfigError, InterruptedRender
 from nlosrender.files.parts.merge import merge_captures
 from nlosrender.pipeline import render_capture
@@ -56,6 +57,16 @@ def test_profiles_are_listed_and_load() -> None:
         assert f"{name}:\n" in listed
         text = f"sensor: {{profile: {name}, pulses: 10, photons_per_pulse: {{mean: 1}}}}"
         assert sensor_of(text).profile == name
+
+
+def test_the_starter_has_a_sensor() -> None:
+    """Without its comment signs it is one."""
+    lines = starter_config("confocal").splitlines()
+    start = lines.index("# sensor:")
+    end = lines.index("", start)
+    assert "sensor:" in lines[start]
+    text = "\n".join([*lines[:start], *(line.removeprefix("# ") for line in lines[start:end]), *lines[end:]])
+    assert parse_config(text, "starter.yaml", Path.cwd()).sensor.n_pulses == 11_000_000
 
 
 def sensor_of(text: str, folder: Path = Path.cwd()) -> object:  # noqa: B008
