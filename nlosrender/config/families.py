@@ -165,8 +165,10 @@ def _issues(item: dict[str, Any], path: KeyPath) -> Iterator[ValidationIssue]:
         )
 
 
-def _taken(item: dict[str, Any]) -> tuple[int, bool, float | None]:
-    """Take the keys of a family out of a raw item."""
+def _taken(item: Any) -> tuple[int, bool, float | None]:
+    """Take the keys of a family out of a raw item; one that is no mapping, a mistake, has none."""
+    if not isinstance(item, dict):
+        return 1, False, None
     count, no_overlap, floor = (
         item.pop(key, default) for key, default in zip(FAMILY_KEYS, (1, False, None), strict=True)
     )

@@ -152,7 +152,8 @@ def sweep_of(document: Document, measure: Measure | None = None) -> Sweep | None
     if document.tree.get(_SWEEP) is None:
         return None
     section, found = validated(SweepConfig, document.tree[_SWEEP], document, (_SWEEP,))
-    dataset, mistakes = validated(DatasetConfig, document.tree.get(_DATASET) or {}, document, (_DATASET,))
+    given = document.tree.get(_DATASET)
+    dataset, mistakes = validated(DatasetConfig, {} if given is None else given, document, (_DATASET,))
     if found or mistakes or any(path[0] in (_SWEEP, _DATASET) for path in document.unread):
         raise ConfigError(in_order([*found, *mistakes], document))
     _check_overrides(section, document)

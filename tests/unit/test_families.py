@@ -217,6 +217,10 @@ def test_no_place_without_overlap(monkeypatch: pytest.MonkeyPatch) -> None:
             "{scene.hidden_geometry.0: {choice: [{type: room, size: [3, 3, {uniform: [1, 2]}], on_floor: 0}]}}",
             "not for room",
         ),
+        (
+            "{scene.hidden_geometry.0: {choice: [3, {type: box, size: {uniform: [1, 2]}, count: 2}]}}",
+            "got 3, need a mapping",
+        ),
         ("{scene.hidden_geometry.0.on_floor: {choice: [low]}}", "on_floor: got 'low' \\(text\\), need a height"),
     ],
 )

@@ -112,6 +112,8 @@ def test_no_part_of_a_capture(tmp_path: Path) -> None:
         ("{split: {train: 2}}", r"dataset\.split\.train: got 2, need a share from 0 to 1"),
         ("{split: {by: files}}", r"dataset\.split\.by: got 'files' .* Did you mean file\?"),
         ("{split: {by: file}}", r"dataset\.split\.by: got file, but no file is drawn"),
+        (".nan", r"dataset: got \.nan, need a finite number"),
+        ("[]", r"dataset: got \[\], need a mapping of keys and values"),
         ("{label: color}", r"dataset\.label: got color, need one of the swept keys: render\.seed"),
         ("{dtype: float16}", r"dataset\.dtype: got float16, need float32 in format znlos"),
         ("{format: lfe, crop: true}", r"dataset\.crop: got true, need false in format lfe"),
