@@ -32,6 +32,8 @@ class Budget:
     target_error: float | None = None
     time_limit_s: float | None = None
     patch_scale: float | None = None  # of the virtual lights: size of patches over that at the coarsest resolution
+    # of the virtual lights: the difference of their two resolutions over the error of the finer one; None: a bound
+    difference_divisor: float | None = None
     rounds: int | None = None  # of the virtual lights: rounds of VPL subpaths
 
     @property

@@ -43,10 +43,12 @@ def calibrated_lights(
     few = _pilot_of_patches(third, pilot)
     gather = cache(lambda scale: third.gather(few, scale))  # a smaller share goes on from these
     known_squares = device.exact_squares(few)
-    patch_scale, gathered, of_third = refined_to(share * target, third.tessellator, gather, known_squares)
+    refined = refined_to(share * target, third.tessellator, gather, known_squares)
+    budget = replace(budget, patch_scale=refined.patch_scale, difference_divisor=refined.divisor)
     if further is None:
-        return replace(budget, patch_scale=patch_scale), (of_third / target) ** 2
-    goal, squares = tuning.rest_share_of_many * target, gathered.squares * (pilot.sensors.size / few.sensors.size)
+        return budget, (refined.error / target) ** 2
+    gathered, more = refined.gathered, pilot.sensors.size / few.sensors.size
+    goal, squares = tuning.rest_share_of_many * target, gathered.squares * more
     squares += device.exact_squares(pilot)
     histogram = further.histogram(pilot, further.pilot_replicas(pilot.sensors.size))
     done, error = 0, math.inf
@@ -61,12 +63,13 @@ def calibrated_lights(
     finer = further.share_of_third(gathered.n_patches, share, share_squares, error * math.sqrt(done) / target)
     if finer < share:
         share = finer
-        patch_scale, _, of_third = refined_to(share * target, third.tessellator, gather, known_squares)
+        refined = refined_to(share * target, third.tessellator, gather, known_squares)
+        budget = replace(budget, patch_scale=refined.patch_scale, difference_divisor=refined.divisor)
     # patches come in steps: what they leave of their share is spent on rounds
-    third_squares = min(share, of_third / target) ** 2
+    third_squares = min(share, refined.error / target) ** 2
     rounds = further.rounds_needed(error, done, math.sqrt(share_squares - third_squares) * target)
     used = third_squares + (error / target) ** 2 * done / rounds
-    return replace(budget, patch_scale=patch_scale, rounds=rounds), min(used, share_squares)
+    return replace(budget, rounds=rounds), min(used, share_squares)
 
 
 def _pilot_of_patches(third: ThirdBounce, pilot: Pilot) -> Pilot:

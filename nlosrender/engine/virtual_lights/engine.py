@@ -192,7 +192,7 @@ class VirtualLightEngine:
         factor = self.device.scale
         third, deviation = fine.values, coarse.values  # large: worked on in place
         np.subtract(third, deviation, out=deviation)
-        deviation *= factor / difference_divisor(coarse, fine)
+        deviation *= factor / (budget.difference_divisor or difference_divisor(coarse, fine))
         third *= factor
         grid, sensors = self.capture.sensor_grid, self.device.sensor_indices(batch)
         for number, slot in enumerate(self._slots(third.shape[1])):

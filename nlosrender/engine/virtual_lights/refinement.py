@@ -1,6 +1,6 @@
-"""Refinement of the third bounce: two resolutions, the error that their difference states, and how fine is enough.
+"""Refinement of the third bounce: how fine is enough, and the error that the difference of two resolutions states.
 
-Richardson extrapolation, docs/virtual-lights.md, 6.
+A render has two resolutions, its pilot a third, finer one: docs/virtual-lights.md, 6.
 """
 
 from __future__ import annotations
@@ -33,6 +33,16 @@ class Gathered:
         return _squares(self.values)
 
 
+@dataclass(frozen=True, eq=False)
+class Refined:
+    """A resolution that is fine enough."""
+
+    patch_scale: float
+    gathered: Gathered
+    error: float  # relative L2, as estimated
+    divisor: float | None  # turns the difference from the coarser resolution into it; None: ``difference_divisor``
+
+
 def estimated_error(coarse: Gathered, fine: Gathered, known_squares: float = 0.0) -> float:
     """Return the relative L2 error of the finer resolution, with ``known_squares`` of other bounces beside it."""
     noise = _squares(fine.values - coarse.values) / difference_divisor(coarse, fine) ** 2
@@ -63,11 +73,8 @@ def finer_scale(tessellator: Tessellator, patch_scale: float, factor: float) -> 
 
 
 def coarser_scale(tessellator: Tessellator, patch_scale: float) -> float:
-    """Return the patch scale that ``patch_scale`` is compared with: a third of the patches, or the coarsest there is.
-
-    Beyond the coarsest the law of the error's decrease does not hold.
-    """
-    refinement, coarsest = tessellator.tuning.refinement, tessellator.tuning.coarsest_scale
+    """Return the patch scale that is compared with: a third of the patches, or the coarsest there is."""
+    refinement, coarsest = tessellator.tuning.refinement, tessellator.tuning.coarsest_compared
     counts, coarser = tessellator.counts(patch_scale), patch_scale * math.sqrt(refinement)
     while coarser < coarsest and any(
         less > count / refinement for less, count in zip(tessellator.counts(coarser), counts, strict=True)
@@ -78,8 +85,8 @@ def coarser_scale(tessellator: Tessellator, patch_scale: float) -> float:
 
 def refined_to(
     target: float, tessellator: Tessellator, gather: Callable[[float], Gathered], known_squares: float
-) -> tuple[float, Gathered, float]:
-    """Return the patch scale whose estimated error is at most ``target``, the third bounce at it, and that error.
+) -> Refined:
+    """Return the resolution whose estimated error is at most ``target``.
 
     Ends earlier where refining is in vain: float32 path lengths and grazing contacts leave an error that no refinement
     takes away, and ``max_patches`` bounds the number of patches.
@@ -95,19 +102,23 @@ def refined_to(
     """
     tuning = tessellator.tuning
     levels: list[tuple[int, float]] = []  # numbers of patches and their errors, coarse to fine
-    patch_scale = finer_scale(tessellator, tuning.coarsest_scale, tuning.refinement)
+    patch_scale = finer_scale(tessellator, tuning.coarsest_compared, tuning.refinement)
+    patch_scale = min(patch_scale, tuning.coarsest_scale)
     while True:
-        # with the coarser one that the render itself will have
-        coarse, fine = gather(coarser_scale(tessellator, patch_scale)), gather(patch_scale)
-        error = estimated_error(coarse, fine, known_squares)
+        fine, finer = gather(patch_scale), finer_scale(tessellator, patch_scale, tuning.refinement)
+        coarse = gather(coarser_scale(tessellator, patch_scale))  # the one that the render itself will have
+        if tessellator.count(finer) > tuning.max_patches:
+            return Refined(patch_scale, fine, estimated_error(coarse, fine, known_squares), None)
+        noise = tuning.difference_margin**2 * _squares(gather(finer).values - fine.values)
+        error = relative_l2_error(noise, fine.squares + noise + known_squares)
         earlier = next(
             (error for count, error in reversed(levels) if count <= fine.n_patches / tuning.stagnation_ratio), math.inf
         )
         is_stuck = tuning.stagnation * earlier < error
         is_beyond = fine.n_patches * error / target > tuning.max_patches
-        in_vain = error < tuning.max_regular_error and (is_stuck or is_beyond)
-        if error <= target or in_vain or 2 * fine.n_patches > tuning.max_patches:
-            return patch_scale, fine, error
+        if error <= target or (error < tuning.max_regular_error and (is_stuck or is_beyond)):
+            divisor = math.sqrt(_squares(fine.values - coarse.values) / noise) if noise > 0 else None
+            return Refined(patch_scale, fine, error, divisor)
         more = (tuning.refinement_margin * error / target) ** (1 / _order(levels, fine.n_patches, error, tuning.orders))
         levels.append((fine.n_patches, error))
         patch_scale = finer_scale(tessellator, patch_scale, min(max(more, tuning.min_refinement), tuning.refinement))
