@@ -23,6 +23,7 @@ from nlosrender.config.unused_keys import without_unused_keys
 from nlosrender.config.yaml_tree import MAX_BYTES, Document, read_document
 from nlosrender.errors import ConfigError, KeyPath, ValidationIssue
 
+LEFT_OUT = (("sensor",), ("output", "ground_truth"), ("output", "ground_truth_grid"))  # of the canonical JSON, if empty
 MAX_ISSUES = 100  # told at once; nobody reads more
 SectionT = TypeVar("SectionT", bound=Section)
 
@@ -186,10 +187,17 @@ def _reading_order(issue: ValidationIssue) -> tuple[int, int]:
 
 
 def config_to_dict(config: Config) -> dict[str, Any]:
-    """Return the config with every default filled in and file names absolute, as plain JSON values."""
+    """Return the config with every default filled in and file names absolute, as plain JSON values.
+
+    Sections and keys of ``LEFT_OUT`` are there only where they are set: earlier captures keep their hash.
+    """
     dumped: dict[str, Any] = json.loads(json.dumps(config.model_dump(mode="json"), allow_nan=False))
-    if dumped["sensor"] is None:  # files of captures without one keep their hash
-        del dumped["sensor"]
+    for *sections, key in LEFT_OUT:
+        place = dumped
+        for section in sections:
+            place = place[section]
+        if not place[key]:
+            del place[key]
     return dumped
 
 

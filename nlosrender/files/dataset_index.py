@@ -143,7 +143,7 @@ def write_table(path: Path, captures: Sequence[Mapping[str, Any]], shards: Mappi
         row["energy"] = sum(capture["energy"].values()) if capture["energy"] else None
         row |= {f"sha256 {key}": file["sha256"] for key, file in capture["files"].items()}
         rows.append(row | {key: _cell(capture["values"].get(key)) for key in keys})
-    columns = list(dict.fromkeys(name for row in rows for name in row))
+    columns = list(dict.fromkeys([*plain, "shard", "energy", *(name for row in rows for name in row)]))
     with replacing(path, TABLES[path.suffix]) as partial:
         if path.suffix == ".csv":
             with partial.open("w", encoding="utf-8", newline="") as file:

@@ -7,6 +7,8 @@ import fcntl
 import os
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import h5py
 import numpy as np
@@ -21,9 +23,10 @@ from nlosrender.analysis.reconstruction.volume_file import write_volume
 from nlosrender.bench.bench_report import write_json
 from nlosrender.bench.generated_meshes import write_ply
 from nlosrender.capture.part import Selection
+from nlosrender.config.dataset_section import DatasetConfig
 from nlosrender.errors import EXIT_FAILURE, DiskError, FileError
 from nlosrender.files.atomic_write import partial_folder, replacing
-from nlosrender.files.dataset_index import write_index
+from nlosrender.files.dataset_index import write_index, write_table
 from nlosrender.files.export.export import export_capture
 from nlosrender.files.file_kinds import CAPTURE, PLY
 from nlosrender.files.partial.partial_capture import PartialCapture
@@ -49,6 +52,8 @@ def view(tmp_path: Path) -> Path:
     return write_points(tmp_path / "in/view.hdf5", header, [(0, 0, 0.8)])
 
 
+SWEEP: Any = SimpleNamespace(source="a.yaml", keys=("render.seed",), dataset=DatasetConfig())
+BESIDE = {"index.json": ["index.csv"]}  # written with it
 WRITERS: dict[str, Callable[[Path, Path, Path], object]] = {
     "plot.png": lambda out, wall, view: plot_capture(wall, out),
     "plot.svg": lambda out, wall, view: plot_capture(wall, out),
@@ -56,7 +61,8 @@ WRITERS: dict[str, Callable[[Path, Path, Path], object]] = {
     "tal.hdf5": lambda out, wall, view: export_capture(wall, out, "tal"),
     "fk.mat": lambda out, wall, view: export_capture(wall, out, "fk"),
     "view.gif": lambda out, wall, view: write_frames(view, out, FrameOptions("gif")),
-    "index.json": lambda out, wall, view: write_index(out, "a.yaml", ["render.seed"], []),
+    "index.json": lambda out, wall, view: write_index(out, SWEEP, []),
+    "index.csv": lambda out, wall, view: write_table(out, []),
     "bench.json": lambda out, wall, view: write_json(out, {"facts": {}, "scenes": []}),
     "mesh.ply": lambda out, wall, view: write_ply(out, np.zeros((3, 3)), np.array([[0, 1, 2]])),
 }
@@ -79,7 +85,7 @@ def test_only_files_of_its_kind_are_replaced(name: str, tmp_path: Path, capture:
     for _ in range(2):
         WRITERS[name](out, capture, view)
         assert out.stat().st_size > 0
-    assert sorted(path.name for path in tmp_path.iterdir()) == sorted(["in", name])
+    assert sorted(path.name for path in tmp_path.iterdir()) == sorted(["in", name, *BESIDE.get(name, [])])
 
 
 def test_frames_replace_frames_alone(tmp_path: Path, view: Path) -> None:
