@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 
@@ -33,12 +33,12 @@ def reader_of(kind: str) -> Callable[[bytes], FileMesh]:
     return read
 
 
-def _materials(parts: list[object]) -> tuple[str, ...]:
+def _materials(parts: Sequence[object]) -> tuple[str, ...]:
     named = (getattr(getattr(part, "visual", None), "material", None) for part in parts)
     return tuple(dict.fromkeys(str(getattr(material, "name", None) or "unnamed") for material in named if material))
 
 
-def _dropped(parts: list[object]) -> Iterator[str]:
+def _dropped(parts: Sequence[object]) -> Iterator[str]:
     visuals = [visual for part in parts if (visual := getattr(part, "visual", None)) is not None]
     if any(getattr(visual, "uv", None) is not None for visual in visuals):
         yield "texture coordinates"
