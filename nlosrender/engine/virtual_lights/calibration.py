@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from nlosrender.engine.interface import Budget
-from nlosrender.engine.launch.pilot_points import Pilot, pilot_of
+from nlosrender.engine.launch.pilot_points import SENSORS_PER_AXIS, Pilot, pilot_of
 from nlosrender.engine.launch.schedule import DEFAULT_TARGET
 from nlosrender.engine.virtual_lights.refinement import Gathered, estimated_error, finer_scale, refined_to
 
@@ -63,7 +63,7 @@ def calibrated_lights(
     finer = further.share_of_third(gathered.n_patches, share, share_squares, error * math.sqrt(done) / target)
     if finer < share:
         share = finer
-        refined = refined_to(share * target, third.tessellator, gather, known_squares)
+        refined = refined_to(share * target, third.tessellator, gather, known_squares, refined.patch_scale)
         budget = replace(budget, patch_scale=refined.patch_scale, difference_divisor=refined.divisor)
     # patches come in steps: what they leave of their share is spent on rounds
     third_squares = min(share, refined.error / target) ** 2
@@ -75,14 +75,18 @@ def calibrated_lights(
 def _pilot_of_patches(third: ThirdBounce, pilot: Pilot) -> Pilot:
     """Return the pilot that patches are tried on: few points, unless some surface is nearer than they are apart.
 
-    Only some of the points see such a surface close up, or what lies behind it.
+    Only some of the points see such a surface close up, or what lies behind it. Then it has up to one in 16 points of
+    the capture: three resolutions of more cost as much as the render.
     """
     built, tessellator = third.device.built, third.tessellator
     nearest = tessellator.nearest
     if built.wall.is_planar and built.hidden_bounds is not None:  # what faces away from it, too
         nearest = built.hidden_bounds[0][2] / built.metres_per_engine_unit
     is_far = nearest > 2 * tessellator.reach / third.tuning.patch_pilot_sensors
-    return pilot_of(third.device.capture, third.tuning.patch_pilot_sensors) if is_far else pilot
+    few, grid = third.tuning.patch_pilot_sensors, third.device.capture.sensor_grid
+    if not is_far and max(grid.nx, grid.ny) >= 4 * SENSORS_PER_AXIS:
+        return pilot
+    return pilot_of(third.device.capture, few if is_far else max(few, -(-max(grid.nx, grid.ny) // 4)))
 
 
 def _patch_scale_in_time(third: ThirdBounce, time_limit_s: float, target: float) -> float:

@@ -84,7 +84,11 @@ def coarser_scale(tessellator: Tessellator, patch_scale: float) -> float:
 
 
 def refined_to(
-    target: float, tessellator: Tessellator, gather: Callable[[float], Gathered], known_squares: float
+    target: float,
+    tessellator: Tessellator,
+    gather: Callable[[float], Gathered],
+    known_squares: float,
+    start: float | None = None,
 ) -> Refined:
     """Return the resolution whose estimated error is at most ``target``.
 
@@ -99,15 +103,17 @@ def refined_to(
         Count the patches of a scale, and gather them on a few points of the capture; asked again for the same scale.
     known_squares
         Sum of the squares of exact light at these points [(engine unit)^-4].
+    start
+        Patch scale to begin with; None: the coarsest.
     """
     tuning = tessellator.tuning
     levels: list[tuple[int, float]] = []  # numbers of patches and their errors, coarse to fine
-    patch_scale = finer_scale(tessellator, tuning.coarsest_compared, tuning.refinement)
-    patch_scale = min(patch_scale, tuning.coarsest_scale)
+    coarsest = min(finer_scale(tessellator, tuning.coarsest_compared, tuning.refinement), tuning.coarsest_scale)
+    patch_scale = start or coarsest
     while True:
         fine, finer = gather(patch_scale), finer_scale(tessellator, patch_scale, tuning.refinement)
-        coarse = gather(coarser_scale(tessellator, patch_scale))  # the one that the render itself will have
         if tessellator.count(finer) > tuning.max_patches:
+            coarse = gather(coarser_scale(tessellator, patch_scale))
             return Refined(patch_scale, fine, estimated_error(coarse, fine, known_squares), None)
         noise = tuning.difference_margin**2 * _squares(gather(finer).values - fine.values)
         error = relative_l2_error(noise, fine.squares + noise + known_squares)
@@ -117,6 +123,7 @@ def refined_to(
         is_stuck = tuning.stagnation * earlier < error
         is_beyond = fine.n_patches * error / target > tuning.max_patches
         if error <= target or (error < tuning.max_regular_error and (is_stuck or is_beyond)):
+            coarse = gather(coarser_scale(tessellator, patch_scale))  # the one that the render itself will have
             divisor = math.sqrt(_squares(fine.values - coarse.values) / noise) if noise > 0 else None
             return Refined(patch_scale, fine, error, divisor)
         more = (tuning.refinement_margin * error / target) ** (1 / _order(levels, fine.n_patches, error, tuning.orders))
