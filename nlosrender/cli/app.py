@@ -21,6 +21,7 @@ from nlosrender.cli.compare_command import check, compare
 from nlosrender.cli.config_commands import new, schema, validate
 from nlosrender.cli.dataset_commands import sheet
 from nlosrender.cli.file_commands import export, frames, info, plot
+from nlosrender.cli.import_command import import_
 from nlosrender.cli.interrupt_watch import InterruptWatch
 from nlosrender.cli.json_output import OUTPUT
 from nlosrender.cli.machine_commands import doctor
@@ -49,11 +50,11 @@ datasets = typer.Typer(help="Data sets: folders of captures.", no_args_is_help=T
 def _add(command: Callable[..., Any], to: typer.Typer = app) -> None:
     """Add a command by its function's name; the last paragraph of the docstring, its example, follows the options."""
     text, _, example = inspect.cleandoc(command.__doc__ or "").rpartition("\n\nExample: ")
-    to.command(command.__name__.replace("_", "-"), help=text, epilog=f"Example: {example}")(command)
+    to.command(command.__name__.rstrip("_").replace("_", "-"), help=text, epilog=f"Example: {example}")(command)
 
 
 _COMMANDS: tuple[Callable[..., Any], ...] = (
-    *(render, measure, merge, plan, new, validate, schema, info, plot, frames, reconstruct, export, doctor),
+    *(render, measure, merge, plan, new, import_, validate, schema, info, plot, frames, reconstruct, export, doctor),
     *(compare, check, check_engines, bench, paper, sheet),
 )
 for _command in _COMMANDS:

@@ -13,7 +13,7 @@ from nlosrender.errors import EXIT_OK, ValidationIssue
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-_PLACE = re.compile(r"(.*):(\d+):(\d+)", re.DOTALL)
+_PLACE = re.compile(r"(.*?):(\d+)(?::(\d+))?", re.DOTALL)  # of XML there is no column
 
 
 class JsonOutput:
@@ -53,7 +53,7 @@ def issue_as_json(issue: ValidationIssue) -> dict[str, Any]:
     if issue.place.startswith("--set "):
         file = None
     elif match:
-        file, line, column = match[1], int(match[2]), int(match[3])
+        file, line, column = match[1], int(match[2]), int(match[3]) if match[3] else None
     where = {"file": file, "line": line, "column": column}
     return {"place": issue.place, **where, "key": issue.key, "message": issue.message}
 

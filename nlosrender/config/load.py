@@ -16,6 +16,7 @@ from typing import Any, TypeVar
 from nlosrender.config.canonical import tree_hash
 from nlosrender.config.document import Config
 from nlosrender.config.encodable import encodable
+from nlosrender.config.foreign_scenes import advice_to_import
 from nlosrender.config.issues import shown
 from nlosrender.config.overrides import apply_overrides
 from nlosrender.config.section import Section, issues_in
@@ -106,7 +107,11 @@ def parse_document(text: str, source: str, folder: Path, overrides: Sequence[str
     ConfigError
         The text is no YAML or no mapping. Other issues are those of the document.
     """
+    if advice := advice_to_import(text, None, source):
+        raise ConfigError.of_file(f"{source}:1:1", advice)
     document = read_document(text, source, folder)
+    if advice := advice_to_import(text, document.tree, source):
+        raise ConfigError.of_file(document.place(()), advice)
     if document.tree is None and not document.issues and overrides:
         document.tree = {}
     if not isinstance(document.tree, dict):

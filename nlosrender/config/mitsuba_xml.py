@@ -33,7 +33,7 @@ from nlosrender.config.xml_expansion import LEFT_OUT, START, Expansion, prefixed
 from nlosrender.config.xml_numbers import check_numbers
 from nlosrender.config.xml_shapes import check_xml_bsdf, check_xml_shape
 from nlosrender.config.xml_transforms import check_rotation
-from nlosrender.config.xml_tree import SceneElement
+from nlosrender.config.xml_tree import SceneElement, parsed_xml
 from nlosrender.errors import ValidationIssue
 
 DEFAULT_FILM = (768, 576)  # Mitsuba's
@@ -91,6 +91,21 @@ def read_mitsuba_xml(path: Path) -> tuple[Element, tuple[int, int] | None]:
     if size is not None:
         _add_film(root, size)
     return root, size
+
+
+def checked_bsdf(text: str, folder: Path) -> Element:
+    """Return the one ``<bsdf>`` of a piece of XML, held to the rules of scenes; file names start at ``folder``.
+
+    Raises
+    ------
+    ValueError
+        The text is no XML, holds something else, or something that is not allowed; says what.
+    """
+    root = parsed_xml(f"<scene>{text}</scene>".encode())
+    if [child.tag for child in root] != ["bsdf"]:
+        raise ValueError("need one <bsdf>")
+    _clean(root, [folder])
+    return root[0]
 
 
 def is_colored_xml(root: Element) -> bool:

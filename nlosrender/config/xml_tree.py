@@ -63,11 +63,17 @@ def read_xml(path: Path, name: str = "") -> Element:
         raise ValueError(f"cannot be read: {error.strerror}") from error
     if len(content) > MAX_XML_BYTES:
         raise ValueError(f"it is larger than {MAX_XML_BYTES // 2**20} MiB; keep meshes in files of their own")
-    return _parsed(content, name)
+    return parsed_xml(content, name)
 
 
-def _parsed(content: bytes, name: str) -> Element:
-    """Return the root of a document; what no scene needs is refused while it is read, before it grows."""
+def parsed_xml(content: bytes, name: str = "") -> Element:
+    """Return the root of a document; what no scene needs is refused while it is read, before it grows.
+
+    Raises
+    ------
+    ValueError
+        As ``read_xml``.
+    """
     parser = expat.ParserCreate()
     opened: list[Element] = [Element("document")]
     count = itertools.count(1)

@@ -1,0 +1,51 @@
+"""BSDFs and textures of a checked Mitsuba scene -> mappings of a configuration."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping
+from typing import Any
+from xml.etree.ElementTree import Element
+
+from nlosrender.config.xml_shapes import shape_parameters
+from nlosrender.config.xml_transforms import transform_steps
+from nlosrender.files.importing.scan_geometry import to_world_of
+
+DEFAULT_DIFFUSE = {"type": "diffuse", "reflectance": 0.5}  # Mitsuba's, ours is white
+
+
+def plugin_of(element: Element, with_id: Mapping[str, Element], file_name: Callable[[str], str]) -> dict[str, Any]:
+    """Return a ``<bsdf>`` or ``<texture>``, or what a ``<ref>`` stands for, as a configuration has it.
+
+    Parameters
+    ----------
+    element
+        Checked, its file names absolute.
+    with_id
+        What may be referred to.
+    file_name
+        Returns how the configuration names a file.
+    """
+    element = with_id.get(element.get("id", ""), element) if element.tag == "ref" else element
+    values = shape_parameters(element)
+    plugin: dict[str, Any] = {"type": element.get("type", "")}
+    for index, child in enumerate(element):
+        name = child.get("name", "")
+        if child.tag in ("bsdf", "texture", "ref"):
+            plugin[name or f"{child.tag}{index}"] = plugin_of(child, with_id, file_name)
+        elif child.tag == "transform":
+            plugin[name] = to_world_of(transform_steps(child) or [])
+        elif child.tag == "spectrum":
+            plugin[name] = _spectrum(child, file_name)
+        else:
+            plugin[name] = file_name(values[name]) if name == "filename" else values.get(name, child.get("value"))
+    return DEFAULT_DIFFUSE | plugin if plugin["type"] == "diffuse" else plugin
+
+
+def _spectrum(element: Element, file_name: Callable[[str], str]) -> Any:
+    if element.get("filename") is not None:
+        return {"type": "spectrum", "filename": file_name(element.get("filename", ""))}
+    pairs = [pair.split(":") for pair in re.split(r"[\s,]+", element.get("value", "").strip())]
+    if len(pairs) == 1 and len(pairs[0]) == 1:
+        return float(pairs[0][0])
+    return {"type": "spectrum", "value": [[float(part) for part in pair] for pair in pairs]}
