@@ -420,6 +420,9 @@ def test_known_biases_are_told(tmp_path: Path) -> None:
         assert part in notes
     notes = " ".join(line.remark for line in imported(tmp_path, XML)[0].lines if line.verdict == "note")
     assert "occluded" not in notes
+    mixed = key + key.replace("sampling", "sampling_do_rroulette")
+    notes = " ".join(line.remark for line in imported(tmp_path, XML.replace(INTEGRATOR, mixed + INTEGRATOR))[0].lines)
+    assert "doubles its light" in notes
     ytal = imported(tmp_path, YAML + "integrator_nlos_hidden_geometry_sampling: true\n")[0]
     notes = " ".join(line.remark for line in ytal.lines if line.verdict == "note")
     assert "occluded" in notes

@@ -34,6 +34,10 @@ _ENERGY = (
     "H is in J m^-2 sr^-1 per joule of pulse; mitransient's depends on where its projector looks: compare with one "
     "factor per laser point"
 )
+_MIXED = (
+    "mitransient mixes hidden geometry and BSDF sampling without weights: each hidden surface on a path doubles its "
+    "light there"
+)
 _BIASES = (
     "mitransient weights a sampled hidden point that is occluded by the surface in front of it: hidden surfaces behind "
     "or close to others are too bright there",
@@ -78,8 +82,11 @@ def translate_bounces(keys: Keys, *, of_ytal: bool) -> None:
     keys.translation.note(_ENERGY)
     if keys.value("integrator.nlos_hidden_geometry_sampling", False, bool):
         keys.translation.note(_BIASES[0])
+        mixes = keys.value("integrator.nlos_hidden_geometry_sampling_do_rroulette", False, bool)
+        if mixes:
+            keys.translation.note(_MIXED)
         meets_wall = keys.value("integrator.nlos_hidden_geometry_sampling_includes_relay_wall", of_ytal, bool)
-        if not meets_wall and not keys.value("integrator.nlos_hidden_geometry_sampling_do_rroulette", False, bool):
+        if not meets_wall and not mixes:
             keys.translation.note(_BIASES[1])
     drop_noise(keys)
 

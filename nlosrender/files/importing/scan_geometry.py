@@ -60,7 +60,10 @@ class FlatWall:
         for key, value in values.items():
             translation.put(f"scene.relay_wall.{key}", value, place)
         if self.is_mirrored:
-            translation.note("the relay wall is mirrored: columns of the sensor grid run the other way here")
+            translation.note(
+                "the relay wall is mirrored: columns of the sensor grid run the other way here; Mitsuba 3.9 renders it "
+                "black, since its geometric and shading normals contradict each other"
+            )
 
     def at_uv(self, u: float, v: float) -> list[float]:
         """Return the wall coordinates (x, y) [m] of a texture coordinate."""
