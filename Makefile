@@ -56,7 +56,7 @@ format: $(VENV)/.dev ## Format the code.
 	.venv-peers/bin/python -m pip --disable-pip-version-check --quiet install --no-deps -r $<
 	@touch $@
 
-peers: $(VENV)/.dev .venv-peers/.installed ## Check our files with other projects' readers.
+peers: $(VENV)/.dev .venv-peers/.installed .venv-peers-mitransient/.installed ## Check our files in other projects' readers, imported scenes in their renderer.
 	$(BIN)/python -m pytest -m peers
 
 # MESH=bunny.ply, a mesh about 0.8 m high, adds scenes with it; SECONDS is the time for all measurements together.

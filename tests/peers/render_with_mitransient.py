@@ -53,8 +53,10 @@ def load_scene(mi, scene: dict, settings: dict):
 
     ``scene``: wall [width, height], wall_reflectance, scan (single or confocal), sensors [rows, columns],
     laser_point [x, y], bins [start_opl, bin_width_opl, n_bins], max_bounces (or null), surfaces: a list of
-    {mesh: .ply file, to_world: 4 x 4, bsdf}.
+    {mesh: .ply file, to_world: 4 x 4, bsdf}. Or xml: a scene file, which is loaded as it is.
     """
+    if "xml" in scene:
+        return mi.load_file(scene["xml"])
     transform = mi.ScalarTransform4f
     rows, columns = scene["sensors"]
     start, width, n_bins = scene["bins"]

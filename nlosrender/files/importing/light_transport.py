@@ -38,11 +38,13 @@ _MIXED = (
     "mitransient mixes hidden geometry and BSDF sampling without weights: each hidden surface on a path doubles its "
     "light there"
 )
-_BIASES = (
+_OCCLUDED = (
     "mitransient weights a sampled hidden point that is occluded by the surface in front of it: hidden surfaces behind "
-    "or close to others are too bright there",
+    "or close to others are too bright there"
+)
+_WITHOUT_WALL = (
     "mitransient samples the hidden geometry alone, not the relay wall: light that meets the wall in between "
-    "(bounces 5 and up) is mostly missing there, and is here",
+    "(bounces 5 and up) is mostly missing there, and is here"
 )
 
 
@@ -52,9 +54,6 @@ def translate_bounces(keys: Keys, *, of_ytal: bool) -> None:
     most = keys.value("integrator.max_depth", -1 if of_ytal else 6, int)
     highest = None if most == -1 else most - (0 if sampled else 1)
     name, bounce = _only_bounce(keys, sampled=sampled)
-    for silent in ("integrator.filter_bounces", "integrator.filter_depth"):
-        if keys.value(silent, 0, int) == -1:
-            keys.drop(silent, "off: all bounces, each on an index of its own in the file")
     if bounce is None:
         counts = "counts surfaces, the wall's two included"
         keys.take("integrator.max_depth", "render.max_bounces", highest, "" if highest is None else counts)
@@ -64,48 +63,55 @@ def translate_bounces(keys: Keys, *, of_ytal: bool) -> None:
         keys.drop("integrator.max_depth", f"{keys.name(name)} keeps one bounce")
         where = f"what it keeps is bounce {bounce}, index {bounce - 2} of the file; export --bounces {bounce}"
         keys.take(name, "render.max_bounces", bounce, where, changed=True)
-    _direct_light(keys, sampled=sampled)
-    spot = _NOISE if sampled else "the laser lights a point here, there the square its fov makes (laser_spot_radius)"
-    keys.drop("integrator.nlos_laser_sampling", spot)
-    legs = keys.value("integrator.account_first_and_last_bounces", False, bool)
-    remark = "" if legs else "start_opl stays as it is; Z-NLOS loaders expect the legs, export --format tal does not"
-    old = "sensor.account_first_and_last_bounces"
-    if old in keys and "integrator.account_first_and_last_bounces" not in keys:
-        legs = keys.value(old, False, bool)
-        keys.take(old, "capture.account_first_and_last_bounces", legs, "as versions mean it that have it here")
-    else:
-        keys.drop(old, "the integrator's decides")
-        keys.take("integrator.account_first_and_last_bounces", "capture.account_first_and_last_bounces", legs, remark)
-    if keys.value("integrator.camera_unwarp", False, bool):
-        keys.refuse("integrator.camera_unwarp", "is for cameras; account_first_and_last_bounces is what is meant")
-    keys.drop("integrator.camera_unwarp", "is for cameras")
-    keys.translation.note(_ENERGY)
-    if keys.value("integrator.nlos_hidden_geometry_sampling", False, bool):
-        keys.translation.note(_BIASES[0])
-        mixes = keys.value("integrator.nlos_hidden_geometry_sampling_do_rroulette", False, bool)
-        if mixes:
-            keys.translation.note(_MIXED)
-        meets_wall = keys.value("integrator.nlos_hidden_geometry_sampling_includes_relay_wall", of_ytal, bool)
-        if not meets_wall and not mixes:
-            keys.translation.note(_BIASES[1])
-    drop_noise(keys)
-
-
-def _only_bounce(keys: Keys, *, sampled: bool) -> tuple[str, int | None]:
-    """Return the key that keeps one bounce, and which; None for all of them."""
-    for name, offset in (("integrator.filter_depth", 0), ("integrator.filter_bounces", 1)):
-        depth = keys.value(name, -1, int)
-        if depth != -1:
-            return name, depth + offset + (0 if sampled else 1)
-    return "", None
-
-
-def _direct_light(keys: Keys, *, sampled: bool) -> None:
     for name in ("integrator.discard_direct_paths", "integrator.discard_direct_light"):
         if keys.value(name, False, bool):
             first = 3 if sampled else 4
             keys.change(name, f"bounces below {first} are missing there; here each has its index in the file")
         keys.drop(name, "nothing is discarded")
+    spot = _NOISE if sampled else "the laser lights a point here, there the square its fov makes (laser_spot_radius)"
+    keys.drop("integrator.nlos_laser_sampling", spot)
+    if keys.value("integrator.camera_unwarp", False, bool):
+        keys.refuse("integrator.camera_unwarp", "is for cameras; account_first_and_last_bounces is what is meant")
+    keys.drop("integrator.camera_unwarp", "is for cameras")
+    _legs(keys)
+    _say_biases(keys, of_ytal=of_ytal)
+    drop_noise(keys)
+
+
+def _only_bounce(keys: Keys, *, sampled: bool) -> tuple[str, int | None]:
+    """Return the key that keeps one bounce, and which; None for all of them."""
+    found: tuple[str, int | None] = ("", None)
+    for name, offset in (("integrator.filter_depth", 0), ("integrator.filter_bounces", 1)):
+        depth = keys.value(name, -1, int)
+        if depth == -1:
+            keys.drop(name, "off: all bounces, each on an index of its own in the file")
+        else:
+            found = name, depth + offset + (0 if sampled else 1)
+    return found
+
+
+def _legs(keys: Keys) -> None:
+    """Judge whether the first and last legs count; older files say so in the sensor."""
+    name, old = (f"{part}.account_first_and_last_bounces" for part in ("integrator", "sensor"))
+    is_old = old in keys and name not in keys
+    legs = keys.value(old if is_old else name, False, bool)
+    remark = "" if legs else "start_opl stays as it is; Z-NLOS loaders expect the legs, export --format tal does not"
+    remark = "as versions mean it that have it here" if is_old else remark
+    keys.take(old if is_old else name, "capture.account_first_and_last_bounces", legs, remark)
+    keys.drop(old, "the integrator's decides")
+
+
+def _say_biases(keys: Keys, *, of_ytal: bool) -> None:
+    """Report how mitransient's result differs from what it stands for."""
+    note, sampling = keys.translation.note, "integrator.nlos_hidden_geometry_sampling"
+    note(_ENERGY)
+    if not keys.value(sampling, False, bool):
+        return
+    note(_OCCLUDED)
+    if keys.value(f"{sampling}_do_rroulette", False, bool):
+        note(_MIXED)
+    elif not keys.value(f"{sampling}_includes_relay_wall", of_ytal, bool):
+        note(_WITHOUT_WALL)
 
 
 def drop_noise(keys: Keys) -> None:

@@ -21,8 +21,9 @@ from nlosrender.config.xml_shapes import placement, shape_parameters
 from nlosrender.config.xml_tree import SceneElement
 from nlosrender.files.importing.light_transport import drop_noise, say_samples, translate_bounces, translate_film
 from nlosrender.files.importing.scan_geometry import FlatWall, matrix_of, to_world_of
-from nlosrender.files.importing.translation import Found, Keys, Translation, plain
+from nlosrender.files.importing.translation import Found, Keys, Translation, plain, rounded
 from nlosrender.files.importing.xml_plugins import DEFAULT_DIFFUSE, plugin_of
+from nlosrender.scene.pose import Float64
 
 NLOS = "transient_nlos_path"
 _CAMERAS = ("transient_path", "transient_prbvolpath")
@@ -242,10 +243,9 @@ class _NlosScene:
         if any(emitter.find("texture") is not None for emitter in self.emitters):
             keys.refuse("emitter.irradiance", "a projected picture lights many points, need an <rgb>")
         matrix = matrix_of(placement(self.emitters[0])) if self.emitters else np.eye(4)
+        position = rounded(matrix[:3, 3])
         if "emitter.to_world" in keys:
-            position = matrix[:3, 3].tolist()
             translation.put("capture.laser_position", position, keys.place("emitter.to_world"))
-            keys.keep("emitter.to_world", f"capture.laser_position: {plain(position)}")
         elif "sensor.laser_origin" in keys:
             keys.take("sensor.laser_origin", "capture.laser_position", keys.value("sensor.laser_origin", None))
         else:
@@ -253,28 +253,32 @@ class _NlosScene:
                 "capture.laser_position: null, 1 m in front of the wall, since it says nothing of the laser's place"
             )
             translation.line("default", "emitter.to_world", None, "changed", remark)
-        keys.drop_all(
-            {
-                "emitter.irradiance": "capture.laser_energy is 1 J: one factor on H, for each laser point",
-                "emitter.scale": "capture.laser_energy is 1 J: one factor on H",
-                "emitter.fov": "the laser is a point here, as it is there with nlos_laser_sampling",
-            }
-        )
-        if scan != "single" or wall is None:
-            return
-        hit = wall.hit(matrix[:3, 3], matrix[:3, 2])
+        aim = self._laser_point(wall, matrix, given) if scan == "single" and wall is not None else ""
+        keys.keep("emitter.to_world", f"capture.laser_position: {plain(position)}{aim}")
+        keys.drop("emitter.fov", "the laser is a point here, as it is there with nlos_laser_sampling")
+        for name in ("emitter.irradiance", "emitter.scale"):
+            keys.drop(name, "capture.laser_energy is 1 J: one factor on H, for each laser point")
+
+    def _laser_point(self, wall: FlatWall, matrix: Float64, given: tuple[float, float] | None) -> str:
+        """Set the point that the laser lights, and return what of it comes from the projector's transform."""
+        keys, translation = self.keys, self.translation
+        hit = wall.hit(matrix[:3, 3], matrix[:3, 2]) if "emitter.to_world" in keys else None
         pixel = keys.value("sensor.laser_lookat_pixel", None)
         if given is not None:
             translation.put_laser(given)
-        elif "emitter.to_world" in keys and hit is not None:
-            translation.note(f"the projector's axis meets the wall at capture.laser_point: {plain(hit)}")
+        elif hit is not None:
             translation.put("capture.laser_point", hit, keys.place("emitter.to_world"))
+            return f", capture.laser_point: {plain(hit)}, where its axis meets the wall"
         elif isinstance(pixel, list):
             point = wall.at_uv(pixel[0] / max(self.pixels["nx"], 1), pixel[1] / max(self.pixels["ny"], 1))
             keys.take("sensor.laser_lookat_pixel", "capture.laser_point", point, "m", changed=True)
         else:
-            at = keys.place("emitter.to_world" if "emitter.to_world" in keys else "emitter.type")
-            translation.refuse(at, "emitter.to_world", "", f"the laser does not look at the relay wall; {_SAY_LASER}")
+            why = f"the laser does not look at the relay wall; {_SAY_LASER}"
+            if "emitter.to_world" in keys:
+                keys.refuse("emitter.to_world", why)
+            else:
+                translation.refuse(keys.place("emitter.type"), "emitter.to_world", "", why)
+        return ""
 
 
 def _refuse_film(keys: Keys) -> None:
