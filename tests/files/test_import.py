@@ -168,6 +168,15 @@ def test_the_laser_point_is_where_the_projector_looks(tmp_path: Path) -> None:
     assert config.capture.laser_position == (0.0, 0.0, 2.0)
 
 
+def test_legs_of_older_files_are_the_sensors(tmp_path: Path) -> None:
+    """The integrator decides; where it is silent, the sensor of a file for an older version does."""
+    key = '<boolean name="account_first_and_last_bounces" value="{}"/>'
+    old = XML.replace("<film", key.format("True") + "<film")
+    assert config_of(tmp_path, old).capture.account_first_and_last_bounces is True
+    both = old.replace("</integrator>", key.format("false") + "</integrator>")
+    assert config_of(tmp_path, both).capture.account_first_and_last_bounces is False
+
+
 def test_scans_of_mitransient(tmp_path: Path) -> None:
     """capture_type is a number or a name; older files say confocal, or give the film of points measured one by one."""
     for element, scan in (
@@ -209,6 +218,7 @@ def test_points_of_ytal(tmp_path: Path) -> None:
     x, y = np.meshgrid([-1.0, 0.0, 1.0], [-0.5, 0.5])
     assert points(config) == pytest.approx(np.stack([x + 0.25, y, 0 * x], axis=-1))
     assert config.capture.laser_point == pytest.approx((-0.5, 0.0))  # 1 of 3 pixels on 3 m; 0 is no value there
+    assert config_of(tmp_path, YAML, laser=(0.5, -0.25)).capture.laser_point == (0.5, -0.25)
 
 
 def test_apertures_of_ytal(tmp_path: Path) -> None:
@@ -228,6 +238,15 @@ def test_shapes_of_ytal(tmp_path: Path) -> None:
     assert matrix @ [0, 1, 0, 1] == pytest.approx([0, 0, 3, 1])  # y: 2 y: 2 z: 2 z: moved by 1
     assert matrix @ [1, 0, 0, 1] == pytest.approx([0, 1, 1, 1])
     assert config.time_axis.n_bins == 1000
+
+
+def test_samples_are_a_comment(tmp_path: Path) -> None:
+    """Their number has no counterpart beside an error to reach: it is said, and refuses nothing."""
+    for text, said in (("sample_count: 2_000\n", "there 2_000 samples"), ("", "there 1_000_000 samples")):
+        assert f"target_error: 0.05}}  # {said} per point" in imported(tmp_path, YAML + text)[1]
+    sampler = '<sampler type="independent"><integer name="sample_count" value="{}"/></sampler><film'
+    assert "# there 64 samples" in imported(tmp_path, XML.replace("<film", sampler.format(64)))[1]
+    assert not imported(tmp_path, XML.replace("<film", sampler.format("$spp")))[0].issues
 
 
 @pytest.mark.parametrize(

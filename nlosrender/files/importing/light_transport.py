@@ -148,8 +148,8 @@ def translate_film(keys: Keys, default_bins: int) -> None:
 
 def say_samples(keys: Keys, name: str, default: int | None = None) -> None:
     """Put the number of samples, which has no counterpart, beside the error that decides here."""
-    samples = keys.value(name, default, int)
-    if samples is not None:
+    samples = keys.value(name, default)
+    if isinstance(samples, int):
         keys.translation.remarks["target_error"] = f"there {samples:_} samples per point"
     keys.drop(name, "render.target_error decides here; said beside it in a comment")
     keys.translation.put("render.target_error", DEFAULT_TARGET_ERROR, str(keys.translation.source))
