@@ -31,6 +31,8 @@ from nlosrender.scene.pose import Float64
 if TYPE_CHECKING:
     from nlosrender.engine.virtual_lights.elements.subdivision import Elements
 
+MIN_LIT_SHARE = 1e-3  # of a cluster's area: what less of it sends on has no slopes to speak of
+
 
 class Merger:
     """Merges elements far smaller than they need to be into one patch per box, at any scale.
@@ -144,12 +146,13 @@ def three_facets(merged: AreaMoments) -> tuple[Float64, Float64, Float64]:
 
     With slopes p, normals are (p, 1) over its length and M is the sum of w (p, 1) (p, 1)^T: three equal w, their slopes
     on an ellipse about the mean at 120 degrees, have its sum, mean and covariance. The roughness (n,) is the trace of
-    the latter.
+    the latter, 0 where shading normals lie across the triangles.
     """
     index, axes = np.arange(len(merged)), (merged.upright[:, None] + np.array([1, 2, 0])) % 3
     moments = merged.light.reshape(-1, 3, 3)[index[:, None, None], axes[:, :, None], axes[:, None, :]]
     moments = (moments + moments.swapaxes(1, 2)) / 2
-    weights = np.maximum(moments[:, 2, 2], 1e-300)
+    is_known = moments[:, 2, 2] > MIN_LIT_SHARE * merged.areas
+    weights = np.where(is_known, moments[:, 2, 2], merged.areas)
     mean = moments[:, :2, 2] / weights[:, None]
     covariance = moments[:, :2, :2] / weights[:, None, None] - mean[:, :, None] * mean[:, None, :]
     values, vectors = np.linalg.eigh(covariance)
@@ -160,7 +163,7 @@ def three_facets(merged: AreaMoments) -> tuple[Float64, Float64, Float64]:
     facets: Float64 = sign * np.concatenate([slopes, np.ones((len(merged), 3, 1))], axis=2)
     squares = np.square(facets).sum(axis=2)
     normals = np.stack([_from_box(facets[:, k], merged.upright) for k in range(3)], axis=1)
-    return weights[:, None] / 3 * squares, normals / np.sqrt(squares)[:, :, None], values.sum(axis=1)
+    return weights[:, None] / 3 * squares, normals / np.sqrt(squares)[:, :, None], values.sum(axis=1) * is_known
 
 
 def _parallelograms(plane: BoxPlane, merged: AreaMoments, centres: Float64) -> Float64:
