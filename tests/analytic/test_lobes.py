@@ -103,9 +103,9 @@ LOBES: dict[str, dict[str, Any]] = {
 
 
 def engines(item: dict[str, Any], folder: Path | None = None) -> tuple[Rendering, Rendering]:
-    """Render both ways: virtual lights at 0.5 %, and paths."""
+    """Render both ways: virtual lights at 0.2 %, and paths."""
     common = {"sensors": (3, 2), "bins": (1.0, 0.06, 30), "color": "grey"}
-    lights = render(flat_wall(item, spp=None, engine="auto", target_error=0.005, **common), folder=folder)
+    lights = render(flat_wall(item, spp=None, engine="auto", target_error=0.002, **common), folder=folder)
     return lights, render(flat_wall(item, spp=2**15, **common), replicas=32, folder=folder)
 
 

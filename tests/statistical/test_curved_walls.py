@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from support.agreement import relative_l2
-from support.engine_sums import assert_alike, energies, group_sums
+from support.engine_sums import assert_alike, energies, finer, group_sums
 from support.rendering import flat_wall, render
 from support.varied_scenes import Stage, ball, diffuse, plate
 from support.wall_meshes import flat, globe, sheet, wavy, write_uv_ply
@@ -58,7 +58,7 @@ def compare(
     stage = Stage.of(scene(name, scan, max_bounces=max_bounces), folder)
     assert stage.engine.name == "virtual_lights"
     assert stage.engine.further is not None or max_bounces == 3
-    budget = replace(stage.engine.calibrate(Budget(target_error=target)), rounds=rounds)
+    budget = finer(stage.engine.calibrate(Budget(target_error=target)), rounds)
     lights = stage.repeated(budget, range(1, seeds + 1))
     reference = Stage.of(scene(name, scan, "path", spp=spp, target_error=None, max_bounces=max_bounces), folder)
     paths = reference.repeated(Budget(spp=spp), range(101, 101 + seeds))

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from support.engine_sums import assert_alike, energies, group_sums
+from support.engine_sums import assert_alike, energies, finer, group_sums
 from support.rendering import flat_wall, render
 from support.varied_scenes import SIDE, SLANTED, TRAPS, Item, Stage, ball
 
@@ -28,7 +28,7 @@ def compare(
 
     stage: Stage = TRAPS[name].stage(folder)
     assert stage.engine.name == "virtual_lights"
-    budget = stage.engine.calibrate(Budget(target_error=target))
+    budget = finer(stage.engine.calibrate(Budget(target_error=target)))
     budget = replace(budget, rounds=rounds if budget.rounds else None, spp=spp if budget.spp else None)
     lights = stage.repeated(budget, seeds)
     reference = TRAPS[name].stage(folder, "path", spp=spp, target_error=None)
