@@ -7,7 +7,6 @@ is there and seen, so that an edge counts once (docs/virtual-lights.md, 11).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import drjit as dr
@@ -21,9 +20,9 @@ from nlosrender.engine.launch.facing_triangles import facing_triangles
 from nlosrender.engine.launch.mirror_index import LitSphere, MirrorIndex
 from nlosrender.engine.launch.ray_offsets import offset_origin, ray_offset
 from nlosrender.scene.build import BuiltScene, wall_box
+from nlosrender.scene.loading.number_of_shape import NO_NUMBER, NumberOfShape
 from nlosrender.scene.pose import Float64
 
-NO_NUMBER = 0xFFFFFFFF  # of a shape, or of a facet, that is no mirror
 FLAT_PLUGINS = ("Rectangle", "Disk")
 COPLANAR = 1e-5  # radians between neighbouring facets of one mirror: float32 vertices tilt those of a plane by less
 # What float32 rounds a point of reflection by, over 1 + the largest coordinate [engine units]: the quick test goes so
@@ -33,29 +32,6 @@ MIN_HEIGHT = 1e-7  # engine units: points nearer to a mirror's plane lie in it a
 NUDGE = 5e-7  # as ROUNDING: how far beside a point on an edge a ray is sent; a plate's edges are met at a tenth of it
 TRIES = 6  # rays at most: about the point at angles of 1 to 5 radians, which are along one edge and no other
 ROWS = 3  # of four numbers each, aligned loads: what the quick test reads of a mirror
-
-
-@dataclass(frozen=True, eq=False)
-class NumberOfShape:
-    """A number for some shapes of a scene, found by the shapes that rays meet."""
-
-    numbers: mi.UInt32  # by Dr.Jit's index of a shape's pointer; NO_NUMBER of other shapes
-
-    @classmethod
-    def of(cls, shapes: Sequence[mi.Shape], numbers: Sequence[int]) -> NumberOfShape:
-        """Return the table of ``shapes`` and their ``numbers``."""
-        index = [int(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))[0]) for shape in shapes]
-        table = np.full(max(index, default=0) + 1, NO_NUMBER, np.uint32)
-        table[index] = numbers
-        result = cls(on_device(mi.UInt32, table))
-        dr.eval(result.numbers)
-        return result
-
-    def at(self, si: mi.SurfaceInteraction3f | mi.PreliminaryIntersection3f, active: mi.Bool) -> mi.UInt32:
-        """Return the number of the shape that a ray met; NO_NUMBER where it met another one, or none."""
-        shape = dr.reinterpret_array(mi.UInt32, si.shape)  # 0: nothing was met
-        known = active & si.is_valid() & (shape < dr.width(self.numbers))
-        return dr.select(known, dr.gather(mi.UInt32, self.numbers, shape, known), NO_NUMBER)
 
 
 def components_of(bits: int) -> tuple[int, ...]:

@@ -15,8 +15,6 @@ import numpy as np
 
 from nlosrender.engine.launch.device_arrays import on_device
 from nlosrender.engine.launch.flat_mirrors import (
-    NO_NUMBER,
-    NumberOfShape,
     Reflection,
     components_of,
     delta_lobes,
@@ -26,6 +24,7 @@ from nlosrender.engine.launch.flat_mirrors import (
 from nlosrender.engine.launch.mirror_index import MirrorIndex
 from nlosrender.engine.launch.ray_offsets import offset_origin
 from nlosrender.scene.build import BuiltScene
+from nlosrender.scene.loading.number_of_shape import NO_NUMBER, NumberOfShape
 from nlosrender.scene.loading.round_surfaces import ROUND_PLUGINS, RoundSurface
 
 # Newton steps. Of 200,000 pairs of points 0.01 to 100 radii above the mirror the angle is good to 1e-2 after 4, 2e-4

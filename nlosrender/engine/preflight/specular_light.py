@@ -24,6 +24,7 @@ from nlosrender.engine.launch.ray_offsets import offset_origin
 from nlosrender.engine.launch.surface_sampler import SAMPLEABLE_PLUGINS
 from nlosrender.engine.launch.wall_points import laser_points
 from nlosrender.scene.build import BuiltScene
+from nlosrender.scene.loading.number_of_shape import pointer_index
 from nlosrender.scene.pose import Float64
 from nlosrender.scene.view import BuiltView
 
@@ -211,16 +212,12 @@ def _names(built: BuiltScene | BuiltView) -> dict[int, str]:
     """Return the items by the numbers that shape pointers have on the device."""
     names: dict[int, str] = {}
     if isinstance(built, BuiltScene):
-        names[_number(built.wall_shape)] = WALL_NAME
+        names[pointer_index(built.wall_shape)] = WALL_NAME
     keyed = len(built.surfaces) == len(built.hidden_shapes)  # a Mitsuba scene has shapes of its own
     for place, shape in enumerate(built.hidden_shapes):
         surface = built.surfaces[place] if keyed else None
-        names[_number(shape)] = f"{surface.key} ({surface.name})" if surface else shape.id() or shape.class_name()
+        names[pointer_index(shape)] = f"{surface.key} ({surface.name})" if surface else shape.id() or shape.class_name()
     return names
-
-
-def _number(shape: mi.Shape) -> int:
-    return int(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))[0])
 
 
 def _ray(built: BuiltScene, lit: mi.SurfaceInteraction3f, direction: mi.Vector3f, is_sent: mi.Bool) -> mi.Ray3f:

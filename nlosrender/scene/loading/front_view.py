@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nlosrender.scene.build import BuiltScene
+from nlosrender.scene.loading.number_of_shape import NumberOfShape
 from nlosrender.scene.pose import Float64
 
 NOTHING = -1  # in place of an item
@@ -47,7 +48,7 @@ def front_view(built: BuiltScene, points: Float64, normals: Float64) -> FrontVie
         origins = origins + STEP * (1 + np.abs(origins).max()) * directions
     ray = mi.Ray3f(mi.Point3f(origins.T.astype(np.float32)), mi.Vector3f(directions.T.astype(np.float32)))
     si = built.scene.ray_intersect(ray, mi.RayFlags.All, coherent=True)
-    item = _items(built, si)
+    item = _items(_number_of_item(built), si)
     bsdf = si.bsdf(ray)
     albedo = mi.unpolarized_spectrum(bsdf.eval_diffuse_reflectance(si, si.is_valid()))
     dr.eval(si.t, si.sh_frame.n, item, albedo)
@@ -95,15 +96,13 @@ def occupancy(built: BuiltScene, low: Float64, high: Float64, shape: tuple[int, 
     return voxels
 
 
-def _items(built: BuiltScene, si: mi.SurfaceInteraction3f) -> mi.Int32:
-    """Return which item each intersection is with."""
-    registry = [int(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))[0]) for shape in built.hidden_shapes]
-    table = np.full(max(registry, default=0) + 2, NOTHING, dtype=np.int32)
-    table[registry] = np.arange(len(registry))
-    # opaque: numbers of shapes grow from capture to capture, and a literal would be compiled anew
-    last = dr.opaque(mi.UInt32, len(table) - 1)
-    number = dr.minimum(dr.reinterpret_array(mi.UInt32, si.shape), last)  # the wall may come later
-    return dr.select(si.is_valid(), dr.gather(mi.Int32, mi.Int32(table), number), NOTHING)
+def _number_of_item(built: BuiltScene) -> NumberOfShape:
+    return NumberOfShape.of(built.hidden_shapes, range(len(built.hidden_shapes)))
+
+
+def _items(numbers: NumberOfShape, si: mi.SurfaceInteraction3f) -> mi.Int32:
+    """Return which item each intersection is with; ``NO_NUMBER`` is ``NOTHING`` with a sign."""
+    return dr.reinterpret_array(mi.Int32, numbers.at(si, mi.Bool(True)))
 
 
 def _crossings(
@@ -118,7 +117,7 @@ def _crossings(
     columns
         (2, rays) x and y of the rays [m].
     """
-    unit = built.metres_per_engine_unit
+    unit, numbers = built.metres_per_engine_unit, _number_of_item(built)
     found: list[tuple[NDArray[np.int64], ...]] = []
     if built.hidden_bounds is not None:
         start = built.hidden_bounds[0][2] / unit
@@ -130,7 +129,7 @@ def _crossings(
             si = built.scene.ray_intersect(
                 mi.Ray3f(mi.Point3f(x, y, z[active]), mi.Vector3f(0, 0, 1)), mi.RayFlags.Minimal, coherent=True
             )
-            item, side, hit = _items(built, si), si.n.z, si.p.z
+            item, side, hit = _items(numbers, si), si.n.z, si.p.z
             valid = si.is_valid()
             dr.eval(item, side, hit, valid)
             met = np.array(valid)
