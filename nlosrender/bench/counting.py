@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import os
-from concurrent.futures import ThreadPoolExecutor
+import functools
 from typing import Any
 
 import numpy as np
-from threadpoolctl import threadpool_limits
 
 from nlosrender.bench.runs import Timer
 from nlosrender.config.sensor import SensorConfig
 from nlosrender.files.measured import BLOCK_SAMPLES
-from nlosrender.sensor.detector import detector_of
+from nlosrender.files.thread_pool import in_order, processors
+from nlosrender.sensor.detector import Detector, detector_of
 from nlosrender.sensor.rebinning import Float32, TimeBins
 
 POINTS, BINS, WIDTH = 256 * 256, 512, 0.003
@@ -31,26 +30,25 @@ def counting_rates() -> list[dict[str, Any]]:
     """
     light = _front()
     blocks = [light[:, i : i + BLOCK_SAMPLES // BINS] for i in range(0, POINTS, BLOCK_SAMPLES // BINS)]
-    best: dict[str, tuple[float, float]] = {}
-    workers = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    with threadpool_limits(1, "blas"), ThreadPoolExecutor(workers) as pool:
-        for _ in range(ROUNDS):
-            for name, keys in DETECTORS.items():
-                values = {"jitter_fwhm_ps": 95, "repetition_rate": 11e6, "exposure_time": 0.1, "ambient_rate": 1e4}
-                scale = {"photons_per_pulse": {"mean": 0.05}}
-                detector = detector_of(SensorConfig.model_validate(values | scale | keys), TimeBins(0.0, WIDTH, BINS))
-                timer = Timer()
-                work = [
-                    pool.submit(detector.measure, block, np.random.Generator(np.random.Philox(number)))
-                    for number, block in enumerate(blocks)
-                ]
-                for future in work:
-                    future.result()
-                best[name] = min(best.get(name, (np.inf, np.inf)), timer.read())
+    best, threads = dict[str, tuple[float, float]](), {"threads": processors()}
+    for _ in range(ROUNDS):
+        for name, keys in DETECTORS.items():
+            values = {"jitter_fwhm_ps": 95, "repetition_rate": 11e6, "exposure_time": 0.1, "ambient_rate": 1e4}
+            scale = {"photons_per_pulse": {"mean": 0.05}}
+            detector = detector_of(SensorConfig.model_validate(values | scale | keys), TimeBins(0.0, WIDTH, BINS))
+            timer = Timer()
+            for _ in in_order(functools.partial(_counted, detector), enumerate(blocks)):
+                pass
+            best[name] = min(best.get(name, (np.inf, np.inf)), timer.read())
     return [
-        {"pile_up": name, "seconds": wall, "cpu_seconds": cpu, "points_per_second": POINTS / wall, "threads": workers}
+        {"pile_up": name, "seconds": wall, "cpu_seconds": cpu, "points_per_second": POINTS / wall} | threads
         for name, (wall, cpu) in best.items()
     ]
+
+
+def _counted(detector: Detector, numbered: tuple[int, Float32]) -> None:
+    number, block = numbered
+    detector.measure(block, np.random.Generator(np.random.Philox(number)))
 
 
 def _front() -> Float32:

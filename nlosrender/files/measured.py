@@ -10,23 +10,18 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
-import os
-from collections import deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TypeVar
 
 import h5py
 import numpy as np
 from numpy.random import Generator, Philox
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
-from threadpoolctl import threadpool_limits
 
-from nlosrender.config.sensor import SensorConfig, misfits, stored_sensor
+from nlosrender.config.sensor import SensorConfig, ZonesConfig, misfits, stored_sensor
 from nlosrender.errors import ConfigError, FileError
 from nlosrender.files import layout
 from nlosrender.files.atomic_write import check_writable, replacing
@@ -41,6 +36,7 @@ from nlosrender.files.parts.shards import PART
 from nlosrender.files.reading.reader import StoredCapture, finite, open_capture
 from nlosrender.files.reading.scan import hidden_box, moved, wall_frame, wall_pose
 from nlosrender.files.reading.stored_header import StoredHeader, intensity
+from nlosrender.files.thread_pool import in_order
 from nlosrender.sensor.detector import (
     Detector,
     Totals,
@@ -60,7 +56,6 @@ CORRECTABLE = ("pile_up", "background")
 LARGE_NOISE = 10  # signal over noise of the sum of a histogram
 
 Block = tuple[tuple[int, int], slice, slice]  # laser point, rows and columns of sensor points or of zones
-Result = TypeVar("Result")
 Progress = Callable[[float], None]
 Warn = Callable[[str], None]
 
@@ -280,7 +275,7 @@ class _Measurement:
         for text in () if self.is_counts else detector_warnings(self.detector):
             warn(text)
         chunker, totals = Chunker(self.header, dataset.compression or "none"), Totals()
-        results = _in_order(lambda block: self._measured(block, chunker), self.blocks, threads)
+        results = in_order(lambda block: self._measured(block, chunker), self.blocks, threads)
         for number, (chunks, part) in enumerate(results):
             for chunk in chunks:
                 writer.put_chunk(dataset, chunk.at, chunk.content)
@@ -323,7 +318,7 @@ class _Measurement:
             if config.footprint_area is None and area <= 0:
                 raise ConfigError.at("sensor.footprint_area", "missing: the sensor grid has no size.")
             return physical_scale(config, area)
-        sums = _in_order(lambda block: self.light(block).sum(axis=0, dtype=np.float64), self.blocks, threads)
+        sums = in_order(lambda block: self.light(block).sum(axis=0, dtype=np.float64), self.blocks, threads)
         total, brightest, points = 0.0, 0.0, 0
         for part in sums:
             total, brightest, points = total + float(part.sum()), max(brightest, float(part.max())), points + len(part)
@@ -380,7 +375,9 @@ def _refuse(header: StoredHeader, config: SensorConfig, corrections: tuple[str, 
         raise ConfigError.at(f"sensor.{key}", message)
 
 
-def _counts_header(capture: StoredCapture, detector: Detector, zones: object) -> tuple[CaptureHeader, csr_array | None]:
+def _counts_header(
+    capture: StoredCapture, detector: Detector, zones: ZonesConfig | None
+) -> tuple[CaptureHeader, csr_array | None]:
     """Describe the file of the counts: the capture's, with the detector's bins, and with zones for sensor points."""
     header, stored, to_wall = capture.header, capture.positions, wall_frame(capture.header)
     if (
@@ -398,11 +395,10 @@ def _counts_header(capture: StoredCapture, detector: Detector, zones: object) ->
     normals, laser_normals = moved(stored.sensor_normals, turn), moved(stored.laser_normals, turn)
     sensor = moved(np.asarray(header.sensor_position), to_wall)
     size, sums = header.sensor_grid_size or (0.0, 0.0), None
-    if detector.config.zones is not None and zones is not None:
-        config = detector.config.zones
-        sums = zone_sums(zone_of_points(config, sensors, sensor, (size[0], size[1])), config.nx * config.ny)
+    if zones is not None:
+        sums = zone_sums(zone_of_points(zones, sensors, sensor, (size[0], size[1])), zones.nx * zones.ny)
         share = sums / sums.sum(axis=1)[:, None]
-        shape = (config.ny, config.nx, 3)
+        shape = (zones.ny, zones.nx, 3)
         sensors = (share @ sensors.reshape(-1, 3)).reshape(shape)
         normals = (share @ normals.reshape(-1, 3)).reshape(shape)
         normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
@@ -438,23 +434,3 @@ def _counts_header(capture: StoredCapture, detector: Detector, zones: object) ->
         ), sums
     except ValueError as error:
         raise FileError(f"{capture.path}: {error}") from error
-
-
-def _in_order(function: Callable[[Block], Result], blocks: Sequence[Block], threads: int | None) -> Iterator[Result]:
-    """Yield the results for blocks in their order, computed by several threads a little ahead of the reader.
-
-    BLAS has one thread: its own would wait for each other, and the processors are busy.
-    """
-    workers = threads or (len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1)
-    waiting: deque[Future[Result]] = deque()
-    with threadpool_limits(1, "blas"), ThreadPoolExecutor(workers) as pool:
-        try:
-            for block in blocks:
-                waiting.append(pool.submit(function, block))
-                if len(waiting) > workers:
-                    yield waiting.popleft().result()
-            while waiting:
-                yield waiting.popleft().result()
-        finally:
-            for future in waiting:
-                future.cancel()

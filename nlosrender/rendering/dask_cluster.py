@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import functools
 import logging
-import os
 import signal
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
@@ -14,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from nlosrender.errors import BackendError
+from nlosrender.files.thread_pool import processors
 from nlosrender.rendering.process_layout import ProcessLayout
 
 if TYPE_CHECKING:
@@ -72,7 +72,7 @@ def joined_cluster(scheduler: str | None = None, workers: int | None = None) -> 
         with _connected(scheduler) as client:
             yield Cluster(lambda: client, ProcessLayout(workers=_awaited(client, scheduler, workers)), threads=None)
         return
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    cores = processors()
     count = workers or cores
     with ExitStack() as started:
 

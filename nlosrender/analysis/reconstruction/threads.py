@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor, as_completed
 
-from threadpoolctl import threadpool_limits
-
+from nlosrender.files.thread_pool import in_order
 from nlosrender.rendering.render_report import Progress
 
 
@@ -19,16 +16,8 @@ def in_threads(work: Callable[[int], None], count: int, progress: Progress = lam
     Exception
         Whatever ``work`` raises; what has not begun by then is left out.
     """
-    # The matrix products are small: threads of BLAS would wait for each other, 25 times as long as the work takes
-    with threadpool_limits(1, "blas"), ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
-        jobs = [pool.submit(work, number) for number in range(count)]
-        try:
-            for done, job in enumerate(as_completed(jobs)):
-                job.result()
-                progress((done + 1) / count)
-        finally:
-            for job in jobs:
-                job.cancel()
+    for done, _ in enumerate(in_order(work, range(count))):
+        progress((done + 1) / count)
 
 
 def portion(progress: Progress, done: float, share: float) -> Progress:
