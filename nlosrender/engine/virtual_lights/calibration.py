@@ -16,7 +16,7 @@ import numpy as np
 from nlosrender.engine.interface import Budget
 from nlosrender.engine.launch.pilot_points import SENSORS_PER_AXIS, Pilot, pilot_of
 from nlosrender.engine.launch.schedule import DEFAULT_TARGET
-from nlosrender.engine.virtual_lights.refinement import Gathered, estimated_error, finer_scale, refined_to
+from nlosrender.engine.virtual_lights.refinement import Gathered, Refined, estimated_error, finer_scale, refined_to
 
 if TYPE_CHECKING:
     from nlosrender.engine.virtual_lights.third_bounce import ThirdBounce
@@ -44,9 +44,8 @@ def calibrated_lights(
     gather = cache(lambda scale: third.gather(few, scale))  # a smaller share goes on from these
     known_squares = device.exact_squares(few)
     refined = refined_to(share * target, third.tessellator, gather, known_squares)
-    budget = replace(budget, patch_scale=refined.patch_scale, difference_divisor=refined.divisor)
     if further is None:
-        return budget, (refined.error / target) ** 2
+        return _with_patches(budget, refined), (refined.error / target) ** 2
     gathered, more = refined.gathered, pilot.sensors.size / few.sensors.size
     goal, squares = tuning.rest_share_of_many * target, gathered.squares * more
     squares += device.exact_squares(pilot)
@@ -64,12 +63,15 @@ def calibrated_lights(
     if finer < share:
         share = finer
         refined = refined_to(share * target, third.tessellator, gather, known_squares, refined.patch_scale)
-        budget = replace(budget, patch_scale=refined.patch_scale, difference_divisor=refined.divisor)
     # patches come in steps: what they leave of their share is spent on rounds
     third_squares = min(share, refined.error / target) ** 2
     rounds = further.rounds_needed(error, done, math.sqrt(share_squares - third_squares) * target)
     used = third_squares + (error / target) ** 2 * done / rounds
-    return replace(budget, rounds=rounds), min(used, share_squares)
+    return replace(_with_patches(budget, refined), rounds=rounds), min(used, share_squares)
+
+
+def _with_patches(budget: Budget, refined: Refined) -> Budget:
+    return replace(budget, patch_scale=refined.patch_scale, difference_divisor=refined.divisor)
 
 
 def _pilot_of_patches(third: ThirdBounce, pilot: Pilot) -> Pilot:

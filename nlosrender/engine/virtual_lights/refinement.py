@@ -46,7 +46,7 @@ class Refined:
 def estimated_error(coarse: Gathered, fine: Gathered, known_squares: float = 0.0) -> float:
     """Return the relative L2 error of the finer resolution, with ``known_squares`` of other bounces beside it."""
     noise = _squares(fine.values - coarse.values) / difference_divisor(coarse, fine) ** 2
-    return relative_l2_error(noise, fine.squares + noise + known_squares)
+    return _relative(noise, fine, known_squares)
 
 
 def difference_divisor(coarse: Gathered, fine: Gathered) -> float:
@@ -116,7 +116,7 @@ def refined_to(
             coarse = gather(coarser_scale(tessellator, patch_scale))
             return Refined(patch_scale, fine, estimated_error(coarse, fine, known_squares), None)
         noise = tuning.difference_margin**2 * _squares(gather(finer).values - fine.values)
-        error = relative_l2_error(noise, fine.squares + noise + known_squares)
+        error = _relative(noise, fine, known_squares)
         earlier = next(
             (error for count, error in reversed(levels) if count <= fine.n_patches / tuning.stagnation_ratio), math.inf
         )
@@ -137,6 +137,11 @@ def _order(levels: list[tuple[int, float]], n_patches: int, error: float, bounds
         return 1.0
     count, earlier = levels[-1]
     return float(np.clip(math.log(earlier / error) / math.log(n_patches / count), *bounds))
+
+
+def _relative(noise: float, fine: Gathered, known_squares: float) -> float:
+    """Return the relative L2 error for the square ``noise`` of an absolute one."""
+    return relative_l2_error(noise, fine.squares + noise + known_squares)
 
 
 def _squares(values: NDArray[np.float64]) -> float:
