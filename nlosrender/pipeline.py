@@ -8,7 +8,6 @@ Mitsuba and Dr.Jit are imported only when a render starts, after the backend has
 
 from __future__ import annotations
 
-import functools
 from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
@@ -32,6 +31,7 @@ from nlosrender.rendering.ground_truth import ground_truth
 from nlosrender.rendering.item_in_flight import SAVING, SavePolicy
 from nlosrender.rendering.local_executor import render_items, resumable
 from nlosrender.rendering.outcome import missed_target, missing_light, summed_capture
+from nlosrender.rendering.photon_counts import photon_counts
 from nlosrender.rendering.process_layout import ONE_PROCESS
 from nlosrender.rendering.render_report import Monitor, Progress, RenderReport, Stopwatch, Warn, Warnings, Watch
 from nlosrender.rendering.render_warnings import render_warnings
@@ -134,14 +134,7 @@ def render_capture(
                 job = Job(config, selection, identity, backend.name, processes)
                 render_on_cluster(items, job, budget, partial, stop, cluster, monitor)
             # --- ideal histograms -> what a detector counts of them ---
-            counted: dict[str, object] = {}
-            if config.sensor is not None and selection == WHOLE:  # parts are measured once they are merged
-                from nlosrender.files.measured import add_counts  # SciPy takes time to import
-
-                with stopwatch.stage("measure"):
-                    counted |= partial.extend(
-                        functools.partial(add_counts, config=config.sensor, warn=lambda text: warnings.emit([text]))
-                    )
+            counted = photon_counts(config, selection, partial, stopwatch, warnings)
             # --- results -> attributes, and the partial capture becomes the file ---
             summed = summed_capture(engine, unsampled, partial.finished.sums)
             missed = missed_target(config.render, summed.stated_error)
