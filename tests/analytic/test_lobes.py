@@ -109,21 +109,20 @@ def engines(item: dict[str, Any], folder: Path | None = None) -> tuple[Rendering
     return lights, render(flat_wall(item, spp=2**15, **common), replicas=32, folder=folder)
 
 
+def assert_engines_agree(lights: Rendering, paths: Rendering) -> None:
+    """The third bounce per bin, per sensor point and in total: within the noise of paths and what lights state."""
+    assert lights.samples == 0
+    stated = lights.total_variance
+    assert_agrees(paths.total, paths.total_variance, lights.total, replicas=32, reference_variance=stated, floor=0.01)
+
+
 @pytest.mark.parametrize(
     "name", [pytest.param(name, marks=[] if name == "blend" else pytest.mark.slow) for name in LOBES]
 )
 def test_both_engines_agree_on_every_lobe(name: str) -> None:
     """The third bounce per bin, per sensor point and in total, against the noise of paths."""
     lights, paths = engines(PLACE | {"bsdf": LOBES[name]})
-    assert lights.samples == 0
-    assert_agrees(
-        paths.total,
-        paths.total_variance,
-        lights.total,
-        replicas=32,
-        reference_variance=lights.total_variance,
-        floor=0.01,
-    )
+    assert_engines_agree(lights, paths)
 
 
 @pytest.mark.slow
@@ -143,15 +142,7 @@ def test_lobes_turn_with_a_map_of_normals(kind: str, tmp_path: Path) -> None:
     nested = {"type": "roughconductor", "alpha": 0.3}
     bsdf = {"type": kind, ("normalmap" if kind == "normalmap" else "arbitrary"): relief, "bsdf": nested}
     lights, paths = engines(PLACE | {"bsdf": bsdf}, tmp_path)
-    assert lights.samples == 0
-    assert_agrees(
-        paths.total,
-        paths.total_variance,
-        lights.total,
-        replicas=32,
-        reference_variance=lights.total_variance,
-        floor=0.01,
-    )
+    assert_engines_agree(lights, paths)
 
 
 def test_lobes_follow_averaged_normals(tmp_path: Path) -> None:
@@ -167,15 +158,7 @@ def test_lobes_follow_averaged_normals(tmp_path: Path) -> None:
     (tmp_path / "bowl.obj").write_text("\n".join(lines) + "\n")
     item = {"type": "mesh", "filename": "bowl.obj", "translate": [0, 0, 0.7]}
     lights, paths = engines(item | {"bsdf": {"type": "roughconductor", "alpha": 0.15}}, tmp_path)
-    assert lights.samples == 0
-    assert_agrees(
-        paths.total,
-        paths.total_variance,
-        lights.total,
-        replicas=32,
-        reference_variance=lights.total_variance,
-        floor=0.01,
-    )
+    assert_engines_agree(lights, paths)
 
 
 def facing_plates(bsdf: dict[str, Any], *, turned: bool) -> tuple[dict[str, Any], ...]:
