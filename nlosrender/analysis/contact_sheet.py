@@ -28,9 +28,9 @@ if TYPE_CHECKING:
     from PIL.ImageDraw import ImageDraw
 
 SIDE = 96  # pixels of each of the three pictures of a capture
-LINES, LINE = 3, 13  # of text below, and the height of one
-GAP = 6
-LETTER = 6  # pixels, the width of one
+LINES, LINE = 3, 13  # lines of text below the pictures, and their height [pixels]
+GAP = 6  # between pictures [pixels]
+LETTER = 6  # width of a character of Pillow's default font [pixels]
 COLUMNS = 5
 MAX_CAPTURES = 100
 Picture = NDArray[np.float64]

@@ -39,7 +39,9 @@ class MeasuredPair:
 
 
 def measured_pair(capture: StoredCapture, ideal: Path | None, stack: ExitStack) -> MeasuredPair | None:
-    """Return what is to be drawn of a capture; None where nothing was measured. ``stack`` closes ``ideal``.
+    """Return the counts of a capture and their ideal histograms; None where nothing was measured.
+
+    ``stack`` closes the file ``ideal``.
 
     Raises
     ------
@@ -49,7 +51,7 @@ def measured_pair(capture: StoredCapture, ideal: Path | None, stack: ExitStack) 
     beside = capture.counts()
     try:
         sensor = sensor_of(capture.header)
-    except FileError:  # its response cannot be drawn, all else can
+    except FileError:  # the curve of its response is gone: the ideal panels are drawn without it
         sensor = None
     if capture.header.is_measured and sensor is not None:
         other = None if ideal is None else stack.enter_context(open_capture(ideal))
@@ -89,7 +91,7 @@ def draw_counts(axes: Axes, pair: MeasuredPair, laser: tuple[int, int], pixel: t
 
 
 def draw_response(axes: Axes, pair: MeasuredPair) -> None:
-    """Draw how pulse and detector spread the light of a moment."""
+    """Draw the time response of pulse and detector."""
     source = (pair.ideal or pair.counts).header
     detector = detector_of(pair.sensor, TimeBins(source.start_opl, source.bin_width_opl, source.n_bins))
     response = detector.response

@@ -20,7 +20,7 @@ from nlosrender.pipeline import render_capture
 SIZES = ((64, 512), (128, 640), (256, 640))  # points per edge, bins
 CELLS = 157  # along each edge of a mesh's grid: 2 x 157 x 157 triangles, 49298
 TARGET = 0.02
-DEPTH = 6.0  # m of optical path that the bins cover
+WINDOW = 6.0  # length of the time axis, optical path [m]
 FEWEST = 2  # captures of each size, beside the first, which compiles
 MESHES = 12  # different ones; more captures begin anew
 
@@ -85,7 +85,7 @@ def _family(folder: Path, points: int, bins: int) -> Sweep:
             "sensor_grid": {"nx": points, "ny": points},
             "account_first_and_last_bounces": False,
         },
-        "time_axis": {"bin_width_opl": DEPTH / bins, "n_bins": bins},
+        "time_axis": {"bin_width_opl": WINDOW / bins, "n_bins": bins},
         "render": {"max_bounces": 3, "target_error": TARGET},
         "output": {"path": f"{folder}/{points}-{{index}}.hdf5", "ground_truth": ["depth"]},
         "sweep": {"random": {"count": 1000, "keys": {"scene.hidden_geometry.0": item}}},

@@ -175,7 +175,7 @@ def _joined(values: object, separator: str = ", ") -> str:
 
 
 def _sensor(sensor: object) -> str:
-    """Return what of a sensor is not its default, by its keys."""
+    """Return the keys of a sensor that differ from their defaults, with their values."""
     from nlosrender.config.sensor import SensorConfig
 
     fields = SensorConfig.model_fields

@@ -46,7 +46,7 @@ class Member:
     item: int  # in the file's list
     copy: int  # from 0
     no_overlap: bool
-    floor: float | None  # m
+    floor: float | None  # height of the floor that it stands on [m]; None: it keeps its own height
 
 
 def family_items(tree: Any) -> list[int]:

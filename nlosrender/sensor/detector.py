@@ -62,12 +62,12 @@ class Detector:
 
     @property
     def bins(self) -> TimeBins:
-        """The detector's bins."""
+        """Time bins that photons are counted in."""
         return self.rebinning.detector
 
     @property
     def response(self) -> Response:
-        """Of laser pulse and detector."""
+        """Time response of laser pulse and detector together."""
         return self.rebinning.response
 
     @cached_property
@@ -88,7 +88,7 @@ class Detector:
         return DeadTime(self.bins, self.config.dead_time_ps * OPL_PER_PS, self.config.period_opl)
 
     def _rates(self, light: Float32) -> tuple[Float64, Totals]:
-        """Return r: detections per pulse and bin if none were lost, (bins, points), and sums of them."""
+        """Return r (bins, points), the detections per pulse and bin without pile-up, and sums over them."""
         r = self.rebinning.apply(light).astype(np.float64)
         photons, ratio = light.sum(axis=0, dtype=np.float64), self.config.photon_detection_ratio
         totals = Totals(light.shape[1], float(photons.sum()) * self.scale, float(r.sum()) * self.scale)
@@ -153,7 +153,7 @@ class Detector:
 
     @property
     def _gap_rate(self) -> float:
-        """Detections without the laser per metre, between the bins and the next pulse."""
+        """Background rate [1/m of path] after the last bin, up to the next pulse; 0 where a gate is shut then."""
         gated = self.config.gate is not None
         return 0.0 if gated else self.config.background_rate / SPEED_OF_LIGHT
 

@@ -21,8 +21,8 @@ from nlosrender.files.packages.radiance_hdr import write_hdr
 from nlosrender.files.packages.samples import Float32, WallSample, rounding, wall_sample
 from nlosrender.files.reading.reader import read_header
 
-BINS, BIN = 600, 0.01  # in half wall widths
-SLACK = 1e-3  # of a bin's width
+BINS, BIN = 600, 0.01  # number and width of LFE's time bins, in half wall widths
+SLACK = 1e-3  # relative difference in bin width that is not worth a note
 
 
 def write_lfe(packing: Packing, entries: list[dict[str, Any]], progress: Callable[[float], None]) -> None:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 MIN_WIDTH, MAX_WIDTH = 8, 32767  # of rows that are run-length encoded
 MAX_LITERAL, MAX_RUN = 128, 127  # bytes after one count; a run's count has 128 added
-SMALLEST = 1e-38  # below is black
+SMALLEST = 1e-38  # radiance that the shared exponent can hold; less is stored as black
 Bytes = NDArray[np.uint8]
 
 

@@ -18,7 +18,7 @@ from nlosrender.scene.build import BuiltScene
 from nlosrender.scene.loading.number_of_shape import NumberOfShape
 from nlosrender.scene.pose import Float64
 
-NOTHING = -1  # in place of an item
+NOTHING = -1  # item index where a ray meets no hidden surface
 MAX_CROSSINGS = 256  # of one ray with surfaces; what lies behind them is left out
 # Step of a ray over a surface that it has met, over 1 + the largest coordinate [engine units]: float32 hits are good to
 # 4e-7 of it (ray_offsets.py has the measurement), surfaces closer together are taken for one.
@@ -31,7 +31,7 @@ SHIFT = np.array([0.0717, 0.0533])  # of these rays, in spacings
 
 @dataclass(frozen=True, eq=False)
 class FrontView:
-    """What lies before each point of a grid (ny, nx) on the wall, or NaN and ``NOTHING``."""
+    """Hidden surface in front of each point of a grid (ny, nx) on the wall; NaN and ``NOTHING`` where there is none."""
 
     depth: Float64  # (ny, nx) m from the wall
     position: Float64  # (ny, nx, 3) m
