@@ -1,9 +1,10 @@
-"""Sizes and durations as people read them: a few digits and the unit that suits."""
+"""Sizes and durations as people read them, a few digits and the unit that suits; text from files, safe to print."""
 
 from __future__ import annotations
 
 _DURATIONS = ((100.0, 1.0, "s"), (6000.0, 60.0, "min"), (172_800.0, 3600.0, "h"), (6e7, 86_400.0, "days"))  # below, s
 _JULIAN_YEAR = 31_557_600.0  # s
+SHOWN_LENGTH = 160  # characters of one value in a table; --json has all of it
 
 
 def readable_size(n_bytes: float) -> str:
@@ -22,6 +23,13 @@ def readable_duration(seconds: float) -> str:
         if seconds < bound:
             return f"{_two_digits(seconds / size)} {unit}"
     return f"{_two_digits(seconds / _JULIAN_YEAR)} years"
+
+
+def printable(text: object, max_length: int = SHOWN_LENGTH) -> str:
+    """Return text from a file as one line that is safe to print, cut to ``max_length`` characters."""
+    # attributes are anybody's: control characters would reach the terminal
+    shown = "".join(character if character.isprintable() else ascii(character)[1:-1] for character in str(text))
+    return shown if len(shown) <= max_length else shown[:max_length] + " ..."
 
 
 def _two_digits(number: float) -> str:

@@ -16,8 +16,9 @@ import typer
 from nlosrender import __version__
 from nlosrender.cli import dataset_commands
 from nlosrender.cli.bench_command import bench
+from nlosrender.cli.check_command import check
 from nlosrender.cli.check_engines_command import check_engines
-from nlosrender.cli.compare_command import check, compare
+from nlosrender.cli.compare_command import compare
 from nlosrender.cli.config_commands import new, schema, validate
 from nlosrender.cli.dataset_commands import sheet
 from nlosrender.cli.file_commands import export, frames, info, plot

@@ -8,9 +8,8 @@ from typing import Any
 
 from nlosrender.capture.bounces import LINE_OF_SIGHT
 from nlosrender.cli.stated_error import energies_by_bounce, errors_by_bounce
-from nlosrender.readable import readable_size
+from nlosrender.readable import SHOWN_LENGTH, printable, readable_size
 
-SHOWN_LENGTH = 160  # characters of one value in the table; --json has all of it
 _MAX_LENGTH = {"mesh": 600, "sensor": 600}  # names of materials
 
 
@@ -200,10 +199,3 @@ def _sequence(value: object) -> Sequence[object]:
 
 def _object(value: object) -> dict[str, object]:
     return value if isinstance(value, dict) else {}
-
-
-def printable(text: object, max_length: int = SHOWN_LENGTH) -> str:
-    """Return text from a file as one line that is safe to print."""
-    # attributes are anybody's: control characters would reach the terminal
-    shown = "".join(character if character.isprintable() else ascii(character)[1:-1] for character in str(text))
-    return shown if len(shown) <= max_length else shown[:max_length] + " ..."

@@ -1,4 +1,4 @@
-"""``nlosrender compare`` and ``nlosrender check``: has anything changed?"""
+"""``nlosrender compare``: have two captures anything that differs? The options are those of ``check`` too."""
 
 from __future__ import annotations
 
@@ -12,7 +12,6 @@ from nlosrender.cli.options import AsJson
 
 if TYPE_CHECKING:
     from nlosrender.analysis.comparison.captures import Tolerances
-    from nlosrender.analysis.comparison.dataset import CheckedFile
 
 
 def _tolerance(text: str, metavar: str = "X") -> Any:
@@ -61,7 +60,7 @@ def compare(
     from nlosrender.cli.comparison_table import print_comparison
     from nlosrender.errors import EXIT_COMPARISON_EXCEEDED, EXIT_OK, ComparisonError
 
-    tolerances = _tolerances(max_rel_l2, max_energy, max_shift, z_test, significance)
+    tolerances = tolerances_given(max_rel_l2, max_energy, max_shift, z_test, significance)
     comparison = compare_captures(capture, reference, tolerances)
     report = comparison_report(comparison)
     if as_json:
@@ -73,61 +72,16 @@ def compare(
         raise ComparisonError(listed)
 
 
-def check(
-    folder: Annotated[
-        Path, typer.Argument(metavar="DATASET_DIR", help="Folder with the captures to judge.", readable=False)
-    ],
-    reference: Annotated[
-        Path,
-        typer.Option(metavar="DIR", help="Folder with captures of the same names to judge them by.", readable=False),
-    ],
-    max_rel_l2: MaxRelL2 = None,
-    max_energy: MaxEnergy = None,
-    max_shift: MaxShift = None,
-    z_test: ZTestWanted = False,
-    significance: Significance = 0.01,
-    as_json: AsJson = False,
-) -> None:
-    """Compare every capture of a reference folder with its namesake, as `nlosrender compare` does.
-
-    Exit code 0: within all tolerances; 4: beyond one, or made of other grids, bins, frame; 3: a file that is damaged
-    or no capture. A file missing from DATASET_DIR fails the check, one missing from the reference does not.
-
-    Example: nlosrender check out/ --reference tests/reference/ --z-test (creates nothing; prints one line per
-    capture)
-    """
-    from dataclasses import asdict
-
-    from nlosrender.analysis.comparison.dataset import check_dataset
-    from nlosrender.cli.comparison_table import check_line
-    from nlosrender.errors import ComparisonError, FileError
-
-    def print_line(file: CheckedFile) -> None:
-        if not as_json:
-            typer.echo(check_line(file))
-
-    tolerances = _tolerances(max_rel_l2, max_energy, max_shift, z_test, significance)
-    found = check_dataset(folder, reference, tolerances, print_line)
-    failed = [file for file in found.files if file.status != "ok"]
-    failure = FileError if found.with_status("unreadable") else ComparisonError
-    if as_json:
-        files = [asdict(file) for file in found.files]
-        OUTPUT.print({"agrees": not failed, "files": files, "extra": found.extra}, failure.exit_code if failed else 0)
-    else:
-        for name in found.extra:
-            typer.echo(f"extra       {name}: not in the reference")
-        typer.echo(f"{len(found.files) - len(failed)} of {len(found.files)} captures agree with {reference}")
-    if failed:
-        # what cannot be read is named by its own message
-        listed = "\n".join(
-            f"{'' if file.status == 'unreadable' else f'{file.name}: '}{file.message}" for file in failed
-        )
-        raise failure(listed)
-
-
-def _tolerances(
+def tolerances_given(
     max_rel_l2: float | None, max_energy: float | None, max_shift: float | None, z_test: bool, significance: float
 ) -> Tolerances:
+    """Return the tolerances that the options give.
+
+    Raises
+    ------
+    BadParameter
+        One of them is none.
+    """
     from nlosrender.analysis.comparison.captures import Tolerances
 
     try:

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
-from nlosrender.cli.capture_table import printable
 from nlosrender.cli.tables import print_table
+from nlosrender.readable import printable
 
 if TYPE_CHECKING:
     from nlosrender.analysis.comparison.dataset import CheckedFile

@@ -67,25 +67,35 @@ def load_document(path: Path, overrides: Sequence[str] = ()) -> Document:
         The file cannot be read, or is no YAML mapping. Other issues are those of the document.
     """
     path = Path(path)
+    text, is_pipe = yaml_text(path, f" nlosrender new {path} writes a starter.")
+    document = parse_document(text, str(path), Path.cwd() if is_pipe else path.absolute().parent, overrides)
+    return dataclasses.replace(document, stem="capture") if is_pipe else document
+
+
+def yaml_text(path: Path, if_missing: str = "") -> tuple[str, bool]:
+    """Return the text of a YAML file, and whether it came through a pipe.
+
+    Raises
+    ------
+    ConfigError
+        The file cannot be read; ``if_missing`` is added where there is none.
+    """
     try:
         is_pipe = path.is_fifo()
         with path.open("rb") as file:
             content = file.read(MAX_BYTES + 1)
-        text = content.decode("utf-8-sig")
+        return content.decode("utf-8-sig"), is_pipe
     except UnicodeDecodeError as error:
         message = f"no UTF-8 text: byte 0x{content[error.start]:02x} at offset {error.start}. Save it as UTF-8."
         if len(content) > MAX_BYTES:  # the cut may have split a character; size is the real mistake
             message = f"larger than {MAX_BYTES // 1024} KiB, which no configuration needs."
         raise ConfigError.of_file(str(path), message) from error
     except FileNotFoundError as error:
-        message = f"there is no such file. nlosrender new {path} writes a starter."
-        raise ConfigError.of_file(str(path), message) from error
+        raise ConfigError.of_file(str(path), f"there is no such file.{if_missing}") from error
     except IsADirectoryError as error:
         raise ConfigError.of_file(str(path), "this is a folder, need a YAML file.") from error
     except (OSError, ValueError) as error:
         raise ConfigError.of_file(str(path), f"cannot be read: {getattr(error, 'strerror', error)}.") from error
-    document = parse_document(text, str(path), Path.cwd() if is_pipe else path.absolute().parent, overrides)
-    return dataclasses.replace(document, stem="capture") if is_pipe else document
 
 
 def parse_document(text: str, source: str, folder: Path, overrides: Sequence[str] = ()) -> Document:

@@ -76,6 +76,7 @@ INDEX = _starting("an index of captures by nlosrender", rb'\{\s*"format_version"
 TABLES = {".csv": _starting("a table by nlosrender", rb"index,file,"), ".parquet": _starting("a table", rb"PAR1")}
 REPORT = _starting("a report of nlosrender", rb'\{\s*"facts"')
 PAGE = _starting("a page by nlosrender", rb"<!doctype html>.*<title>nlosrender")
+JUNIT = _starting("a JUnit report by nlosrender", rb"<\?xml[^>]*\?>\s*<testsuites name=\"nlosrender")
 PICTURES = {".png": PNG, ".pdf": PDF, ".svg": SVG, ".gif": GIF, ".exr": EXR}  # by suffix
 
 

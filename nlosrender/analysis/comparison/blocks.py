@@ -165,8 +165,16 @@ def open_for_comparison(path: Path) -> Iterator[OpenCapture]:
         yield capture
 
 
-def blocks(a: OpenCapture, b: OpenCapture, with_variance: bool, block_samples: int = BLOCK_SAMPLES) -> Iterator[Block]:
+def blocks(
+    a: OpenCapture,
+    b: OpenCapture,
+    with_variance: bool,
+    block_samples: int = BLOCK_SAMPLES,
+    only: tuple[int, int] | None = None,
+) -> Iterator[Block]:
     """Yield all parts of two captures of the same structure that either of them stores, laser after laser.
+
+    ``only`` is the one laser (row, column) that is read; None: all.
 
     Raises
     ------
@@ -175,8 +183,7 @@ def blocks(a: OpenCapture, b: OpenCapture, with_variance: bool, block_samples: i
     """
     lasers = b.lasers.turned_shape
     read_variance = [with_variance and capture.header.has_variance for capture in (a, b)]
-    for row, column in np.ndindex(*lasers):
-        laser = (row, column)
+    for laser in np.ndindex(lasers) if only is None else [only]:
         if not (a.stores_laser(laser) or b.stores_laser(laser)):
             continue
         for rows, columns in _tiles(a, block_samples):

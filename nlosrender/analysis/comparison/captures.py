@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from nlosrender.analysis.comparison.alignment import align
+from nlosrender.analysis.comparison.alignment import Alignment, align
 from nlosrender.analysis.comparison.blocks import BLOCK_SAMPLES, OpenCapture, blocks, open_for_comparison
 from nlosrender.analysis.comparison.differences import Differences
 from nlosrender.analysis.comparison.shift import TimeShift
@@ -95,15 +96,11 @@ def compare_captures(
     FileError
         One of them is missing, damaged or not a capture, or the Z-test finds no variance in either.
     """
-    with open_for_comparison(Path(path)) as a, open_for_comparison(Path(reference)) as b:
-        alignment = align(a.capture, b.capture)
-        structure = structure_differences(a.capture, b.capture, alignment)
-        header = alignment.header
+    with open_aligned(path, reference) as pair:
+        a, b, header = pair.a, pair.b, pair.alignment.header
         differences, shift = Differences(header), TimeShift(header)
         test, findings = None, ()  # type: ZTest | None, tuple[Finding, ...]
-        if not structure:
-            a.align(alignment.sensors, alignment.lasers, alignment.lead, header.n_bins)
-            b.align(b.sensors, b.lasers, alignment.reference_lead, header.n_bins)
+        if not pair.structure:
             test = None if tolerances.significance is None else _z_test(a, b, header, tolerances.significance)
             for block in blocks(a, b, with_variance=test is not None, block_samples=block_samples):
                 for sums in (differences, shift, test):
@@ -112,7 +109,36 @@ def compare_captures(
             if test is not None:
                 test.finish()
             findings = tuple(_findings(header, differences, shift, test, tolerances))
-        return Comparison(a.path, b.path, structure, alignment.notes, header, differences, shift, test, findings)
+        notes = pair.alignment.notes
+        return Comparison(a.path, b.path, pair.structure, notes, header, differences, shift, test, findings)
+
+
+@dataclass(frozen=True, eq=False)
+class AlignedPair:
+    """Two open captures, aligned where their structure is the same."""
+
+    a: OpenCapture
+    b: OpenCapture
+    alignment: Alignment
+    structure: tuple[StructureDifference, ...]
+
+
+@contextmanager
+def open_aligned(path: str | Path, reference: str | Path) -> Iterator[AlignedPair]:
+    """Open a capture and a reference for :func:`blocks`.
+
+    Raises
+    ------
+    FileError
+        One of them is missing, damaged or not a capture.
+    """
+    with open_for_comparison(Path(path)) as a, open_for_comparison(Path(reference)) as b:
+        alignment = align(a.capture, b.capture)
+        structure = structure_differences(a.capture, b.capture, alignment)
+        if not structure:
+            a.align(alignment.sensors, alignment.lasers, alignment.lead, alignment.header.n_bins)
+            b.align(b.sensors, b.lasers, alignment.reference_lead, alignment.header.n_bins)
+        yield AlignedPair(a, b, alignment, structure)
 
 
 def _z_test(a: OpenCapture, b: OpenCapture, header: StoredHeader, significance: float) -> ZTest:

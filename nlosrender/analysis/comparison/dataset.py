@@ -1,16 +1,21 @@
-"""``check_dataset``: every capture of a reference folder against its namesake in another."""
+"""``check_dataset``: every capture of a reference folder against its namesake in another; references replaced."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
-from dataclasses import dataclass
+import shutil
+import time
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
 from nlosrender.analysis.comparison.captures import Tolerances, compare_captures
 from nlosrender.analysis.comparison.report import comparison_report
+from nlosrender.analysis.comparison.tolerance_rules import ToleranceRule, refuse_idle_rules, tolerances_of
 from nlosrender.errors import FileError
+from nlosrender.files.atomic_write import check_writable, replacing
+from nlosrender.files.file_kinds import CAPTURE
 
 SUFFIXES = (".hdf5", ".h5")  # names that captures have
 
@@ -25,6 +30,7 @@ class CheckedFile:
     status: Status
     message: str  # why it is not ok; empty when it is
     report: dict[str, Any] | None = None
+    seconds: float = 0.0  # that the comparison took
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,23 +46,43 @@ class DatasetCheck:
 
 
 def check_dataset(
-    folder: Path, reference: Path, tolerances: Tolerances, done: Callable[[CheckedFile], None] = lambda file: None
+    folder: Path,
+    reference: Path,
+    tolerances: Tolerances,
+    done: Callable[[CheckedFile], None] = lambda file: None,
+    rules: Sequence[ToleranceRule] = (),
 ) -> DatasetCheck:
     """Compare every capture below ``reference`` with that of the same relative path below ``folder``.
 
-    Captures are files named .hdf5 or .h5, at any depth, hidden ones excepted; ``done`` is called after each.
+    Captures are files named .hdf5 or .h5, at any depth, hidden ones excepted.
+
+    Parameters
+    ----------
+    folder, reference
+        Folder with the captures to judge, and with those to judge them by.
+    tolerances
+        Of files that no rule is about.
+    done
+        Called after each file.
+    rules
+        Tolerances of single files; the first that applies decides.
 
     Raises
     ------
     FileError
         One of them is no folder, or the reference holds no capture: a check of nothing must not pass.
+    ConfigError
+        A rule decides about no file.
     """
     expected, present = _captures(reference), _captures(folder)
     if not expected:
         raise FileError(f"{reference}: holds no capture (files named {' or '.join(SUFFIXES)}) to check against.")
+    refuse_idle_rules(rules, expected, reference)
     files = []
     for name in expected:
-        file = _check(folder / name, reference / name, name, tolerances)
+        begun = time.perf_counter()
+        file = _check(folder / name, reference / name, name, tolerances_of(name, rules, tolerances))
+        file = replace(file, seconds=time.perf_counter() - begun)
         done(file)
         files.append(file)
     return DatasetCheck(tuple(files), tuple(sorted(set(present) - set(expected))))
@@ -71,6 +97,22 @@ def _check(path: Path, reference: Path, name: str, tolerances: Tolerances) -> Ch
         return CheckedFile(name, "unreadable", str(error))
     failures = comparison.failures
     return CheckedFile(name, "exceeds" if failures else "ok", "; ".join(failures), comparison_report(comparison))
+
+
+def replace_references(files: Iterable[CheckedFile], folder: Path, reference: Path) -> None:
+    """Copy captures over the references they were checked against: each whole or not at all.
+
+    Raises
+    ------
+    FileError
+        A reference is no capture of ours, or cannot be written; then none has been replaced, unless a disk failed.
+    """
+    names = [file.name for file in files]
+    for name in names:
+        check_writable(reference / name, CAPTURE, [folder / name])
+    for name in names:
+        with replacing(reference / name, CAPTURE, [folder / name]) as partial:
+            shutil.copyfile(folder / name, partial)
 
 
 def _captures(folder: Path) -> list[str]:
