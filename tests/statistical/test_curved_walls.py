@@ -58,7 +58,7 @@ def compare(
     stage = Stage.of(scene(name, scan, max_bounces=max_bounces), folder)
     assert stage.engine.name == "virtual_lights"
     assert stage.engine.further is not None or max_bounces == 3
-    budget = finer(stage.engine.calibrate(Budget(target_error=target)), rounds)
+    budget = replace(finer(stage.engine, target), rounds=rounds)
     lights = stage.repeated(budget, range(1, seeds + 1))
     reference = Stage.of(scene(name, scan, "path", spp=spp, target_error=None, max_bounces=max_bounces), folder)
     paths = reference.repeated(Budget(spp=spp), range(101, 101 + seeds))

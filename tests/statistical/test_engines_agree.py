@@ -28,7 +28,7 @@ def compare(
 
     stage: Stage = TRAPS[name].stage(folder)
     assert stage.engine.name == "virtual_lights"
-    budget = finer(stage.engine.calibrate(Budget(target_error=target)))
+    budget = finer(stage.engine, target)
     budget = replace(budget, rounds=rounds if budget.rounds else None, spp=spp if budget.spp else None)
     lights = stage.repeated(budget, seeds)
     reference = TRAPS[name].stage(folder, "path", spp=spp, target_error=None)

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
+from nlosrender.engine.interface import Budget
 from support.agreement import grouped, t_limit
 from support.varied_scenes import Repeated
 
@@ -48,14 +49,14 @@ class Sums:
         return float(stats.norm.isf(stats.t.sf(t, freedom)).max()), int(stated.sum())
 
 
-def finer(budget: Any, rounds: int | None = None) -> Any:
-    """Return a calibrated budget with nine times the patches, and so many rounds.
+def finer(engine: Any, target_error: float) -> Any:
+    """Return the budget of a ninth of the error.
 
     What is stated is the error of all bins together. Of single sums it is a few times that, one to a few percent, which
-    paths of minutes resolve; a ninth of it is below their noise.
+    paths of minutes resolve; a ninth of it is below their noise. Calibrated, not scaled: the divisor of differences is
+    that of two resolutions.
     """
-    scale = budget.patch_scale / 3 if budget.patch_scale else None
-    return replace(budget, patch_scale=scale, rounds=rounds or budget.rounds)
+    return engine.calibrate(Budget(target_error=target_error / 9))
 
 
 def rows(values: Array) -> Array:
