@@ -1,3 +1,48 @@
-"""Batch renderer for non-line-of-sight (NLOS) imaging datasets."""
+"""Batch renderer for non-line-of-sight (NLOS) imaging datasets; docs/python.md has the Python API."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
 
 __version__ = "0.1.0"
+
+if TYPE_CHECKING:
+    from nlosrender.api.configuration import Configuration, Validation, load, plan, validate
+    from nlosrender.api.opened_capture import Capture
+    from nlosrender.api.opened_capture import open_file as open
+    from nlosrender.api.renders import render, render_all
+    from nlosrender.errors import NlosError, NlosWarning
+
+__all__ = [
+    "Capture",
+    "Configuration",
+    "NlosError",
+    "NlosWarning",
+    "Validation",
+    "load",
+    "open",
+    "plan",
+    "render",
+    "render_all",
+    "validate",
+]
+_PLACES = {  # imported when a name is first asked for: ``import nlosrender`` takes milliseconds
+    "api.configuration": ("Configuration", "Validation", "load", "plan", "validate"),
+    "api.opened_capture": ("Capture", "open"),
+    "api.renders": ("render", "render_all"),
+    "errors": ("NlosError", "NlosWarning"),
+}
+
+
+def __getattr__(name: str) -> object:
+    import importlib
+
+    for place, names in _PLACES.items():
+        if name in names:
+            module = importlib.import_module(f"nlosrender.{place}")
+            return getattr(module, "open_file" if name == "open" else name)
+    raise AttributeError(f"module 'nlosrender' has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

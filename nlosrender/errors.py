@@ -121,6 +121,10 @@ class InterruptedRender(NlosError):
     exit_code = EXIT_INTERRUPTED
 
 
+class NlosWarning(UserWarning):
+    """A warning that the command line prints, as Python programs get it."""
+
+
 def nearest(name: str, known: Iterable[str]) -> str | None:
     """Return the known name closest in spelling to ``name``, or None when none is close."""
     import difflib

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, cast
 
 import numpy as np
 
+from nlosrender.analysis.drawn_picture import Picture, picture_kind
 from nlosrender.analysis.laser_view import (
     Float64,
     LaserView,
@@ -39,8 +40,7 @@ from nlosrender.capture.bounces import LINE_OF_SIGHT
 from nlosrender.config.encodable import encodable
 from nlosrender.constants import opl_to_seconds
 from nlosrender.errors import OptionError
-from nlosrender.files.atomic_write import check_writable, replacing
-from nlosrender.files.file_kinds import PICTURES
+from nlosrender.files.atomic_write import check_writable
 from nlosrender.files.reading.reader import StoredCapture, open_capture
 from nlosrender.files.reading.stored_header import StoredHeader
 
@@ -48,7 +48,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure, SubFigure
 
-FORMATS = (".png", ".pdf", ".svg")
 DECADES = 5  # shown of a logarithmic axis
 MAX_ROW_LINES = 1200  # of the row over time, whose panel is about 500 pixels high
 
@@ -80,21 +79,26 @@ def plot_capture(
         There is no such point, or pictures have no such format.
     """
     picture = Path(picture)
-    if picture.suffix.lower() not in FORMATS:
-        raise OptionError(f"--output: got {str(picture)!r}, need a name that ends in one of {', '.join(FORMATS)}")
-    kind = PICTURES[picture.suffix.lower()]
-    check_writable(picture, kind, [path])  # before the work, not after it
+    check_writable(picture, picture_kind(picture), [path])  # before the work, not after it
+    return capture_picture(path, laser, pixel, ideal).save(picture, [path])
+
+
+def capture_picture(
+    path: str | Path,
+    laser: tuple[int, int] | None = None,
+    pixel: tuple[int, int] | None = None,
+    ideal: Path | None = None,
+) -> Picture:
+    """Draw as ``plot_capture`` without writing a file; parameters and errors are its own."""
     with open_capture(path) as capture, ExitStack() as stack:
         sizes = capture.header.sizes
-        _check_point("--laser", laser, sizes["laser_y"], sizes["laser_x"])
-        _check_point("--pixel", pixel, sizes["sensor_y"], sizes["sensor_x"])
-        figure = _draw(capture, laser, pixel, measured_pair(capture, ideal, stack))
-    with replacing(picture, kind, [path]) as partial:
-        figure.savefig(partial, format=picture.suffix[1:].lower(), dpi=130, facecolor=GROUND)
-    return picture
+        check_point("--laser", laser, sizes["laser_y"], sizes["laser_x"])
+        check_point("--pixel", pixel, sizes["sensor_y"], sizes["sensor_x"])
+        return Picture(_draw(capture, laser, pixel, measured_pair(capture, ideal, stack)))
 
 
-def _check_point(option: str, point: tuple[int, int] | None, rows: int, columns: int) -> None:
+def check_point(option: str, point: tuple[int, int] | None, rows: int, columns: int) -> None:
+    """Raise OptionError for a (row, column) that a grid does not have; ``option`` is named."""
     if point is not None and not (0 <= point[0] < rows and 0 <= point[1] < columns):
         raise OptionError(
             f"{option}: got {point[0]},{point[1]}, need a row from 0 to {rows - 1} and a column from 0 to {columns - 1}"

@@ -63,39 +63,29 @@ def validate(
     Example: nlosrender validate z.yaml --set render.spp=64 (creates nothing; prints ok or every mistake with its
     line, exit code 3)
     """
-    from nlosrender.config.load import config_of, load_document
-    from nlosrender.config.sweep_load import sweep_of
-    from nlosrender.config.warnings import config_warnings
-    from nlosrender.scene.item_bounds import item_bounds
+    from nlosrender.api.configuration import validate as validate_one
 
     issues: list[ValidationIssue] = []
     warnings: list[str] = []
     meshes: list[MeshReport] = []
     for path in configs:
         try:
-            document = load_document(path, overrides or ())
-            sweep = sweep_of(document, item_bounds)
-            config = config_of(document) if sweep is None else sweep.config(0)
-            found, lines = list(config_warnings(config)), []  # type: list[str], list[str]
-            if config.scene.has_mesh_files:  # numpy is loaded only for these
-                from nlosrender.scene.meshes.mesh_report import mesh_lines
-                from nlosrender.scene.read_surfaces import describe_meshes
-
-                with document.placing_issues():
-                    read = describe_meshes(config.scene)
-                meshes += read.meshes
-                lines += mesh_lines(read.meshes)
-                found += read.warnings
+            found = validate_one(path, overrides or ())
         except ConfigError as error:
             issues += error.issues
             continue
-        warnings += [f"{path}: {warning}" for warning in found]
+        meshes += found.meshes
+        warnings += [f"{path}: {warning}" for warning in found.warnings]
         if not as_json:
+            sweep = found.configuration.sweep
             captures = "" if sweep is None else f"a sweep of {len(sweep)} captures in {sweep.output_folder}, such as "
-            typer.echo(f"{path}: ok ({captures}{_summary(config)})")
-            for line in lines:
-                typer.echo(f"  mesh {line}")
-            for warning in found:
+            typer.echo(f"{path}: ok ({captures}{_summary(found.first)})")
+            if found.meshes:  # NumPy is imported only for these
+                from nlosrender.scene.meshes.mesh_report import mesh_lines
+
+                for line in mesh_lines(found.meshes):
+                    typer.echo(f"  mesh {line}")
+            for warning in found.warnings:
                 typer.echo(f"warning: {path}: {warning}", err=True)
     if as_json:
         verdict = {

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from nlosrender.cli.capture_table import summary_rows
+from nlosrender.analysis.capture_table import summary_rows
 from nlosrender.cli.json_output import OUTPUT
 from nlosrender.cli.options import AsJson, CameraFile, CaptureFile, beside, two_numbers
 from nlosrender.cli.tables import print_table

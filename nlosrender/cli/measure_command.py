@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
@@ -12,9 +12,6 @@ from nlosrender.cli.json_output import OUTPUT
 from nlosrender.cli.options import AsJson, Overrides, Quiet, one_of, refuse_folder
 from nlosrender.cli.progress import reporting
 from nlosrender.cli.tables import print_table
-
-if TYPE_CHECKING:
-    from nlosrender.config.sensor import SensorConfig
 
 
 def measure(
@@ -58,33 +55,22 @@ def measure(
     if output is None:
         raise typer.BadParameter("missing, the file to write", param_hint="--output")
 
+    from nlosrender.api.opened_capture import sensor_for
     from nlosrender.files.measured import CORRECTABLE, measure_capture
 
     refuse_folder(output, "counts.hdf5")
     corrections = tuple(dict.fromkeys(one_of(name, CORRECTABLE, "--correct") for name in correct or []))
     changes = [*(overrides or []), *([] if seed is None else [f"sensor.seed={seed}"])]
-    config = _sensor(file, sensor, changes)
+    config = sensor_for(file, sensor, changes)
     with reporting("measure", quiet) as (progress, warn, _):
         report = measure_capture(file, output, config, progress, warn, corrections=corrections, overwrite=overwrite)
     if as_json:
         OUTPUT.print(dataclasses.asdict(report) | {"output": str(report.output)})
     elif not quiet:
-        from nlosrender.cli.capture_table import measurement_rows
+        from nlosrender.analysis.capture_table import measurement_rows
 
         typer.echo(f"wrote {report.output}")
         print_table([row for row in measurement_rows(report.measurement) if row[1]], indent=2)
-
-
-def _sensor(file: Path, sensor: str | None, changes: list[str]) -> SensorConfig | None:
-    """Return the sensor that the options describe; None: that of the capture, as it is."""
-    from nlosrender.config.sensor_load import load_sensor
-    from nlosrender.files.measured import sensor_of
-    from nlosrender.files.reading.reader import read_header
-
-    if sensor is None and not changes:
-        return None
-    known = None if sensor is not None else sensor_of(read_header(file))
-    return load_sensor(sensor, known, changes)
 
 
 def _list(as_json: bool) -> None:

@@ -29,8 +29,8 @@ def merge(
     Example: nlosrender merge part*.hdf5 -o whole.hdf5 (creates whole.hdf5, the capture that one render without
     --shard would have written)
     """
+    from nlosrender.analysis.stated_error import energies_by_bounce, stated_error_rows
     from nlosrender.cli.progress import reporting
-    from nlosrender.cli.stated_error import energies_by_bounce, stated_error_rows
     from nlosrender.files.parts.merge import merge_captures
 
     with reporting("merge", quiet) as (progress, warn, _):

@@ -27,18 +27,15 @@ def plan(config: ConfigFile, overrides: Overrides = None, as_json: AsJson = Fals
     Example: nlosrender plan configs/z-letter.yaml --set render.target_error=0.001 (writes nothing; prints the engine
     and why, what is skipped, memory, file size and an estimate of the time)
     """
-    from nlosrender.analysis.render_plan import plan_render
-    from nlosrender.config.load import config_of, load_document
-    from nlosrender.config.sweep_load import sweep_of
-    from nlosrender.scene.item_bounds import item_bounds
+    from nlosrender.api.configuration import load
+    from nlosrender.api.configuration import plan as plan_single
 
-    document = load_document(config, overrides or ())
-    sweep = sweep_of(document, item_bounds)
-    with document.placing_issues():
-        if sweep is not None:
-            _plan_all(sweep, as_json)
-            return
-        found = plan_render(config_of(document))
+    configuration = load(config, overrides or ())
+    if configuration.sweep is not None:
+        with configuration.document.placing_issues():
+            _plan_all(configuration.sweep, as_json)
+        return
+    found = plan_single(configuration)
     if as_json:
         OUTPUT.print(found.as_json())
         return

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from types import TracebackType
 from typing import TYPE_CHECKING, NamedTuple, Self
 
+from nlosrender.api.progress_bar import progress_bar
 from nlosrender.readable import readable_duration
 
 if TYPE_CHECKING:
@@ -68,12 +69,7 @@ def _can_redraw() -> bool:
 def _bar(label: str) -> Iterator[Listeners]:
     from tqdm import tqdm
 
-    layout = "{l_bar}{bar}| {elapsed}<{remaining}{postfix}"
-    with tqdm(total=1.0, desc=label, bar_format=layout, leave=False) as bar:
-
-        def progress(share: float) -> None:
-            with suppress(OSError):  # the terminal is gone: no reason to stop working
-                bar.update(max(0.0, min(share, 1.0) - bar.n))
+    with progress_bar(label, tqdm) as progress:
 
         def warn(text: str) -> None:
             with suppress(OSError):

@@ -92,9 +92,8 @@ def reconstruct(
     silhouette, scored = None, None
     if score:
         from nlosrender.analysis.reconstruction.score import score_front_view
-        from nlosrender.analysis.reconstruction.silhouette import true_silhouette
 
-        silhouette = true_silhouette(found.source, found.source_attributes, found.grid)
+        silhouette = found.silhouette()
         scored = score_front_view(found.front_view(), silhouette)
     attributes: dict[str, object] = {}
     if scored is not None:

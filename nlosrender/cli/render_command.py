@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
-import functools
-import json
-from collections.abc import Callable
+from collections.abc import Mapping
 from contextlib import AbstractContextManager, nullcontext
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -22,11 +20,10 @@ from nlosrender.cli.tables import print_table
 from nlosrender.readable import readable_duration
 
 if TYPE_CHECKING:
+    from nlosrender.api.configuration import Configuration
     from nlosrender.capture.part import Selection
-    from nlosrender.config.document import Config
-    from nlosrender.config.sweep_load import Sweep
     from nlosrender.rendering.dask_cluster import Cluster
-    from nlosrender.rendering.render_report import Progress, RenderReport, Warn
+    from nlosrender.rendering.render_report import RenderReport
 
 
 class Executor(StrEnum):
@@ -85,35 +82,24 @@ def render(
         hint = "--workers" if scheduler is None else "--scheduler"
         raise typer.BadParameter("needs --executor dask", param_hint=hint)
 
-    from nlosrender.config.load import config_of, load_document
-    from nlosrender.config.sweep_load import sweep_of
-    from nlosrender.files.atomic_write import refuse_sources
-    from nlosrender.pipeline import render_capture
-    from nlosrender.scene.item_bounds import item_bounds
+    from nlosrender.api.configuration import load
+    from nlosrender.api.renders import output_change, render_single
 
     changes = list(overrides or [])
     if output is not None:
         refuse_folder(output, "capture.hdf5")
-        changes.append(f"output.path={json.dumps(str(output))}")  # JSON is YAML: "1e3" or "yes" stay text
-    document = load_document(config, changes)
-    sweep = sweep_of(document, item_bounds)
-    if sweep is not None:
-        if lasers is not None:
-            raise typer.BadParameter("cuts one capture, not a sweep; use --shard", param_hint="--lasers")
-        with _cluster(executor, scheduler, workers) as cluster:
-            how = functools.partial(render_capture, cluster=cluster, strict=strict)
-            _render_all(sweep, how, shard=selection.shard, resume=resume, quiet=quiet, as_json=as_json)
-        return
-    loaded = config_of(document)
-    refuse_sources(loaded.output.path, [config])
-    with (
-        document.placing_issues(),
-        _cluster(executor, scheduler, workers) as cluster,
-        reporting("render", quiet) as listeners,
-    ):
-        report = render_capture(
-            loaded, **listeners._asdict(), selection=selection, resume=resume, cluster=cluster, strict=strict
-        )
+        changes += output_change(output)
+    configuration = load(config, changes)
+    if configuration.sweep is not None and lasers is not None:
+        raise typer.BadParameter("cuts one capture, not a sweep; use --shard", param_hint="--lasers")
+    with _cluster(executor, scheduler, workers) as cluster:
+        if configuration.sweep is not None:
+            how: dict[str, Any] = {"cluster": cluster, "strict": strict}
+            _render_all(configuration, how, shard=selection.shard, resume=resume, quiet=quiet, as_json=as_json)
+            return
+        with reporting("render", quiet) as listeners:
+            how = {"selection": selection, "cluster": cluster, "strict": strict}
+            report = render_single(configuration, resume=resume, **listeners._asdict(), **how)
     if as_json:
         OUTPUT.print(dataclasses.asdict(report) | {"output": str(report.output)})
     elif not quiet:
@@ -121,29 +107,20 @@ def render(
 
 
 def _render_all(
-    sweep: Sweep,
-    render_capture: Callable[..., RenderReport],
+    configuration: Configuration,
+    how: Mapping[str, Any],
     *,
     shard: tuple[int, int] | None,
     resume: bool | None,
     quiet: bool,
     as_json: bool,
 ) -> None:
-    """Render the captures of a sweep, each by ``render_capture``, and print the report."""
-    from nlosrender.errors import EXIT_FAILURE, EXIT_OK, RenderError
-    from nlosrender.files.packages.package import pack
-    from nlosrender.rendering.sweep_render import render_sweep
+    """Render the captures of a sweep, and print the report."""
+    from nlosrender.api.renders import refuse_failed, render_captures
+    from nlosrender.errors import EXIT_FAILURE, EXIT_OK
 
     with reporting("sweep", quiet) as listeners:
-
-        def render(config: Config, progress: Progress, warn: Warn, resume: bool | None) -> RenderReport:
-            with sweep.document.placing_issues():  # a capture that fails is reported by the sweep
-                return render_capture(config, progress, warn, resume=resume, watch=listeners.watch)
-
-        report = render_sweep(sweep, render, shard=shard, resume=resume, **listeners._asdict())
-    # a shard does not know whether the others are done
-    is_packed = sweep.dataset.format != "znlos" and shard is None and len(report.failed) < report.captures
-    package = pack(sweep.output_folder) if is_packed else None
+        report, package = render_captures(configuration, shard=shard, resume=resume, **listeners._asdict(), **how)
     if as_json:
         told = dataclasses.asdict(report) | {"index": str(report.index), "package": package}
         OUTPUT.print(told, EXIT_FAILURE if report.failed else EXIT_OK)
@@ -153,9 +130,7 @@ def _render_all(
         print_table([("rendered", rendered), ("took", readable_duration(report.seconds))], indent=2)
         if package is not None:
             print_packed(package)
-    if report.failed:
-        listed = "\n".join(f"{entry.file}: {entry.message}" for entry in report.failed)
-        raise RenderError(f"{listed}\n{len(report.failed)} of {report.captures} captures failed.")
+    refuse_failed(report)
 
 
 def _cluster(
@@ -184,7 +159,7 @@ def _selection(shard: str | None, lasers: str | None) -> Selection:
 
 
 def _print_report(report: RenderReport) -> None:
-    from nlosrender.cli.stated_error import energies_by_bounce, errors_by_bounce, stated_error_rows
+    from nlosrender.analysis.stated_error import energies_by_bounce, errors_by_bounce, stated_error_rows
 
     is_view = report.engine == LINE_OF_SIGHT  # that engine renders nothing else
     typer.echo(f"wrote {report.output}" + (f", {report.part} of the capture" if report.part else ""))

@@ -2,23 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from nlosrender.config.load import in_order, load_document, validated
+from nlosrender.config.mapping_load import mapping_document
 from nlosrender.config.overrides import apply_overrides
 from nlosrender.config.sensor import SensorConfig, profile_names
 from nlosrender.config.yaml_tree import Document, Place
 from nlosrender.errors import ConfigError
 
 
-def load_sensor(name: str | None, known: SensorConfig | None, overrides: Sequence[str]) -> SensorConfig:
+def load_sensor(
+    name: str | Mapping[str, object] | None, known: SensorConfig | None, overrides: Sequence[str]
+) -> SensorConfig:
     """Return a validated sensor.
 
     Parameters
     ----------
     name
-        A profile, or a YAML file: a configuration with a section ``sensor``, or the keys of one alone.
+        A profile, or a YAML file: a configuration with a section ``sensor``, or the keys of one alone, which a mapping
+        has, too.
     known
         The sensor without a name.
     overrides
@@ -29,7 +33,9 @@ def load_sensor(name: str | None, known: SensorConfig | None, overrides: Sequenc
     ConfigError
         With every issue found.
     """
-    if name is not None and name not in profile_names() and Path(name).suffix in (".yaml", ".yml"):
+    if isinstance(name, Mapping):
+        document = mapping_document({"sensor": name})
+    elif name is not None and name not in profile_names() and Path(name).suffix in (".yaml", ".yml"):
         document = load_document(Path(name))
         if "sensor" not in document.tree:
             document.tree = {"sensor": document.tree}

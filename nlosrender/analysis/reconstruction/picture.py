@@ -7,12 +7,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from nlosrender.analysis.drawn_picture import Picture
 from nlosrender.analysis.reconstruction.reconstruct import SEPARATOR, Reconstruction, settings_text
 from nlosrender.analysis.reconstruction.score import Score, otsu_threshold
 from nlosrender.analysis.theme import COLORMAP, FAINT, GROUND, INK, MARK, color_bar, style
 from nlosrender.config.encodable import encodable
-from nlosrender.files.atomic_write import replacing
-from nlosrender.files.file_kinds import PNG
 from nlosrender.files.layout import Float64
 from nlosrender.files.reading.scan import Float32
 
@@ -27,19 +26,23 @@ BACKGROUND_SHARE = 0.5  # of the threshold between object and background below w
 def draw_reconstruction(
     reconstruction: Reconstruction, path: str | Path, silhouette: Float64 | None = None, score: Score | None = None
 ) -> Path:
-    """Draw a reconstruction as a .png, outlined by the true front view ``silhouette`` (y, x); return ``path``.
+    """Draw a reconstruction as a .png, .pdf or .svg, outlined by the true front ``silhouette`` (y, x).
 
-    The front is drawn as the wall sees it, so that letters facing the wall read as they should.
+    The front is drawn as the wall sees it, so that letters facing the wall read as they should. Returns ``path``.
 
     Raises
     ------
     FileError
         The picture cannot be written.
     """
-    figure = _figure(reconstruction, silhouette, score)
-    with replacing(path, PNG) as partial:
-        figure.savefig(partial, format="png", dpi=130, facecolor=GROUND)
-    return Path(path)
+    return reconstruction_picture(reconstruction, silhouette, score).save(path)
+
+
+def reconstruction_picture(
+    reconstruction: Reconstruction, silhouette: Float64 | None = None, score: Score | None = None
+) -> Picture:
+    """Draw as ``draw_reconstruction`` without writing a file."""
+    return Picture(_figure(reconstruction, silhouette, score))
 
 
 def _figure(reconstruction: Reconstruction, silhouette: Float64 | None, score: Score | None) -> Figure:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -19,6 +20,10 @@ from nlosrender.files.measured import few_counts
 from nlosrender.files.reading.reader import open_capture
 from nlosrender.files.reading.scan import Float32, chosen_bounces, read_scan
 from nlosrender.rendering.render_report import Progress, Warn, Warnings
+
+if TYPE_CHECKING:
+    from nlosrender.analysis.drawn_picture import Picture
+    from nlosrender.analysis.reconstruction.score import Score
 
 METHODS = ("phasor", "backprojection")
 FILTER_WAVELENGTHS = 1 / 8  # width of the backprojection's filter: about the depth resolution of phasor fields
@@ -99,6 +104,42 @@ class Reconstruction:
         bend = before - 2 * top + after
         shift = np.divide(before - after, 2 * bend, out=np.zeros_like(top), where=(bend < 0) & (peak == inner))
         return self.grid.z[peak] + shift * self.grid.voxel_size
+
+    def silhouette(self) -> Float64:
+        """Return the share of each front pixel (y, x) that the true hidden geometry covers.
+
+        Raises
+        ------
+        FileError
+            The capture does not carry its scene, or a shape's outline is not known without a renderer.
+        """
+        from nlosrender.analysis.reconstruction.silhouette import true_silhouette
+
+        return true_silhouette(self.source, self.source_attributes, self.grid)
+
+    def score(self) -> Score:
+        """Return how well the front view matches the true silhouette.
+
+        Raises
+        ------
+        FileError, NlosError
+            As ``silhouette``; or nothing can be compared.
+        """
+        from nlosrender.analysis.reconstruction.score import score_front_view
+
+        return score_front_view(self.front_view(), self.silhouette())
+
+    def plot(self) -> Picture:
+        """Draw the front view, the depth, and the views from above and from the side."""
+        from nlosrender.analysis.reconstruction.picture import reconstruction_picture
+
+        return reconstruction_picture(self)
+
+    def save(self, path: str | Path) -> Path:
+        """Write the volume as an HDF5 file and return ``path``; FileError where that cannot be done."""
+        from nlosrender.analysis.reconstruction.volume_file import write_volume
+
+        return write_volume(self, path)
 
 
 def reconstruct_capture(

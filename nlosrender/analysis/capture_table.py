@@ -6,8 +6,8 @@ import json
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from nlosrender.analysis.stated_error import energies_by_bounce, errors_by_bounce
 from nlosrender.capture.bounces import LINE_OF_SIGHT
-from nlosrender.cli.stated_error import energies_by_bounce, errors_by_bounce
 from nlosrender.readable import SHOWN_LENGTH, printable, readable_size
 
 _MAX_LENGTH = {"mesh": 600, "sensor": 600}  # names of materials
