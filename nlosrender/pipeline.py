@@ -30,7 +30,7 @@ from nlosrender.rendering.dask_worker import Job
 from nlosrender.rendering.ground_truth import ground_truth
 from nlosrender.rendering.item_in_flight import SAVING, SavePolicy
 from nlosrender.rendering.local_executor import render_items, resumable
-from nlosrender.rendering.outcome import missed_target, missing_light, summed_capture
+from nlosrender.rendering.outcome import missed_target, missing_light, remarks, summed_capture
 from nlosrender.rendering.photon_counts import photon_counts
 from nlosrender.rendering.process_layout import ONE_PROCESS
 from nlosrender.rendering.render_report import Monitor, Progress, RenderReport, Stopwatch, Warn, Warnings, Watch
@@ -143,6 +143,7 @@ def render_capture(
             # the file of an earlier run may say another sensor
             configured = {name: provenance[name] for name in ("config", "config_hash")}
             results = summed.attributes(stopwatch.report()) | configured | counted
+            results |= remarks(engine, config, warnings.emitted)
             if selection != WHOLE:
                 results |= part_attributes(plan.part, plan.tiling, partial.finished)
             elif missed:

@@ -10,7 +10,7 @@ from nlosrender.analysis.stated_error import energies_by_bounce, errors_by_bounc
 from nlosrender.capture.bounces import LINE_OF_SIGHT
 from nlosrender.readable import SHOWN_LENGTH, printable, readable_size
 
-_MAX_LENGTH = {"mesh": 600, "sensor": 600}  # names of materials
+_MAX_LENGTH = {"mesh": 600, "sensor": 600, "WARNING": 600}  # names of materials
 
 
 def summary_rows(summary: dict[str, Any]) -> list[tuple[str, str]]:
@@ -45,7 +45,7 @@ def _rows(summary: dict[str, Any]) -> list[tuple[str, str]]:
         ("frame", _text(summary["frame"])),
         ("scene" if is_view else "hidden volume", f"{_joined(edges, ' x ')} m, centre {center}" if has_volume else ""),
         ("data", f"{samples}, compression {summary['compression']}{variance}"),
-        ("engine", _text(summary["engine"])),
+        ("engine", ": ".join(filter(None, map(_text, (summary["engine"], summary["engine_reason"]))))),
         ("samples per pixel" if is_view else "samples per pair", _text(summary["samples"])),
         ("seed", _text(summary["seed"])),
         ("error estimate", _error(summary)),
@@ -53,6 +53,8 @@ def _rows(summary: dict[str, Any]) -> list[tuple[str, str]]:
         ("energy", energies_by_bounce(_object(summary["energy"]), _object(summary["energy_error_per_bounce"]))),
         *(("NOT SAMPLED", _text(paths)) for paths in _sequence(summary["unsampled_paths"] or [])),
         *(("ZERO BECAUSE", _text(reason)) for reason in _sequence(summary["zero_because"] or [])),
+        *(("WARNING", _text(warning)) for warning in _sequence(summary["warnings"] or [])),
+        *(("skipped", _text(work)) for work in _sequence(summary["omitted_work"] or [])),
         ("outside the window", _text(summary["out_of_window_energy"])),
         ("sensor", _sensor(summary["sensor"])),
         *measurement_rows(_object(summary["measurement"])),

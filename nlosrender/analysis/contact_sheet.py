@@ -50,7 +50,7 @@ def contact_sheet(folder: str | Path, output: str | Path, most: int = MAX_CAPTUR
     entries = [entry for entry in read_index(folder)["captures"] if entry["status"] != "pending"]
     if not entries:
         raise FileError(f"{folder}: no capture is finished yet.")
-    chosen = [entries[at] for at in np.unique(np.linspace(0, len(entries) - 1, min(most, len(entries))).astype(int))]
+    chosen = [entries[at] for at in evenly(len(entries), most)]
     columns = min(columns, len(chosen))
     width, height = 3 * SIDE + 2 * GAP, SIDE + LINES * LINE + GAP
     rows = -(-len(chosen) // columns)
@@ -59,24 +59,35 @@ def contact_sheet(folder: str | Path, output: str | Path, most: int = MAX_CAPTUR
     for number, entry in enumerate(chosen):
         x, y = number % columns * (width + 2 * GAP) + GAP, number // columns * (height + 2 * GAP) + GAP
         try:
-            pictures = _pictures(folder / entry["file"]) if entry["status"] == "done" else None
+            pictures = capture_pictures(folder / entry["file"]) if entry["status"] == "done" else None
         except FileError as error:
             pictures, entry = None, {**entry, "message": str(error)}
         if pictures is not None:
             truth, wall, histogram = pictures
             for place, picture in enumerate((truth, wall)):
                 if picture is not None:
-                    sheet.paste(Image.fromarray(_square(picture)), (x + place * (SIDE + GAP), y))
+                    sheet.paste(Image.fromarray(square(picture)), (x + place * (SIDE + GAP), y))
             _draw_histogram(draw, histogram, x + 2 * (SIDE + GAP), y)
-        for line, text in enumerate(_text(entry, width // LETTER)):
+        for line, text in enumerate(entry_text(entry, width // LETTER)):
             draw.text((x, y + SIDE + 2 + line * LINE), text, fill=INK if line == 0 else FAINT)
     with replacing(output, PNG) as partial:
         sheet.save(partial, format="PNG")
     return len(chosen)
 
 
-def _pictures(path: Path) -> tuple[Picture | None, Picture, Picture]:
-    """Return front view and wall at the peak (rows, columns, 3), and the brightest point's histogram, from 0 to 1."""
+def evenly(count: int, most: int) -> list[int]:
+    """Return at most ``most`` of ``count`` indices, evenly chosen, the first and the last among them."""
+    return np.unique(np.linspace(0, count - 1, min(most, count)).astype(int)).tolist() if count else []
+
+
+def capture_pictures(path: Path) -> tuple[Picture | None, Picture, Picture]:
+    """Return front view and wall at the peak (rows, columns, 3), and the brightest point's histogram, from 0 to 1.
+
+    Raises
+    ------
+    FileError
+        The file is missing, damaged or no capture.
+    """
     with open_capture(path) as capture:
         sizes = capture.header.sizes
         laser = (0, 0) if capture.header.confocal else (sizes["laser_y"] // 2, sizes["laser_x"] // 2)
@@ -109,7 +120,7 @@ def _scaled(values: Picture) -> Picture:
     return values / max(float(values.max(initial=0)), 1e-300)
 
 
-def _square(picture: Picture) -> NDArray[np.uint8]:
+def square(picture: Picture) -> NDArray[np.uint8]:
     """Return a grid on the wall as bytes of ``SIDE`` x ``SIDE`` pixels, its sides' ratio kept.
 
     It is what the wall sees: wall y upwards, wall x to the left, so that letters can be read.
@@ -135,7 +146,7 @@ def _draw_histogram(draw: ImageDraw, histogram: Picture, x: int, y: int) -> None
     draw.line(list(zip(places.tolist(), heights.tolist(), strict=True)), fill=MARK)
 
 
-def _text(entry: Mapping[str, Any], width: int) -> list[str]:
+def entry_text(entry: Mapping[str, Any], width: int) -> list[str]:
     """Return index, split, label, error, and the drawn values, cut to lines."""
     error = entry["error_estimate"]
     head = [str(entry["index"]), entry["split"], entry["label"], None if error is None else f"{100 * error:.2g} %"]
@@ -144,18 +155,20 @@ def _text(entry: Mapping[str, Any], width: int) -> list[str]:
         first, rest = f"{entry['index']}  FAILED", str(entry["message"])
     else:
         shown = ((key, value) for key, value in entry["values"].items() if key != "render.seed")
-        rest = "  ".join(f"{_short(key)} {_shown(value)}" for key, value in shown)
+        rest = "  ".join(f"{short_key(key)} {shown_value(value)}" for key, value in shown)
     return [first[:width], *textwrap.wrap(rest, width)[: LINES - 1]]
 
 
-def _short(key: str) -> str:
+def short_key(key: str) -> str:
+    """Return the last part of a dotted key, with the one before it where that is a number."""
     parts = key.split(".")
     return ".".join(parts[-2:] if parts[-1].isdigit() else parts[-1:])
 
 
-def _shown(value: Any) -> str:
+def shown_value(value: Any) -> str:
+    """Return a drawn value with three digits; of a file its name alone."""
     if isinstance(value, float):
         return f"{value:.3g}"
     if isinstance(value, list):
-        return ",".join(_shown(item) for item in value)
+        return ",".join(shown_value(item) for item in value)
     return Path(value).name if isinstance(value, str) else json.dumps(value)

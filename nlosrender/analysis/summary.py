@@ -10,11 +10,11 @@ from nlosrender.analysis.json_values import finite_or_none
 from nlosrender.constants import opl_to_seconds
 from nlosrender.errors import FileError
 from nlosrender.files.attributes import text_list
-from nlosrender.files.capture_results import UNSAMPLED, ZERO
+from nlosrender.files.capture_results import OMITTED, UNSAMPLED, WARNINGS, ZERO
 from nlosrender.files.reading.reader import read_header
 
 # keys of the summary that are attributes of the file, as text, number or JSON
-_ATTRIBUTES = {"engine": "render_engine", "written_by": "engine"} | {
+_ATTRIBUTES = {"engine": "render_engine", "engine_reason": "engine_reason", "written_by": "engine"} | {
     name: name
     for name in (
         *("samples", "seed", "error_estimate", "error_estimate_per_bounce", "energy", "energy_error_per_bounce"),
@@ -71,8 +71,10 @@ def summarise(path: str | Path) -> dict[str, object]:
         "has_variance": header.has_variance,
         "size_on_disk": size,
         "size_of_samples": prod(header.data_shape) * header.itemsize,
-        "unsampled_paths": list(text_list(attributes, UNSAMPLED)) if UNSAMPLED in attributes else None,
-        "zero_because": list(text_list(attributes, ZERO)) if ZERO in attributes else None,
+        **{
+            name: list(text_list(attributes, name)) if name in attributes else None
+            for name in (UNSAMPLED, ZERO, WARNINGS, OMITTED)
+        },
         **{key: _unpacked(attributes.get(name)) for key, name in _ATTRIBUTES.items()},
     }
     return finite_or_none(summary)

@@ -32,6 +32,7 @@ from nlosrender.cli.paper_command import paper
 from nlosrender.cli.plan_command import plan
 from nlosrender.cli.reconstruct_command import reconstruct
 from nlosrender.cli.render_command import render
+from nlosrender.cli.report_command import report
 from nlosrender.cli.streams import give_up_stderr, open_closed_streams, print_any_name
 from nlosrender.errors import EXIT_FAILURE, EXIT_INTERRUPTED, ConfigError, NlosError, ValidationIssue
 
@@ -56,7 +57,7 @@ def _add(command: Callable[..., Any], to: typer.Typer = app) -> None:
 
 _COMMANDS: tuple[Callable[..., Any], ...] = (
     *(render, measure, merge, plan, new, import_, validate, schema, info, plot, frames, reconstruct, export, doctor),
-    *(compare, check, check_engines, bench, paper, sheet),
+    *(report, compare, check, check_engines, bench, paper, sheet),
 )
 for _command in _COMMANDS:
     _add(_command)

@@ -13,6 +13,7 @@ from nlosrender.files.sums import Sums
 
 UNSAMPLED, ZERO, MISSED = "unsampled_paths", "zero_because", "target_missed"
 UNKNOWN_FROM = "unsampled_first_bounce"
+WARNINGS, OMITTED = "warnings", "omitted_work"  # of the render: lists of texts
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from nlosrender.config.sweep_load import CaptureFacts, Sweep
 
 INDEX_NAME = "index.json"
+SHARD_INDICES = "index-*-of-*.json"
 FORMAT_VERSION = 1
 
 Status = Literal["done", "pending", "failed"]
@@ -171,6 +172,11 @@ def pyarrow() -> Any:
     return pyarrow
 
 
+def has_index(folder: Path) -> bool:
+    """Return whether a folder has an index of its captures, or those of shards."""
+    return (folder / INDEX_NAME).is_file() or any(folder.glob(SHARD_INDICES))
+
+
 def read_index(folder: str | Path) -> dict[str, Any]:
     """Return the index of a dataset's folder; where only those of shards are there, what they say together.
 
@@ -181,7 +187,7 @@ def read_index(folder: str | Path) -> dict[str, Any]:
     """
     folder = Path(folder)
     whole = folder / INDEX_NAME
-    paths = [whole] if whole.is_file() else sorted(folder.glob("index-*-of-*.json"))
+    paths = [whole] if whole.is_file() else sorted(folder.glob(SHARD_INDICES))
     if not paths:
         raise FileError(f"{folder}: holds no {INDEX_NAME}. Name the folder that a sweep was rendered into.")
     contents = []

@@ -27,7 +27,7 @@ from nlosrender.files import layout
 from nlosrender.files.atomic_write import check_writable, replacing
 from nlosrender.files.attributes import json_object, set_attributes, text_list
 from nlosrender.files.capture_header import CaptureHeader
-from nlosrender.files.capture_results import UNSAMPLED, ZERO
+from nlosrender.files.capture_results import OMITTED, UNSAMPLED, WARNINGS, ZERO
 from nlosrender.files.chunking import Chunker, PackedChunk
 from nlosrender.files.file_kinds import CAPTURE, MEASURED
 from nlosrender.files.hdf5_writer import HDF5Writer
@@ -51,7 +51,18 @@ from nlosrender.sensor.zones import zone_of_points, zone_sums
 SENSOR, MEASUREMENT, CORRECTIONS = "sensor", "measurement", "corrections"  # attributes
 BLOCK_SAMPLES = 2**21  # of light or counts at a time and thread: some ten arrays of 16 MB
 # of the ideal capture's attributes, what stays true of its counts
-KEPT = ("config", "config_hash", "versions", "render_engine", "meshes", UNSAMPLED, ZERO)
+KEPT = (
+    "config",
+    "config_hash",
+    "versions",
+    "render_engine",
+    "engine_reason",
+    "meshes",
+    UNSAMPLED,
+    ZERO,
+    OMITTED,
+    WARNINGS,
+)
 CORRECTABLE = ("pile_up", "background")
 LARGE_NOISE = 10  # signal over noise of the sum of a histogram
 

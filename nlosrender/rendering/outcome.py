@@ -1,12 +1,14 @@
-"""What a render says of itself when it is done: light that is missing, why H is zero, a target that was missed."""
+"""What a render says of itself when it is done: what was left out or is missing, why H is zero, a target missed."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
+from nlosrender.config.document import Config
 from nlosrender.config.render import RenderConfig
 from nlosrender.errors import ConfigError, ValidationIssue
-from nlosrender.files.capture_results import SummedCapture
+from nlosrender.files.capture_results import OMITTED, WARNINGS, SummedCapture
 
 if TYPE_CHECKING:
     from nlosrender.engine.interface import Engine
@@ -27,6 +29,15 @@ def summed_capture(engine: Engine, unsampled: tuple[UnsampledPaths, ...], sums: 
         () if sums.squares else zero_reasons(engine, unsampled, float(sums.outside)),
         min((paths.first_bounce for paths in unsampled), default=None),
     )
+
+
+def remarks(engine: Engine, config: Config, warnings: Iterable[str]) -> dict[str, object]:
+    """Return the attributes that say why this engine rendered, what it left out and why, and the warnings."""
+    from nlosrender.engine.preflight.omitted_work import omitted_work
+
+    omitted = omitted_work(engine, scene_is_colored=config.scene.is_colored)
+    stated = [f"{work.what}: {work.why}" for work in omitted]
+    return {"engine_reason": engine.reason, OMITTED: stated, WARNINGS: list(warnings)}
 
 
 def missing_light(engine: Engine, strict: bool = False) -> tuple[UnsampledPaths, ...]:

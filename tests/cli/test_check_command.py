@@ -8,7 +8,6 @@ import pty
 import re
 import subprocess
 import sys
-from html.parser import HTMLParser
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -16,6 +15,7 @@ import numpy as np
 import pytest
 from support import commands
 from support.commands import Done
+from support.pages import Page
 from support.point_captures import cells, points_header, write_light
 
 from nlosrender.errors import (
@@ -53,21 +53,6 @@ def folders(tmp_path: Path) -> Path:
 def check(folder: Path, *options: object) -> Done:
     """Run ``check out --reference ref``."""
     return commands.run(folder, "check", "out", "--reference", "ref", *options)
-
-
-class Page(HTMLParser):
-    """The tags of a page, and the addresses it would load."""
-
-    def __init__(self, text: str):
-        super().__init__()
-        self.tags: list[str] = []
-        self.addresses: list[str] = []
-        self.feed(text)
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        """Note a tag."""
-        self.tags.append(tag)
-        self.addresses += [value or "" for key, value in attrs if key in ("src", "href", "srcset", "data")]
 
 
 def test_junit_counts_what_the_check_finds(folders: Path) -> None:

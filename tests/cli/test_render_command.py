@@ -46,6 +46,9 @@ def test_a_render_leaves_a_valid_file_and_an_honest_report(scan, tmp_path):
         # float32 samples: the sum of n of them is off by less than n * 6e-8 of it
         assert file["data"][...].sum(dtype=float) == pytest.approx(sum(report["energy"].values()), rel=1e-5)
         assert json.loads(file.attrs["config"])["render"]["spp"] == 64
+        assert json.loads(file.attrs["warnings"]) == report["warnings"]
+        assert file.attrs["engine_reason"] == report["reason"]
+        assert "second bounce: no light goes straight" in file.attrs["omitted_work"]  # the wall is planar
 
 
 @pytest.mark.parametrize("part", [("--lasers", "0:99"), ("--shard", "1/16")])

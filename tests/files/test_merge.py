@@ -69,6 +69,19 @@ def test_laser_ranges_of_any_length(tmp_path: Path, header_of: Callable, block_o
         np.testing.assert_array_equal(np.transpose(file["data"][0], (1, 4, 5, 2, 3, 0))[:2], block[0])
 
 
+def test_warnings_and_omitted_work_of_all_parts_are_kept(tmp_path: Path, shards: list[Path]) -> None:
+    """Each text once, in the order of the parts."""
+    for number, path in enumerate(shards):
+        with h5py.File(path, "r+") as file:
+            file.attrs["warnings"] = json.dumps(["of all", f"of part {number}"])
+            file.attrs["omitted_work"] = json.dumps(["colour"])
+    merge_captures(shards, tmp_path / "merged.hdf5")
+    with h5py.File(tmp_path / "merged.hdf5") as file:
+        expected = ["of all", *(f"of part {number}" for number in range(len(shards)))]
+        assert json.loads(file.attrs["warnings"]) == expected
+        assert json.loads(file.attrs["omitted_work"]) == ["colour"]
+
+
 def test_a_shard_says_what_it_holds(tmp_path: Path, header_of: Callable, block_of: Callable) -> None:
     """Alone it is a valid file, dark where other shards are lit, and its attributes say so."""
     header = header_of()

@@ -74,7 +74,7 @@ def check_dataset(
     ConfigError
         A rule decides about no file.
     """
-    expected, present = _captures(reference), _captures(folder)
+    expected, present = captures_below(reference), captures_below(folder)
     if not expected:
         raise FileError(f"{reference}: holds no capture (files named {' or '.join(SUFFIXES)}) to check against.")
     refuse_idle_rules(rules, expected, reference)
@@ -115,8 +115,14 @@ def replace_references(files: Iterable[CheckedFile], folder: Path, reference: Pa
             shutil.copyfile(folder / name, partial)
 
 
-def _captures(folder: Path) -> list[str]:
-    """Return the captures below a folder as sorted relative paths."""
+def captures_below(folder: Path) -> list[str]:
+    """Return the captures below a folder as sorted relative paths.
+
+    Raises
+    ------
+    FileError
+        It is no folder, or one in it cannot be read.
+    """
     if not folder.is_dir():
         raise FileError(f"{folder}: there is no such folder" if not folder.exists() else f"{folder}: is no folder")
 

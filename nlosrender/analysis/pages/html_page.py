@@ -38,6 +38,7 @@ def write_page(path: Path, template: str, sources: Iterable[Path] = (), **values
 
 def _environment() -> Environment:
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
+    from markupsafe import Markup, escape
 
     environment = Environment(
         loader=FileSystemLoader(Path(__file__).parent),
@@ -49,6 +50,9 @@ def _environment() -> Environment:
         finalize=lambda value: printable(value, MAX_TEXT) if type(value) is str else value,
     )
     environment.filters |= {"size": readable_size, "duration": readable_duration, "number": number, "percent": percent}
+    environment.filters["lines"] = lambda text: Markup(
+        escape("\n".join(printable(line, MAX_TEXT) for line in text.split("\n")))
+    )
     return environment
 
 
@@ -63,20 +67,20 @@ def percent(share: float | None, infinite: str = "infinite") -> str:
 
 
 def colored(values: Float64, colormap: str, low: float, high: float) -> str:
-    """Return (rows, columns) on the wall as a data URI: PNG, one pixel per point, the first row at the bottom."""
+    """Return (rows, columns) on the wall as a picture's address: one pixel per point, the first row at the bottom."""
     from matplotlib import colormaps
-    from PIL import Image
 
     share = (values[::-1] - low) / (high - low if high > low else 1.0)
-    colors = np.round(255 * np.asarray(colormaps[colormap](np.clip(share, 0, 1)))[..., :3]).astype(np.uint8)
+    return picture_uri(np.round(255 * np.asarray(colormaps[colormap](np.clip(share, 0, 1)))[..., :3]).astype(np.uint8))
+
+
+def picture_uri(picture: NDArray[np.uint8]) -> str:
+    """Return (row, column, 3) as an address that holds a PNG of it."""
+    from PIL import Image
+
     content = io.BytesIO()
-    Image.fromarray(colors).save(content, format="PNG", optimize=True)
-    return data_uri(content.getvalue(), "image/png")
-
-
-def data_uri(content: bytes, kind: str) -> str:
-    """Return bytes as an address that holds them."""
-    return f"data:{kind};base64,{base64.b64encode(content).decode('ascii')}"
+    Image.fromarray(picture).save(content, format="PNG", optimize=True)
+    return f"data:image/png;base64,{base64.b64encode(content.getvalue()).decode('ascii')}"
 
 
 def curve(values: Float64, top: float) -> str:

@@ -21,7 +21,15 @@ from nlosrender.errors import FileError
 from nlosrender.files import layout
 from nlosrender.files.atomic_write import check_writable, explained_write, replacing
 from nlosrender.files.attributes import json_object, set_attributes, text_list
-from nlosrender.files.capture_results import UNKNOWN_FROM, UNSAMPLED, ZERO, CaptureResults, SummedCapture
+from nlosrender.files.capture_results import (
+    OMITTED,
+    UNKNOWN_FROM,
+    UNSAMPLED,
+    WARNINGS,
+    ZERO,
+    CaptureResults,
+    SummedCapture,
+)
 from nlosrender.files.file_kinds import CAPTURE, FileKind, same_capture
 from nlosrender.files.hdf5_writer import HDF5Writer
 from nlosrender.files.identity import SELECTION
@@ -163,7 +171,13 @@ def _attributes(shards: Sequence[Shard], summed: SummedCapture, output: Path) ->
     if isinstance(config.get("output"), dict):
         config["output"]["path"] = str(output)
         changed |= {"config": json.dumps(config, ensure_ascii=False), "config_hash": tree_hash(config)}
+    changed |= {name: list(_texts(shards, name)) for name in (OMITTED, WARNINGS) if name in attributes}
     return changed | summed.attributes(seconds)
+
+
+def _texts(shards: Sequence[Shard], name: str) -> tuple[str, ...]:
+    """Return the texts in a list that every shard has, each once."""
+    return tuple(dict.fromkeys(text for shard in shards for text in text_list(shard.header.attributes, name)))
 
 
 def _summed(shards: Sequence[Shard]) -> SummedCapture:
@@ -175,9 +189,6 @@ def _summed(shards: Sequence[Shard]) -> SummedCapture:
         bool(attributes[0].get("split_bounces")),
         shards[0].header.first_bounce,
     )
-    unsampled, zero = (
-        tuple(dict.fromkeys(text for each in attributes for text in text_list(each, name)))
-        for name in (UNSAMPLED, ZERO)
-    )
+    unsampled, zero = _texts(shards, UNSAMPLED), _texts(shards, ZERO)
     unknown = [bounce for each in attributes if isinstance(bounce := each.get(UNKNOWN_FROM), int)]
     return SummedCapture(sums, bounces, unsampled, () if sums.squares else zero, min(unknown, default=None))
