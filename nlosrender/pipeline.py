@@ -103,7 +103,7 @@ def render_capture(
         check_writable(output.path, CAPTURE, files_read(resolved))
         backend = started_backend(config)
     processes = ONE_PROCESS if cluster is None else cluster.processes
-    replicas = replicas_for(backend.lanes, config.capture.sensor_grid.n_points)
+    replicas = replicas_for(backend.lanes, config.capture.n_sensors)
     identity = capture_identity(resolved, str(selection), backend.variant, replicas)
     with PartialCapture.claim(output.path, identity, resume) as partial:
         # --- scene -> capture and plan -> engine ---

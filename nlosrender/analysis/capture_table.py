@@ -34,8 +34,8 @@ def _rows(summary: dict[str, Any]) -> list[tuple[str, str]]:
         ("file", f"{summary['file']} ({readable_size(summary['size_on_disk'])})"),
         ("PART ONLY", _part(summary["part"])),
         ("scan type", _text(summary["scan_type"])),
-        ("pixels" if is_view else "sensor points", _grid(summary["sensor_grid"], summary["sensor_grid_size"])),
-        ("laser points", "" if is_view else _grid(summary["laser_grid"], summary["laser_grid_size"])),
+        ("pixels" if is_view else "sensor points", _grid(summary, "sensor")),
+        ("laser points", "" if is_view else _grid(summary, "laser")),
         ("camera at" if is_view else "sensor at", _lengths(summary["sensor_position"])),
         ("laser at", "" if is_view else _lengths(summary["laser_position"])),
         ("time axis", f"{bins}, {window}"),
@@ -135,8 +135,11 @@ def _bounces(summary: dict[str, Any]) -> str:
     return listed + (f" (highest rendered: {limit})" if listed and limit else "")
 
 
-def _grid(points: object, size: object) -> str:
-    return _joined(points, " x ") + (f" over {_joined(size, ' x ')} m" if size else "")
+def _grid(summary: Mapping[str, Any], name: str) -> str:
+    points, size = summary[f"{name}_grid"], summary[f"{name}_grid_size"]
+    is_list = name in _sequence(summary["point_lists"])
+    shown = f"a list of {_text(points[0])}" if is_list else _joined(points, " x ")
+    return shown + (f" over {_joined(size, ' x ')} m" if size else "")
 
 
 def _lengths(position: object) -> str:

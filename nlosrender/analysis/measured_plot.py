@@ -11,11 +11,13 @@ import numpy as np
 
 from nlosrender.analysis.laser_view import Float64, lit_window, point_histograms
 from nlosrender.analysis.theme import INK, MARK, PANEL, add_nanoseconds, line_colors, style
+from nlosrender.capture.bounces import LINE_OF_SIGHT
 from nlosrender.constants import SPEED_OF_LIGHT
 from nlosrender.errors import FileError
 from nlosrender.files.attributes import json_object
 from nlosrender.files.measured import MEASUREMENT, sensor_of
 from nlosrender.files.reading.reader import StoredCapture, open_capture
+from nlosrender.files.reading.stored_header import StoredHeader
 from nlosrender.sensor.detector import detector_of
 from nlosrender.sensor.rebinning import TimeBins
 
@@ -66,10 +68,10 @@ def measured_pair(capture: StoredCapture, ideal: Path | None, stack: ExitStack) 
     return MeasuredPair(beside, capture, sensor) if beside is not None and sensor is not None and same_grid else None
 
 
-def draw_counts(axes: Axes, pair: MeasuredPair, laser: tuple[int, int], pixel: tuple[int, int], what: str) -> None:
+def draw_counts(axes: Axes, pair: MeasuredPair, laser: tuple[int, int], pixel: tuple[int, int]) -> None:
     """Draw the counts of one point over the photons that the ideal histogram would make without pile-up and noise."""
     edges, counts = _histogram(pair.counts, laser, pixel)
-    style(axes, f"{what} in row {pixel[0]}, column {pixel[1]} (+)", "optical path length [m]", "counts per bin")
+    style(axes, point_name(pair.counts.header, pixel), "optical path length [m]", "counts per bin")
     shown, top = edges, float(counts.max(initial=0.0))
     axes.stairs(counts, edges, baseline=None, color=MARK, lw=1.0, label="measured")
     if pair.ideal is not None:
@@ -88,6 +90,14 @@ def draw_counts(axes: Axes, pair: MeasuredPair, laser: tuple[int, int], pixel: t
     axes.set_ylim(0, top * 1.08 or 1.0)
     axes.legend(facecolor=PANEL, edgecolor="none", labelcolor=INK, fontsize=9, loc="upper right", framealpha=0.75)
     add_nanoseconds(axes)
+
+
+def point_name(header: StoredHeader, pixel: tuple[int, int]) -> str:
+    """Return the heading of one point's histogram."""
+    if header.is_list():
+        return f"sensor point {pixel[1]} of the list (+)"
+    what = "pixel" if header.scan_type == LINE_OF_SIGHT else "sensor point"
+    return f"{what} in row {pixel[0]}, column {pixel[1]} (+)"
 
 
 def draw_response(axes: Axes, pair: MeasuredPair) -> None:

@@ -6,7 +6,7 @@ import math
 import re
 from contextlib import ExitStack
 from pathlib import Path
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
@@ -21,9 +21,10 @@ from nlosrender.analysis.laser_view import (
     row_over_time,
     wall_frames,
 )
-from nlosrender.analysis.measured_plot import MeasuredPair, draw_counts, draw_response, measured_pair
+from nlosrender.analysis.measured_plot import MeasuredPair, draw_counts, draw_response, measured_pair, point_name
 from nlosrender.analysis.theme import (
     COLORMAP,
+    EDGE,
     FAINT,
     GROUND,
     INK,
@@ -42,6 +43,7 @@ from nlosrender.constants import opl_to_seconds
 from nlosrender.errors import OptionError
 from nlosrender.files.atomic_write import check_writable
 from nlosrender.files.reading.reader import StoredCapture, open_capture
+from nlosrender.files.reading.scan import moved, wall_frame
 from nlosrender.files.reading.stored_header import StoredHeader
 
 if TYPE_CHECKING:
@@ -49,6 +51,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure, SubFigure
 
 DECADES = 5  # shown of a logarithmic axis
+DOT_AREA = 4000.0  # square points, of the dots of a list together
 MAX_ROW_LINES = 1200  # of the row over time, whose panel is about 500 pixels high
 
 
@@ -130,7 +133,7 @@ def _draw(
     _draw_frames(upper, capture, view, pixel)
     left, center, right = lower.subplots(1, 3, width_ratios=[1.55, 0.75, 1.2])
     if measured is not None:
-        draw_counts(left, measured, view.laser, pixel, "pixel" if _is_view(header) else "sensor point")
+        draw_counts(left, measured, view.laser, pixel)
         draw_response(center, measured)
     else:
         _draw_histogram(left, capture, view, pixel)
@@ -140,11 +143,9 @@ def _draw(
 
 
 def _subtitle(header: StoredHeader, view: LaserView) -> str:
-    rows, columns = header.sensor_grid
-    parts = [header.scan_type, f"{columns} x {rows} {'pixels' if _is_view(header) else 'sensor points'}"]
+    parts = [header.scan_type, f"{header.counted_points()} {'pixels' if _is_view(header) else 'sensor points'}"]
     if header.scan_type == "exhaustive":
-        ly, lx = header.laser_grid
-        parts.append(f"laser in row {view.laser[0]}, column {view.laser[1]} of {lx} x {ly}")
+        parts.append(f"laser in row {view.laser[0]}, column {view.laser[1]} of {header.counted_points('laser')}")
     width = header.bin_width_opl
     parts.append(f"{header.n_bins} bins of {1000 * width:.4g} mm ({opl_to_seconds(width) * 1e12:.3g} ps)")
     engine, error = header.attributes.get("render_engine"), header.attributes.get("error_estimate")
@@ -169,15 +170,26 @@ def _draw_frames(figure: SubFigure, capture: StoredCapture, view: LaserView, pix
     bins = frame_bins(view.time)
     windows = [slice(max(index - half, 0), index + half + 1) for index in bins]
     frames = wall_frames(capture, view.laser, windows)
-    (left, right, bottom, top), xlabel, ylabel = _wall_extent(header)
+    extent, xlabel, ylabel = _wall_extent(header)
+    left, right, bottom, top = extent
     rows, columns = header.sensor_grid
     at_pixel = (left + (pixel[1] + 0.5) / columns * (right - left), bottom + (pixel[0] + 0.5) / rows * (top - bottom))
-    extent = (left, right, bottom, top)
+    points = _list_on_wall(capture)
+    if points is not None:
+        at_pixel = (float(points[pixel[1], 0]), float(points[pixel[1], 1]))
+        xlabel, ylabel = "wall x [m]", "wall y [m]"
     all_axes = np.ravel(figure.subplots(1, len(bins), sharex=True, sharey=True, squeeze=False))
     for axes, frame, index in zip(all_axes, frames, bins, strict=True):
         opl = header.start_opl + (index + 0.5) * header.bin_width_opl
         style(axes, f"{opl:.3f} m   {opl_to_seconds(opl) * 1e9:.2f} ns", xlabel, ylabel if axes is all_axes[0] else "")
-        axes.imshow(frame, origin="lower", extent=extent, cmap=COLORMAP, vmin=0, vmax=max(frame.max(), 0) or 1)
+        scale: dict[str, Any] = {"cmap": COLORMAP, "vmin": 0, "vmax": max(frame.max(), 0) or 1}
+        if points is None:
+            axes.imshow(frame, origin="lower", extent=extent, **scale)
+        else:
+            area = max(4.0, min(80.0, DOT_AREA / len(points)))
+            axes.scatter(*points.T, c=frame[0], s=area, edgecolors=EDGE, linewidths=0.5, **scale)
+            axes.set_aspect("equal")
+            axes.margins(0.08)
         axes.plot(*at_pixel, marker="+", markersize=9, markeredgewidth=1.2, color=MARK, clip_on=False)
 
 
@@ -190,7 +202,7 @@ def _draw_histogram(axes: Axes, capture: StoredCapture, view: LaserView, pixel: 
     logarithmic = len(shown) > 1  # higher bounces are orders of magnitude darker
     factor, power = (1.0, "") if logarithmic else power_of_ten(float(histograms.max()))
     top = float(histograms.max()) / factor
-    title = f"{'pixel' if _is_view(header) else 'sensor point'} in row {pixel[0]}, column {pixel[1]} (+)"
+    title = point_name(header, pixel)
     style(axes, title, "optical path length [m]", _per_bin(header, power))
     for slot, color in zip(shown, line_colors(len(shown)), strict=True):
         label = _bounce_label(header, slot)
@@ -235,8 +247,11 @@ def _draw_row(axes: Axes, capture: StoredCapture, view: LaserView) -> None:
     light = _at_most(row_over_time(capture, view.laser, row)[:, first : last + 1].T, MAX_ROW_LINES)
     factor, power = power_of_ten(float(light.max()))
     (left, right, _, _), xlabel, _ = _wall_extent(header)
+    if header.is_list():
+        left, right, xlabel = -0.5, header.sensor_grid[1] - 0.5, "point, in the order of the list"
     early, late = (header.start_opl + index * header.bin_width_opl for index in (first, last + 1))
-    style(axes, f"brightest row ({row}) over time", xlabel, "optical path length [m]")
+    title = "listed points over time" if header.is_list() else f"brightest row ({row}) over time"
+    style(axes, title, xlabel, "optical path length [m]")
     # square root: one bright front would leave everything behind it black
     scale = PowerNorm(0.5, vmin=0, vmax=max(float(light.max()), 0.0) / factor or 1.0, clip=True)
     extent = (left, right, early, late)
@@ -273,6 +288,13 @@ def _wall_extent(header: StoredHeader) -> tuple[tuple[float, float, float, float
         return (-width / 2, width / 2, -height / 2, height / 2), "wall x [m]", "wall y [m]"
     rows, columns = header.sensor_grid
     return (-0.5, columns - 0.5, -0.5, rows - 0.5), "column", "row"
+
+
+def _list_on_wall(capture: StoredCapture) -> Float64 | None:
+    """Return where the points of a list are on the wall, x and y (points, 2) [m]; None for a grid."""
+    if not capture.header.is_list():
+        return None
+    return np.asarray(moved(capture.positions.sensor_positions[0], wall_frame(capture.header))[:, :2])
 
 
 def _at_most(light: Float64, lines: int) -> Float64:

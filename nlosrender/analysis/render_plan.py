@@ -33,6 +33,7 @@ class RenderPlan:
     scan_type: str
     sensor_grid: tuple[int, int]  # columns, rows
     laser_grid: tuple[int, int]  # columns, rows; confocal: the sensor grid
+    point_lists: tuple[str, ...]  # which of "sensor" and "laser" points are a list: one row
     n_triangles: int  # of the hidden geometry, or of all that a camera sees
     n_bins: int
     bin_width_opl: float  # m
@@ -92,6 +93,7 @@ def plan_render(config: Config) -> RenderPlan:
         scan_type=capture.scan_type,
         sensor_grid=(capture.sensor_grid.nx, capture.sensor_grid.ny),
         laser_grid=(capture.laser_grid.nx, capture.laser_grid.ny),
+        point_lists=capture.point_lists,
         n_triangles=engine.built.n_triangles,
         n_bins=time_axis.n_bins,
         bin_width_opl=time_axis.bin_width_opl,

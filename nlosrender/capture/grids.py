@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -15,7 +16,9 @@ from nlosrender.scene.walls.wall import EDGE_TOLERANCE, RelayWall
 
 if TYPE_CHECKING:
     from nlosrender.config.capture import CaptureConfig, GridConfig
+    from nlosrender.config.point_list import PointList
 
+EVENNESS = 1e-6  # of the spacing: decimal coordinates of a grid with few digits
 SCAN_TYPES = ("single", "confocal", "exhaustive", LINE_OF_SIGHT)
 
 
@@ -26,7 +29,8 @@ class PointGrid:
     wall_coordinates: Float64  # (ny, nx, 2) m
     positions: Float64  # (ny, nx, 3) m
     normals: Float64  # (ny, nx, 3), unit
-    size: tuple[float, float]  # extent the cells cover (width, height) [m]; (0, 0) for a single point
+    size: tuple[float, float]  # extent the cells cover (width, height) [m], of a list its points'; (0, 0) for one point
+    is_list: bool = False  # one row of points that stand anywhere, in the order they were given
 
     @property
     def ny(self) -> int:
@@ -37,6 +41,35 @@ class PointGrid:
     def nx(self) -> int:
         """Number of columns."""
         return self.positions.shape[1]
+
+    @cached_property
+    def lattice(self) -> PointGrid:
+        """The same points as the rows and columns of a regular grid; a list that is none is returned as it is.
+
+        What depends on neighbours asks for it, so that a grid given as a list, row by row, gives the same numbers.
+        """
+        listed = self.wall_coordinates.reshape(-1, 2)
+        x, y = np.unique(listed[:, 0]), np.unique(listed[:, 1])
+        if not self.is_list or len(x) * len(y) != len(listed):
+            return self
+        in_rows = np.array_equal(listed, np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2))
+        if not (in_rows and _is_even(x) and _is_even(y)):
+            return self
+        # 12 digits: the cells' extent, not how the points were rounded
+        size = [float(f"{np.ptp(axis) / max(len(axis) - 1, 1) * len(axis):.12g}") for axis in (x, y)]
+        shape = len(y), len(x), -1
+        xy, positions, normals = (a.reshape(shape) for a in (self.wall_coordinates, self.positions, self.normals))
+        return PointGrid(xy, positions, normals, (size[0], size[1]))
+
+    @cached_property
+    def places(self) -> Float64:
+        """Where each point is (points, 2), from 0 to 1 along x and y of the grid, or of the box around a list."""
+        grid = self.lattice
+        index = np.arange(grid.ny * grid.nx)
+        if not grid.is_list:
+            return np.stack([index % grid.nx / grid.nx, index // grid.nx / grid.ny], axis=-1)
+        xy = grid.wall_coordinates[0]
+        return np.asarray((xy - xy.min(axis=0)) / np.maximum(np.ptp(xy, axis=0), np.finfo(float).tiny))
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,6 +117,12 @@ class Capture:
     def lasers_per_sensor(self) -> int:
         """Number of laser points that each sensor point is measured for: of confocal captures only its own."""
         return self.n_lasers if self.scan_type == "exhaustive" else 1
+
+    @property
+    def point_lists(self) -> tuple[str, ...]:
+        """Which of "sensor" and "laser" points are a list."""
+        grids = {"sensor": self.sensor_grid, "laser": self.laser_grid}
+        return tuple(name for name, grid in grids.items() if grid.is_list)
 
     @property
     def is_line_of_sight(self) -> bool:
@@ -139,6 +178,13 @@ def point_grid(wall: RelayWall, nx: int, ny: int, width: float | None = None, he
     return _grid_at(wall, np.stack(np.meshgrid(x, y, indexing="xy"), axis=-1), (width, height))
 
 
+def listed_points(wall: RelayWall, xy: ArrayLike) -> PointGrid:
+    """Return the list of points at wall coordinates ``xy`` (points, 2) [m] as one row; ValueError off the wall."""
+    row = np.asarray(xy, dtype=np.float64)[None]
+    width, height = np.ptp(row[0], axis=0).tolist()
+    return replace(_grid_at(wall, row, (width, height)), is_list=True)
+
+
 def single_point(wall: RelayWall, xy: ArrayLike) -> PointGrid:
     """Return the 1 x 1 grid of one point at wall coordinates ``xy`` (2,) [m]; ValueError off the wall."""
     return _grid_at(wall, np.asarray(xy, dtype=np.float64).reshape(1, 1, 2), (0.0, 0.0))
@@ -154,13 +200,11 @@ def build_capture(capture_config: CaptureConfig, wall: RelayWall) -> Capture:
     ValueError
         A point is off the wall, or a value is out of range.
     """
-    sensor_grid = _configured_grid(capture_config.sensor_grid, wall, "capture.sensor_grid")
+    sensor_grid = _configured_points(capture_config, "sensor", wall)
     if capture_config.scan_type == "confocal":
         laser_grid = sensor_grid
     elif capture_config.scan_type == "exhaustive":
-        if capture_config.laser_grid is None:
-            raise ValueError("an exhaustive capture needs a laser_grid")
-        laser_grid = _configured_grid(capture_config.laser_grid, wall, "capture.laser_grid")
+        laser_grid = _configured_points(capture_config, "laser", wall)
     else:
         laser_point = capture_config.laser_point
         laser_grid = single_point(wall, (0.0, 0.0) if laser_point is None else laser_point)
@@ -181,11 +225,24 @@ def _cell_centres(count: int) -> Float64:
     return (2 * np.arange(count) + 1 - count) / (2 * count)
 
 
-def _configured_grid(grid_config: GridConfig, wall: RelayWall, key: str) -> PointGrid:
+def _configured_points(capture_config: CaptureConfig, name: str, wall: RelayWall) -> PointGrid:
+    """Return the grid or the list of sensor or laser points."""
+    grid: GridConfig | None = getattr(capture_config, f"{name}_grid")
+    points: PointList | None = getattr(capture_config, f"{name}_list")
     try:
-        return point_grid(wall, grid_config.nx, grid_config.ny, grid_config.width, grid_config.height)
+        if points is not None:
+            return listed_points(wall, points.xy)
+        if grid is None:
+            raise ValueError(f"a capture of scan_type {capture_config.scan_type} needs a {name}_grid or {name}_points")
+        return point_grid(wall, grid.nx, grid.ny, grid.width, grid.height)
     except ValueError as error:
-        raise ConfigError.at(key, f"{error}.") from error
+        raise ConfigError.at(f"capture.{name}_{'grid' if points is None else 'points'}", f"{error}.") from error
+
+
+def _is_even(ascending: Float64) -> bool:
+    """Return whether coordinates are equally spaced, but for rounding."""
+    steps = np.diff(ascending)
+    return len(steps) < 2 or bool(np.ptp(steps) <= EVENNESS * steps[0])
 
 
 def _device_position(scene_position: ArrayLike | None, wall: RelayWall) -> Float64:

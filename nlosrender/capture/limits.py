@@ -18,10 +18,15 @@ MAX_INT32 = 2**31 - 1  # the file holds the number of bins as a 32-bit integer
 def refuse_impossible_grids(capture_config: CaptureConfig, memory_limit: int) -> None:
     """Raise ConfigError for grids or pixels whose positions alone take more than ``memory_limit`` bytes."""
     points, sensors = _words(capture_config)
-    for key, grid in ((sensors, capture_config.sensor_grid), ("capture.laser_grid", capture_config.laser_grid)):
-        if grid is not None and grid.n_points * POINT_BYTES > memory_limit:
+    lasers = "capture.laser_grid" if capture_config.laser_points is None else "capture.laser_points"
+    for key, grid, count in (
+        (sensors, capture_config.sensor_grid, capture_config.n_sensors),
+        (lasers, capture_config.laser_grid, capture_config.n_lasers),
+    ):
+        if count * POINT_BYTES > memory_limit:
+            shape = f"{count}" if grid is None else f"{grid.nx} x {grid.ny}"
             message = (
-                f"{grid.nx} x {grid.ny} {points} take {grid.n_points * POINT_BYTES / 1e9:.3g} GB for their positions "
+                f"{shape} {points} take {count * POINT_BYTES / 1e9:.3g} GB for their positions "
                 f"alone, but there are {memory_limit / 1e9:.3g} GB. Use fewer {points}."
             )
             raise ConfigError.at(key, message)
@@ -60,7 +65,7 @@ def refuse_impossible_samples(
         The capture is too large; the message says what to change.
     """
     points, sensors = _words(capture_config)
-    pairs = capture_config.sensor_grid.n_points * capture_config.n_lasers
+    pairs = capture_config.n_sensors * capture_config.n_lasers
     smallest = pairs * rows_per_pair * (n_bins + 1) * (2 * BYTES_PER_SUM + BYTES_OF_STATISTICS)
     if n_bins > MAX_INT32:
         key, message = "time_axis.n_bins", f"got {n_bins}, need at most {MAX_INT32}. Use wider bins or a later start."
@@ -83,4 +88,6 @@ def refuse_impossible_samples(
 
 def _words(capture_config: CaptureConfig) -> tuple[str, str]:
     """Return what sensor points are called, and the key that sets their number."""
-    return ("pixels", "capture.camera") if capture_config.is_line_of_sight else ("points", "capture.sensor_grid")
+    if capture_config.is_line_of_sight:
+        return "pixels", "capture.camera"
+    return "points", f"capture.{capture_config.sensor_key}"

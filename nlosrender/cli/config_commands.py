@@ -117,9 +117,13 @@ def _summary(config: Config) -> str:
     """Return the capture in a few words: scan, sizes, bins, what is in the scene."""
     capture, n_bins = config.capture, config.time_axis.n_bins
     points = "pixels" if capture.is_line_of_sight else "sensors"
-    parts = [capture.scan_type, f"{capture.sensor_grid.nx} x {capture.sensor_grid.ny} {points}"]
-    if capture.laser_grid is not None:
-        parts.append(f"{capture.laser_grid.nx} x {capture.laser_grid.ny} lasers")
+    parts: list[str] = [capture.scan_type]
+    for name, grid, listed in (
+        (points, capture.sensor_grid, capture.sensor_list),
+        ("lasers", capture.laser_grid, capture.laser_list),
+    ):
+        parts += [f"{grid.nx} x {grid.ny} {name}"] if grid is not None else []
+        parts += [f"{len(listed)} listed {name}"] if listed is not None else []
     parts.append(f"{n_bins} bins of {config.time_axis.bin_width_opl:g} m")
     return ", ".join([*parts, *_contents(config)])
 

@@ -92,8 +92,12 @@ def _units(plan: RenderPlan) -> str:
 
 def _scan(plan: RenderPlan) -> str:
     points = "pixels" if plan.scan_type == LINE_OF_SIGHT else "sensor points"
-    lasers = ", {} x {} laser points".format(*plan.laser_grid) if plan.scan_type == "exhaustive" else ""
-    return f"{plan.scan_type}, {plan.sensor_grid[0]} x {plan.sensor_grid[1]} {points}{lasers}"
+    counts = {
+        name: f"{grid[0]} listed" if name in plan.point_lists else f"{grid[0]} x {grid[1]}"
+        for name, grid in (("sensor", plan.sensor_grid), ("laser", plan.laser_grid))
+    }
+    lasers = f", {counts['laser']} laser points" if plan.scan_type == "exhaustive" else ""
+    return f"{plan.scan_type}, {counts['sensor']} {points}{lasers}"
 
 
 def _plan_all(sweep: Sweep, as_json: bool) -> None:

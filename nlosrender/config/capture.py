@@ -19,6 +19,7 @@ from nlosrender.config.fields import (
     Point2,
     Point3,
 )
+from nlosrender.config.point_list import PointList, WallPoints, point_list
 from nlosrender.config.section import ONE_OF, Section
 from nlosrender.errors import ValidationIssue
 
@@ -49,12 +50,16 @@ class CaptureConfig(Section):
     scan_type: Annotated[ScanType, ONE_OF]
     """single: one laser point; confocal: laser and sensor on the same point; exhaustive: every pair;
     line_of_sight: what a camera sees of a scene with emitters"""
-    sensor_grid: GridConfig
+    sensor_grid: GridConfig | None = None
     """the measured points; line_of_sight: the camera's pixels, not set here"""
+    sensor_points: WallPoints | None = None
+    """instead of a grid: [[x, y], ...] in wall coordinates [m], or {file: points.csv}, also .npy"""
     camera: CameraConfig | None = None
     """line_of_sight: where the scene is seen from; null: the camera of scene.mitsuba"""
     laser_grid: GridConfig | None = None
     """the lit points of an exhaustive scan"""
+    laser_points: WallPoints | None = None
+    """instead of laser_grid, as sensor_points"""
     laser_point: Point2 | None = None
     """m, wall coordinates (x, y) from the wall's centre; the lit point of a single scan, default [0, 0]"""
     laser_position: Point3 | None = None
@@ -82,16 +87,28 @@ class CaptureConfig(Section):
             raw["sensor_grid"] = pixels
         return raw
 
-    def rule_laser_grid(self) -> Iterator[ValidationIssue]:
-        """An exhaustive scan has one."""
-        if self.scan_type == "exhaustive" and self.laser_grid is None:
-            message = "missing, an exhaustive scan needs it, such as {nx: 4, ny: 3}."
-            yield ValidationIssue(("laser_grid",), message)
+    def rule_sensor_points(self) -> Iterator[ValidationIssue]:
+        """A scan measures a grid or a list."""
+        yield from self._one_of("sensor", "it is required: the measured points")
+
+    def rule_laser_points(self) -> Iterator[ValidationIssue]:
+        """An exhaustive scan has a grid or a list."""
+        if self.scan_type == "exhaustive":
+            yield from self._one_of("laser", "an exhaustive scan needs it")
+
+    def _one_of(self, name: str, why: str) -> Iterator[ValidationIssue]:
+        grid, points = getattr(self, f"{name}_grid"), getattr(self, f"{name}_points")
+        if grid is None and points is None:
+            message = f"missing, {why}, such as {{nx: 4, ny: 3}}, or a list as {name}_points."
+            yield ValidationIssue((f"{name}_grid",), message)
+        elif grid is not None and points is not None:
+            message = f"stands beside {name}_grid: the points are a grid or a list; remove one of them."
+            yield ValidationIssue((f"{name}_points",), message, "key")
 
     def rule_pixels(self) -> Iterator[ValidationIssue]:
         """The grid of a camera is its pixels."""
         camera, grid = self.camera, self.sensor_grid
-        if not self.is_line_of_sight:
+        if not self.is_line_of_sight or grid is None:
             return
         if grid.width or grid.height or (camera and (grid.nx, grid.ny) != (camera.width, camera.height)):
             message = "the sensor points of a line_of_sight capture are the camera's pixels; remove it, and set "
@@ -104,9 +121,33 @@ class CaptureConfig(Section):
         return self.scan_type == "line_of_sight"
 
     @property
+    def sensor_list(self) -> PointList | None:
+        """The points of ``sensor_points``; None: a grid."""
+        return None if self.sensor_points is None else point_list(self.sensor_points)
+
+    @property
+    def laser_list(self) -> PointList | None:
+        """The points of ``laser_points``; None: a grid, or a single point."""
+        return None if self.laser_points is None else point_list(self.laser_points)
+
+    @property
+    def sensor_key(self) -> str:
+        """The key that the sensor points stand under."""
+        return "sensor_grid" if self.sensor_points is None else "sensor_points"
+
+    @property
+    def n_sensors(self) -> int:
+        """Number of sensor points."""
+        return _count(self.sensor_grid, self.sensor_list)
+
+    @property
     def n_lasers(self) -> int:
         """Number of laser points that have a histogram of their own; 1 for a confocal scan, whose pairs are fixed."""
-        return self.laser_grid.n_points if self.laser_grid is not None else 1
+        return _count(self.laser_grid, self.laser_list)
+
+
+def _count(grid: GridConfig | None, points: PointList | None) -> int:
+    return grid.n_points if grid is not None else 1 if points is None else len(points)
 
 
 class TimeAxisConfig(Section):

@@ -14,6 +14,7 @@ from nlosrender.config.fields import Name
 from nlosrender.config.issues import WrongValueRead, mismatch, shown
 from nlosrender.config.mitsuba_xml import read_mitsuba_xml
 from nlosrender.config.plugin_check import config_folder
+from nlosrender.config.point_list import off_the_wall
 from nlosrender.config.relay_wall import EDGE_TOLERANCE, RectangleWallConfig
 from nlosrender.config.render import OutputConfig, RenderConfig
 from nlosrender.config.scene import SceneConfig
@@ -106,6 +107,9 @@ class Config(Section):
         if self.output.ground_truth and self.capture.is_line_of_sight:
             message = "is seen from a relay wall, and a line_of_sight capture has none; remove it."
             yield ValidationIssue(("output", "ground_truth"), message, "key")
+        if "occupancy" in self.output.ground_truth and self.capture.sensor_points and not self.output.ground_truth_grid:
+            message = "occupancy needs a grid, and the sensor points are a list; give output.ground_truth_grid."
+            yield ValidationIssue(("output", "ground_truth"), message)
 
     # --- captures of a relay wall ---
 
@@ -165,6 +169,16 @@ class Config(Section):
             )
             yield ValidationIssue(("capture", "laser_point"), message)
 
+    def rule_lists_on_the_wall(self) -> Iterator[ValidationIssue]:
+        """Points of lists are on the wall."""
+        if (wall := self.scene.relay_wall) is None or self.capture.is_line_of_sight:
+            return
+        for name in ("sensor", "laser"):
+            with suppress(WrongValueRead):
+                points = getattr(self.capture, f"{name}_list")
+                for issue in () if points is None else off_the_wall(points, wall.extent, EDGE_TOLERANCE):
+                    yield issue.below(("capture", f"{name}_points"))
+
     def rule_devices_before_the_wall(self) -> Iterator[ValidationIssue]:
         """Laser and sensor stand on the lit side of a flat wall."""
         wall = self.scene.relay_wall
@@ -213,10 +227,10 @@ class Config(Section):
     def rule_bins(self) -> Iterator[ValidationIssue]:
         """The capture fits a disk."""
         is_view, n_bins = self.capture.is_line_of_sight, self.time_axis.n_bins
-        pairs = self.capture.sensor_grid.n_points * self.capture.n_lasers
+        pairs = self.capture.n_sensors * self.capture.n_lasers
         per_pair = 1 if n_bins == "auto" else n_bins
         if pairs * per_pair > MAX_BINS:
-            grid = ("capture", "camera" if is_view else "sensor_grid")
+            grid = ("capture", "camera" if is_view else self.capture.sensor_key)
             path: KeyPath = ("time_axis", "n_bins") if pairs <= MAX_BINS else grid
             counted = "pixels" if is_view else "pairs of laser and sensor points"
             message = f"got {pairs:_} {counted} with {per_pair:_} bins each, need at most 2**40 bins in all. "

@@ -24,7 +24,13 @@ from nlosrender.config.unused_keys import without_unused_keys
 from nlosrender.config.yaml_tree import MAX_BYTES, Document, read_document
 from nlosrender.errors import ConfigError, KeyPath, ValidationIssue
 
-LEFT_OUT = (("sensor",), ("output", "ground_truth"), ("output", "ground_truth_grid"))  # of the canonical JSON, if empty
+LEFT_OUT = (  # of the canonical JSON, if empty
+    ("sensor",),
+    ("output", "ground_truth"),
+    ("output", "ground_truth_grid"),
+    ("capture", "sensor_points"),
+    ("capture", "laser_points"),
+)
 MAX_ISSUES = 100  # told at once; nobody reads more
 SectionT = TypeVar("SectionT", bound=Section)
 

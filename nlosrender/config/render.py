@@ -140,4 +140,4 @@ class OutputConfig(Section):
     """what of the hidden scene is stored beside the light, any of: depth, normal, albedo, position, instance,
     occupancy, poses"""
     ground_truth_grid: TruthGridConfig | None = None
-    """its points; null: the sensor grid"""
+    """its points; null: the sensor points. Of sensor_points, a list, it covers the whole wall"""

@@ -46,6 +46,8 @@ _SENSOR_GRID = """\
     ny: 32                       # integer >= 1
     width: 2.0                   # m; default null: the whole wall
     height: 2.0                  # m; default null: the whole wall
+  # sensor_points: {file: points.csv}  # instead of sensor_grid: x,y in wall coordinates [m] (.csv, .npy), or a list
+  # laser_points: [[0.0, 0.0], [0.1, 0.2]]  # instead of laser_grid, as sensor_points
 """
 _DEVICES = """\
   laser_position: [-0.5, 0, 0.25]     # m, in front of the wall; default null: 1 m in front of its centre

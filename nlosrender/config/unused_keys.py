@@ -21,7 +21,9 @@ from nlosrender.config.section import Section, sections_in, type_of
 _SCANS = typing.get_args(ScanType)
 _OF_WALLS = ("single", "confocal", "exhaustive")
 _NEEDED_BY: dict[str, tuple[str, ...]] = {
+    "capture.sensor_points": _OF_WALLS,
     "capture.laser_grid": ("exhaustive",),
+    "capture.laser_points": ("exhaustive",),
     "capture.laser_point": ("single",),
     "capture.camera": ("line_of_sight",),
     "scene.emitters": ("line_of_sight",),

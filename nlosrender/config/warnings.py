@@ -109,8 +109,11 @@ def _file(config: Config) -> Iterator[str]:
         yield "time_axis.start_opl is not 0: many Z-NLOS loaders ignore t0 and shift the capture."
     if not config.capture.account_first_and_last_bounces:
         yield "capture.account_first_and_last_bounces is false: Z-NLOS loaders expect the first and last legs in time."
-    if config.capture.scan_type != "confocal" and config.capture.sensor_grid.nx == 6:
+    capture = config.capture
+    grid = capture.sensor_grid
+    nx, what = (capture.n_sensors, "sensor_points has 6") if grid is None else (grid.nx, "sensor_grid.nx is 6")
+    if capture.scan_type != "confocal" and nx == 6:
         yield (
-            "capture.sensor_grid.nx is 6: y-tal's converter finds the bounce axis by its length 6, and takes the "
-            "sensor's for it. Use another nx if the file is meant for y-tal."
+            f"capture.{what}: y-tal's converter finds the bounce axis by its length 6, and takes the sensor's for it. "
+            "Use another number if the file is meant for y-tal."
         )

@@ -48,6 +48,7 @@ class CaptureHeader:
     frame: str = "znlos"  # of the positions in the file, one of ``layout.FRAMES``
     planar_wall: bool = True
     shared_samples: str = ""  # which samples have errors in common, in words: their variances may not be summed
+    point_lists: tuple[str, ...] = ()  # which of "sensor" and "laser" points are a list, see ``layout.POINT_LISTS``
     chunk_samples: int = CHUNK_SAMPLES  # of a chunk of the file at most
 
     def __post_init__(self) -> None:

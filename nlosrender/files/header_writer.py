@@ -161,6 +161,8 @@ def root_attributes(header: CaptureHeader) -> dict[str, object]:
             if legs
             else "NOT included: optical path lengths run from the emitter to the last surface only"
         }
+    if header.point_lists:
+        attributes[layout.POINT_LISTS] = " ".join(header.point_lists)
     if header.n_channels in layout.CHANNELS:
         attributes["channels"] = layout.CHANNELS[header.n_channels]
     if attributes.get("channels") == layout.STOKES:

@@ -21,7 +21,7 @@ from nlosrender.files.provenance import package_versions
 MEASURED_AFTERWARDS = "sensor"
 NOT_THE_CAPTURE = (("output", "path"), ("render", "memory_limit"), ("render", "backend"))
 PACKAGES = ("nlosrender", "mitsuba", "drjit")  # whose versions the samples depend on
-FILE_KEY = "filename"  # of meshes, textures, spectra
+FILE_KEYS = ("filename", "file")  # of meshes, textures, spectra; of lists of points
 SCENE_KEY = "mitsuba"  # of a whole scene, which names files of its own
 KEPT_DIGESTS = 65536  # of meshes, which the captures of a dataset share
 MAX_LISTED = 6  # differences in one message
@@ -104,16 +104,16 @@ def _with_digests(key: str, value: Any) -> Any:
         return {name: _with_digests(name, item) for name, item in value.items()}
     if isinstance(value, (list, tuple)):
         return [_with_digests("", item) for item in value]
-    if isinstance(value, str) and key == FILE_KEY:
+    if isinstance(value, str) and key in FILE_KEYS:
         return _digest(value)
     return _scene_digests(value) if isinstance(value, str) and key == SCENE_KEY else value
 
 
 def files_read(resolved_config: Any) -> Iterator[str]:
-    """Yield the names of the meshes, images and scenes that a configuration names."""
+    """Yield the names of the meshes, images, scenes and lists of points that a configuration names."""
     if isinstance(resolved_config, Mapping):
         for key, value in resolved_config.items():
-            if isinstance(value, str) and key in (FILE_KEY, SCENE_KEY):
+            if isinstance(value, str) and key in (*FILE_KEYS, SCENE_KEY):
                 yield value
             else:
                 yield from files_read(value)

@@ -326,8 +326,9 @@ class _Measurement:
                 )
                 raise ConfigError.at("sensor.photons_per_pulse", message + "photons; need a relative scale.")
             area = float(np.prod(header.sensor_grid_size or 0.0)) / math.prod(header.sensor_grid)
-            if config.footprint_area is None and area <= 0:
-                raise ConfigError.at("sensor.footprint_area", "missing: the sensor grid has no size.")
+            if config.footprint_area is None and (area <= 0 or header.is_list()):
+                lacks = "points of a list have no cells" if header.is_list() else "the sensor grid has no size"
+                raise ConfigError.at("sensor.footprint_area", f"missing: {lacks}, so give the area that is seen [m^2].")
             return physical_scale(config, area)
         sums = in_order(lambda block: self.light(block).sum(axis=0, dtype=np.float64), self.blocks, threads)
         total, brightest, points = 0.0, 0.0, 0
@@ -384,6 +385,9 @@ def _refuse(header: StoredHeader, config: SensorConfig, corrections: tuple[str, 
         )
     for key, message in () if counts else misfits(config, header.scan_type):
         raise ConfigError.at(f"sensor.{key}", message)
+    if config.zones is not None and not counts and header.is_list():
+        message = "add up the cells of a grid, and points of a list have none; need capture.sensor_grid, or no zones."
+        raise ConfigError.at("sensor.zones", message)
 
 
 def _counts_header(
@@ -440,6 +444,7 @@ def _counts_header(
             n_channels=1,
             bounce_indices=(layout.SUMMED_INDEX,),
             split_bounces=False,
+            point_lists=tuple(name for name in ("sensor", "laser") if header.is_list(name)),
             # a chunk is counted at once: of few bins as few points as of the many they are made of
             chunk_samples=max(layout.CHUNK_SAMPLES * bins.count // max(bins.count, header.n_bins), bins.count),
         ), sums

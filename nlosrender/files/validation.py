@@ -204,6 +204,12 @@ def _points(file: h5py.File, path: Path, sizes: Mapping[str, int], confocal: boo
         if confocal and not np.array_equal(grids[f"cameraGrid{name}"], grids[f"laserGrid{name}"]):
             found.append(f"laserGrid{name}: differs from cameraGrid{name} although the capture is confocal")
     attributes = get_attributes(file)
+    lists = str(attributes.get(layout.POINT_LISTS, "")).split()
+    for name, axis in (("sensor", "sensor_y"), ("laser", "laser_y")):
+        if name in lists and sizes[axis] != 1:
+            found.append(
+                f"attribute {layout.POINT_LISTS!r}: {name} points are a list, but there are {sizes[axis]} rows"
+            )
     if attributes.get("frame") == "znlos" and attributes.get("planar_wall") == 1:
         for name in ("cameraGrid", "laserGrid"):
             points = grids[f"{name}Positions"]
@@ -211,6 +217,8 @@ def _points(file: h5py.File, path: Path, sizes: Mapping[str, int], confocal: boo
                 found.append(f"{name}Positions: a planar wall lies in Y = 0 in the Z-NLOS frame")
             if not np.allclose(grids[f"{name}Normals"], (0, -1, 0), atol=NORMAL_TOLERANCE):
                 found.append(f"{name}Normals: a planar wall faces (0, -1, 0) in the Z-NLOS frame")
+            if name.removesuffix("Grid").replace("camera", "sensor") in lists:
+                continue
             if (np.diff(points[..., 2], axis=0) <= 0).any() or (np.diff(points[..., 0], axis=1) <= 0).any():
                 found.append(f"{name}Positions: rows must ascend in Z and columns in X")
     return found

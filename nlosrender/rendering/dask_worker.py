@@ -113,7 +113,7 @@ def render_remotely(
 
 def _refuse_other_capture(job: Job, backend: Backend) -> None:
     """Refuse to render what would be another capture here: other versions, another mesh under the same name."""
-    replicas = replicas_for(backend.lanes, job.config.capture.sensor_grid.n_points)
+    replicas = replicas_for(backend.lanes, job.config.capture.n_sensors)
     mine = capture_identity(config_to_dict(job.config), str(job.selection), backend.variant, replicas)
     found = [f"{key}: {there} there, {here} here" for key, there, here in differences(job.identity, mine)]
     if found:

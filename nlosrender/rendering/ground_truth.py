@@ -32,7 +32,7 @@ def ground_truth(config: Config, built: BuiltScene | BuiltView, capture: Capture
     frame = layout.file_frame(output.frame, built.wall.pose)
     grid, own = capture.sensor_grid, output.ground_truth_grid
     if own is not None:
-        grid = point_grid(built.wall, own.nx, own.ny, *grid.size)
+        grid = point_grid(built.wall, own.nx, own.ny, *((None, None) if grid.is_list else grid.size))
     found: dict[str, NDArray[Any]] = {}
     if wanted & _OF_VIEW:
         view = front_view(built, grid.positions, grid.normals)

@@ -191,4 +191,5 @@ def describe_file(
         frame=config.output.frame,
         planar_wall=built.wall.is_planar,
         shared_samples=shared,
+        point_lists=capture.point_lists,
     )

@@ -127,7 +127,8 @@ def _engine_frame(scene_config: SceneConfig, wall: RelayWall | None, plane: Imag
 
 
 def _image_plane(capture_config: CaptureConfig, whole: mi.Scene | None) -> ImagePlane:
-    camera, pixels = capture_config.camera, (capture_config.sensor_grid.nx, capture_config.sensor_grid.ny)
+    camera, film = capture_config.camera, capture_config.sensor_grid
+    pixels = (1, 1) if film is None else (film.nx, film.ny)
     if camera is not None:
         return image_plane(camera.position, camera.look_at, camera.up, camera.fov_deg, pixels)
     if whole is None or not whole.sensors():

@@ -24,6 +24,7 @@ DRAWS = 40  # of 32 contrasts: a standard error of 1 / sqrt(2 * 32 * 40) = 2 %, 
 TOLERANCE = 0.12
 GRID = (10, 5)
 SENSORS = np.arange(50)
+PLACES = np.stack([SENSORS % GRID[0] / GRID[0], SENSORS // GRID[0] / GRID[1]], axis=-1)
 
 
 def histogram(energies: NDArray[np.float64]) -> Any:
@@ -73,7 +74,7 @@ def test_sensor_points_that_share_walks_have_the_error_of_their_walks(rounds: in
     draws = []
     for _ in range(DRAWS):
         energies = np.zeros((2, 50, 1, 1, 1))
-        contrasts = RoundContrasts(histogram(energies), SENSORS, GRID)
+        contrasts = RoundContrasts(histogram(energies), PLACES)
         for done in range(1, rounds + 1):
             energies += random.normal(5.0, 1.0, (2, 1, 1, 1, 1))
             contrasts.add(done, done == rounds)
@@ -86,6 +87,6 @@ def test_one_round_states_no_error_that_cancels_by_chance() -> None:
     """Errors of one sign left and of the other right on the wall add up to nothing in one draw, not in all."""
     deviation = np.where(SENSORS % GRID[0] < GRID[0] / 2, 1.0, -1.0).reshape(1, 1, 50, 1)
     assert abs(deviation.sum()) == 0
-    assert stated([contrasts_of_deviation(deviation, SENSORS, GRID)]) > 0.25 * np.abs(deviation).sum()
+    assert stated([contrasts_of_deviation(deviation, PLACES)]) > 0.25 * np.abs(deviation).sum()
     same = np.ones((1, 1, 50, 1))
-    assert 1 <= stated([contrasts_of_deviation(same, SENSORS, GRID)]) / same.sum() < np.sqrt(3)
+    assert 1 <= stated([contrasts_of_deviation(same, PLACES)]) / same.sum() < np.sqrt(3)

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from nlosrender.capture.grids import build_capture, point_grid, single_point
+from nlosrender.errors import ConfigError
 from nlosrender.scene.pose import Pose
 from nlosrender.scene.walls.round_walls import SphereWall
 from nlosrender.scene.walls.wall import RectangleWall
@@ -24,6 +25,8 @@ def capture(wall=WALL, **changes):
         "scan_type": "exhaustive",
         "sensor_grid": grid(5, 3),
         "laser_grid": grid(7, 2, 1.4, 0.4),
+        "sensor_list": None,
+        "laser_list": None,
         "laser_point": None,
         "laser_position": [6.0, -2.0, 1.5],
         "sensor_position": None,
@@ -148,5 +151,5 @@ def test_impossible_captures_are_refused(changes, message):
 
 def test_exhaustive_needs_its_lasers():
     """An exhaustive capture without a laser grid is refused."""
-    with pytest.raises(ValueError, match="needs a laser_grid"):
+    with pytest.raises(ConfigError, match="needs a laser_grid or laser_points"):
         capture(laser_grid=None)

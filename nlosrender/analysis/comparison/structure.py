@@ -53,8 +53,11 @@ def _header_differences(a: StoredHeader, b: StoredHeader, alignment: Alignment) 
         "channels": (a.sizes["channel"], b.sizes["channel"]),
         "samples": tuple("counts" if header.is_measured else "light" for header in (a, b)),
         "bins": (b.n_bins if moved_in_time else a.n_bins, b.n_bins),
-        "sensor points": (_size(alignment.sensors.turned_shape), _size(b.sensor_grid)),
-        "laser points": (_size(alignment.lasers.turned_shape), _size(b.laser_grid)),
+        "sensor points": (_size(alignment.sensors.turned_shape, a.is_list()), _size(b.sensor_grid, b.is_list())),
+        "laser points": (
+            _size(alignment.lasers.turned_shape, a.is_list("laser")),
+            _size(b.laser_grid, b.is_list("laser")),
+        ),
         "bounce axis": (a.sizes["bounce"], b.sizes["bounce"]),
         "bounce of index 0": (a.first_bounce if same_axis else b.first_bounce, b.first_bounce),
     }
@@ -69,8 +72,8 @@ def _header_differences(a: StoredHeader, b: StoredHeader, alignment: Alignment) 
             yield StructureDifference(name, str(values[0]), str(values[1]))
 
 
-def _size(grid: tuple[int, int]) -> str:
-    return f"{grid[1]} x {grid[0]}"
+def _size(grid: tuple[int, int], is_list: bool) -> str:
+    return f"{max(grid)} listed" if is_list else f"{grid[1]} x {grid[0]}"
 
 
 def _grid_differences(a: StoredCapture, b: StoredCapture, alignment: Alignment) -> Iterator[StructureDifference]:

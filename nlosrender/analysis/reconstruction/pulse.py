@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from nlosrender.errors import OptionError
 from nlosrender.files.layout import Float64
@@ -110,7 +111,14 @@ def pulse_warnings(scan: Scan, pulse: Pulse, box: Bounds) -> list[str]:
 
 
 def _spacings(scan: Scan) -> tuple[float, float]:
-    """Return the distance between neighbouring sensor points along columns (x) and rows (y) [m]; 0 for a single one."""
+    """Return the distance between neighbouring sensor points along columns (x) and rows (y) [m]; 0 for a single one.
+
+    Of a list it is that to the second nearest point, in both directions: on a grid and on a curve that is the spacing.
+    """
+    if scan.has_sensor_list:
+        points = scan.sensors.reshape(-1, 3)
+        apart = cKDTree(points).query(points, k=[min(3, len(points))])[0]  # the first is the point itself
+        return float(np.median(apart)), float(np.median(apart))
     steps = [np.linalg.norm(np.diff(scan.sensors, axis=axis), axis=-1) for axis in (1, 0)]
     along_x, along_y = (float(np.median(step)) if step.size else 0.0 for step in steps)
     return along_x, along_y

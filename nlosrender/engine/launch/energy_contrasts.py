@@ -59,14 +59,14 @@ class RoundContrasts:
     ----------
     histogram
         That the rounds are added to, empty.
-    sensors, grid
-        (sensors,) flat indices of its sensor points; columns and rows of their grid.
+    places
+        (sensors, 2) where its sensor points are, see ``PointGrid.places``.
     """
 
-    def __init__(self, histogram: DeviceHistogram, sensors: NDArray[np.integer], grid: tuple[int, int]):
+    def __init__(self, histogram: DeviceHistogram, places: NDArray[np.float64]):
         shape = histogram.shape
         self._histogram, self.groups = histogram, 0
-        self._weights = np.stack([np.ones((CONTRASTS, shape.sensors)), _slow_weights(sensors, grid)])
+        self._weights = np.stack([np.ones((CONTRASTS, shape.sensors)), _slow_weights(places)])
         self._wanted = math.ceil(CONTRASTS / max(shape.replicas // 2, 1))
         self.grouped = np.zeros((2, CONTRASTS, shape.replicas, shape.slots, shape.channels))
         self.sums = np.zeros((2, CONTRASTS, shape.channels, shape.slots))
@@ -96,32 +96,28 @@ class RoundContrasts:
         return _in_slots(self.sums[int(is_few)] * (factor * _unpaired(replicas)), slots)
 
 
-def contrasts_of_deviation(
-    deviation: NDArray[np.float64], sensors: NDArray[np.integer], grid: tuple[int, int]
-) -> NDArray[np.float64]:
+def contrasts_of_deviation(deviation: NDArray[np.float64], places: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the contrasts (contrast, channel) of a known deviation, estimated minus true, of one bounce.
 
     Parameters
     ----------
     deviation
         (channel, laser, sensor, bin) [J m^-2 sr^-1]: one sample of it.
-    sensors, grid
+    places
         As for ``RoundContrasts``.
     """
     per_sensor = deviation.sum(axis=(1, 3))
-    return np.asarray(_slow_weights(sensors, grid) @ per_sensor.T, dtype=np.float64)
+    return np.asarray(_slow_weights(places) @ per_sensor.T, dtype=np.float64)
 
 
-def _slow_weights(sensors: NDArray[np.integer], grid: tuple[int, int]) -> NDArray[np.float64]:
+def _slow_weights(places: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return weights (contrast, sensor) about 1 that change slowly from place to place.
 
     With few samples of a difference its sum may be small by chance while parts of the wall deviate much. Weights that
     vary slowly over the wall reveal them; a constant deviation counts once, and no error more than sqrt(3) times.
     """
-    index = np.asarray(sensors, dtype=np.int64)
-    place = np.stack([index % grid[0] / grid[0], index // grid[0] / grid[1]])
     waves = np.random.default_rng(0).random((3, CONTRASTS))
-    phase = (waves[:2].T * 2 - 1) @ place + waves[2][:, None]  # at most a period over the grid
+    phase = (waves[:2].T * 2 - 1) @ np.ascontiguousarray(places.T) + waves[2][:, None]  # at most a period over the grid
     return np.asarray(1 + math.sqrt(2) * np.cos(2 * math.pi * phase), dtype=np.float64)
 
 

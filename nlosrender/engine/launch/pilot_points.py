@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from nlosrender.capture.grids import Capture, PointGrid
+from nlosrender.engine.launch.morton import morton_order
 
 SENSORS_PER_AXIS = 16  # 256 points: calibrated sample counts scatter by 0.4 to 1.7 % between seeds (bench scenes)
 LASERS_PER_AXIS = 3  # corners, edges and centre of the laser grid
@@ -48,7 +49,11 @@ def pilot_of(capture: Capture, sensors_per_axis: int = SENSORS_PER_AXIS) -> Pilo
 
 
 def spread(grid: PointGrid, per_axis: int) -> Selection:
-    """Return at most ``per_axis`` x ``per_axis`` points spread evenly over a grid."""
+    """Return at most ``per_axis`` x ``per_axis`` points spread evenly over a grid or, of a list, over its places."""
+    grid = grid.lattice
+    if grid.is_list:
+        order, count = np.argsort(morton_order(grid.positions[0]), kind="stable"), min(per_axis**2, grid.nx)
+        return Selection(tuple(np.sort(order[((np.arange(count) + 0.5) * grid.nx / count).astype(int)]).tolist()))
     rows, columns = (
         np.unique(((np.arange(min(per_axis, n)) + 0.5) * n / min(per_axis, n)).astype(int)) for n in (grid.ny, grid.nx)
     )

@@ -183,7 +183,7 @@ class PathEngine:
     def _accumulation(self, batch: Batch | Pilot, shape: HistogramShape, budget: Budget) -> Accumulation:
         """Return the sampling of a batch's paths."""
         bounces, row_points = self.options.bounces, self.device.sensor_indices(batch)
-        points, nx = row_points[self.device.lane_order(batch)], self.capture.sensor_grid.nx
+        points, nx = row_points[self.device.lane_order(batch)], self.capture.sensor_grid.lattice.nx
         period = self.continuation_period(budget)
         params = self._path_params(batch, shape, period)
         seed = self.options.seed
@@ -237,7 +237,7 @@ class PathEngine:
 
     def _pilot_variance(self, period: int) -> float:
         """Return the variance of H summed over the pilot's points, in arbitrary units."""
-        pilot, nx, samples = pilot_of(self.capture), self.capture.sensor_grid.nx, self.tuning.pilot_samples
+        pilot, nx, samples = pilot_of(self.capture), self.capture.sensor_grid.lattice.nx, self.tuning.pilot_samples
         shape, order = self._pilot_shape(pilot), self.device.lane_order(pilot)
         params, histogram = self._path_params(pilot, shape, period), DeviceHistogram(shape, self.kernel)
         points = self.device.sensor_indices(pilot)[order]

@@ -184,7 +184,7 @@ def _measured(
     active = np.array(scattered, dtype=bool)
     if isinstance(built, BuiltView):
         return active, np.zeros_like(active)
-    grid = capture.sensor_grid
+    grid = capture.sensor_grid.lattice
     points = grid.positions.reshape(-1, 3) / built.metres_per_engine_unit
     margin = (
         max(size / count for size, count in zip(grid.size, (grid.nx, grid.ny), strict=True))

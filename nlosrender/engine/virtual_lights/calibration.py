@@ -85,7 +85,7 @@ def _pilot_of_patches(third: ThirdBounce, pilot: Pilot) -> Pilot:
     if built.wall.is_planar and built.hidden_bounds is not None:  # what faces away from it, too
         nearest = built.hidden_bounds[0][2] / built.metres_per_engine_unit
     is_far = nearest > 2 * tessellator.reach / third.tuning.patch_pilot_sensors
-    few, grid = third.tuning.patch_pilot_sensors, third.device.capture.sensor_grid
+    few, grid = third.tuning.patch_pilot_sensors, third.device.capture.sensor_grid.lattice
     if not is_far and max(grid.nx, grid.ny) >= 4 * SENSORS_PER_AXIS:
         return pilot
     return pilot_of(third.device.capture, few if is_far else max(few, -(-max(grid.nx, grid.ny) // 4)))

@@ -194,11 +194,11 @@ class VirtualLightEngine:
         np.subtract(third, deviation, out=deviation)
         deviation *= factor / (budget.difference_divisor or difference_divisor(coarse, fine))
         third *= factor
-        grid, sensors = self.capture.sensor_grid, self.device.sensor_indices(batch)
+        places = self.capture.sensor_grid.places[self.device.sensor_indices(batch)]
         for number, slot in enumerate(self._slots(third.shape[1])):
             result.mean[:, slot] += third[:, number, ..., :-1]
             in_window = deviation[:, number, ..., :-1]
-            result.contrasts[:, :, slot] += contrasts_of_deviation(in_window, sensors, (grid.nx, grid.ny))
+            result.contrasts[:, :, slot] += contrasts_of_deviation(in_window, places)
             result.variance[:, slot] += np.square(in_window, out=in_window)
             result.outside[:, slot] += third[:, number, ..., -1]
         result.refuse_not_finite()

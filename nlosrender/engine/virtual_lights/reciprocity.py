@@ -27,9 +27,9 @@ def is_reciprocal(
     # of the capture, not of the batches it is cut into: these must not change results
     if capture.n_sensors * capture.n_lasers * n_bins > tuning.max_reciprocal_sums:
         return False
-    if not np.array_equal(capture.laser_grid.positions, capture.sensor_grid.positions):
+    if not np.array_equal(capture.laser_grid.lattice.positions, capture.sensor_grid.lattice.positions):
         return False
-    if not np.array_equal(capture.laser_legs, capture.sensor_legs):
+    if not np.array_equal(capture.laser_legs.ravel(), capture.sensor_legs.ravel()):
         return False
     shapes = built.hidden_shapes if built.wall.is_planar else built.scene.shapes()
     return not any(shape.is_mesh() and shape.has_vertex_normals() for shape in shapes)

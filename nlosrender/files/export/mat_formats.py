@@ -201,10 +201,8 @@ def _refuse_shape(ordered: OrderedCapture) -> None:
     if not ordered.scan.planar:
         raise FileError(f"{path}: has a curved relay wall, and this format holds no positions. Export it as tal.")
     if not ordered.is_grid:
-        raise FileError(
-            f"{path}: its sensor points are no grid along the wall's axes, and this format holds no positions. "
-            "Export it as tal."
-        )
+        are = "a list" if ordered.scan.has_sensor_list else "no grid along the wall's axes"
+        raise FileError(f"{path}: its sensor points are {are}, and this format holds no positions. Export it as tal.")
 
 
 def _refuse_large(ordered: OrderedCapture, n_bins: int) -> None:

@@ -83,7 +83,15 @@ def write_tal(path: Path, ordered: OrderedCapture, keep_legs: bool) -> list[str]
         file["t_start"] = scan.start_opl if keep_legs else 0.0
         file["t_accounts_first_and_last_bounces"] = scan.legs_counted and keep_legs
         file["scene_info"] = _scene_info(ordered.capture, scan)
-    return _leg_losses(scan, move)
+    return [*_list_losses(ordered.capture), *_leg_losses(scan, move)]
+
+
+def _list_losses(capture: StoredCapture) -> list[str]:
+    return [
+        f"the {name} points are a list, here a grid of {count} x 1: take methods that go by positions, such as bp"
+        for name, (_, count) in (("sensor", capture.header.sensor_grid), ("laser", capture.header.laser_grid))
+        if capture.header.is_list(name)
+    ]
 
 
 def _leg_losses(scan: Scan, move: Rectification | None) -> list[str]:

@@ -91,8 +91,13 @@ def ordered_capture(
     capture: StoredCapture, scan: Scan, bounces: tuple[int, ...], *, x_descends: bool = False, y_descends: bool = False
 ) -> OrderedCapture:
     """Return a capture in the order of wall coordinates: rows along y, columns along x, both ascending by default."""
-    sensors = grid_order(scan.sensors, x_descends=x_descends, y_descends=y_descends)
-    lasers = sensors if scan.confocal else grid_order(scan.lasers, x_descends=x_descends, y_descends=y_descends)
+
+    def order(name: str, points: Float64) -> GridOrder | None:
+        listed = capture.header.is_list(name)
+        return None if listed else grid_order(points, x_descends=x_descends, y_descends=y_descends)
+
+    sensors = order("sensor", scan.sensors)
+    lasers = sensors if scan.confocal else order("laser", scan.lasers)
     laser_order = lasers or _as_stored(scan.lasers)
     sensor_order = sensors or _as_stored(scan.sensors)
     ordered = replace(

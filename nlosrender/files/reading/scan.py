@@ -43,6 +43,7 @@ class Scan:
     hidden_aabb: Bounds | None  # around the hidden geometry, as the file has it
     wall_to_file: Float64  # (4, 4)
     wall_to_scene: Float64 | None  # (4, 4); None when the file does not say
+    has_sensor_list: bool = False  # whether the sensor points are a list in one row, which may stand anywhere
 
     @property
     def confocal(self) -> bool:
@@ -100,6 +101,7 @@ def read_scan(capture: StoredCapture) -> Scan:
         hidden_aabb=hidden_box(header, wall_from_file),
         wall_to_file=wall_to_file,
         wall_to_scene=None if to_scene is None else to_scene @ wall_to_file,
+        has_sensor_list=header.is_list(),
     )
 
 

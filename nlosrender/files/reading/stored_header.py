@@ -90,6 +90,15 @@ class StoredHeader:
         """Rows and columns of the laser grid; a confocal capture has its sensor grid here."""
         return self.sensor_grid if self.confocal else (self.sizes["laser_y"], self.sizes["laser_x"])
 
+    def is_list(self, name: str = "sensor") -> bool:
+        """Whether ``sensor`` or ``laser`` points are a list, in one row, and not a grid."""
+        return name in str(self.attributes.get(layout.POINT_LISTS, "")).split()
+
+    def counted_points(self, name: str = "sensor") -> str:
+        """Return the number of ``sensor`` or ``laser`` points in words: ``5 x 3``, or ``15 listed``."""
+        rows, columns = self.sensor_grid if name == "sensor" else self.laser_grid
+        return f"{columns} listed" if self.is_list(name) else f"{columns} x {rows}"
+
     @property
     def is_measured(self) -> bool:
         """Whether the samples are a detector's counts."""

@@ -8,6 +8,7 @@ apart, the rest once for all. docs/virtual-lights.md, 3.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,7 +48,7 @@ def regions_of(
     """
     if capture.n_lasers > 1 and capture.scan_type != "confocal":
         return None  # what is near to a laser point has to be fine for all
-    size_field, grid = whole.size_field, capture.sensor_grid
+    size_field, grid = whole.size_field, capture.sensor_grid.lattice
     tuning, wall_index = size_field.tuning, size_field.wall_index
     fitting = (n for n in tuning.region_blocks if capture.n_sensors >= n**2 * tuning.min_region_sensors)
     blocks = next(fitting, 1)
@@ -68,12 +69,9 @@ def regions_of(
         Elements.joined([elements.select((elements.distances < reach) == is_near) for elements in parts])
         for is_near in (True, False)
     )
-    row_blocks, column_blocks = (np.arange(n) * blocks // n for n in (grid.ny, grid.nx))
-    near = []
-    for row, column in np.ndindex(blocks, blocks):
-        part = _part_of(capture, np.ix_(row_blocks == row, column_blocks == column))
-        near.append(SizedElements(subdivide(close, WallDistance(part, unit), wall_index), size_field))
-    labels = (row_blocks[:, None] * blocks + column_blocks).reshape(-1)
+    labels, point_sets = _blocks(grid, blocks)
+    distances = (WallDistance(_with_points(capture, part), unit) for part in point_sets)
+    near = [SizedElements(subdivide(close, distance, wall_index), size_field) for distance in distances]
     regions = Regions(labels, tuple(near), SizedElements(far, size_field))
     lighting = tuning.sensors_per_patch_cost
     cost = sum(regions.counts(1.0)) * capture.n_sensors + regions.total(1.0) * lighting
@@ -81,8 +79,22 @@ def regions_of(
     return regions if cost < tuning.max_region_cost * cost_of_one else None
 
 
-def _part_of(capture: Capture, chosen: tuple[NDArray[np.intp], ...]) -> Capture:
-    """Return the capture with a part of its sensor points, and of its laser points where they are the same."""
-    grid = capture.sensor_grid
-    part = PointGrid(grid.wall_coordinates[chosen], grid.positions[chosen], grid.normals[chosen], grid.size)
-    return replace(capture, sensor_grid=part, laser_grid=part if capture.laser_grid is grid else capture.laser_grid)
+def _blocks(grid: PointGrid, blocks: int) -> tuple[NDArray[np.int64], list[PointGrid]]:
+    """Return the block (points,) of each point of ``blocks`` x ``blocks``, and the points of each that has any."""
+    if grid.is_list:
+        at = np.minimum((grid.places * blocks).astype(np.int64), blocks - 1)
+        found, labels = np.unique(at @ [1, blocks], return_inverse=True)
+        return labels, [_part(grid, (slice(None), labels == label)) for label in range(len(found))]
+    rows, columns = (np.arange(n) * blocks // n for n in (grid.ny, grid.nx))
+    labels = (rows[:, None] * blocks + columns).reshape(-1)
+    return labels, [_part(grid, np.ix_(rows == row, columns == column)) for row, column in np.ndindex(blocks, blocks)]
+
+
+def _part(grid: PointGrid, chosen: Any) -> PointGrid:
+    return replace(grid, **{name: getattr(grid, name)[chosen] for name in ("wall_coordinates", "positions", "normals")})
+
+
+def _with_points(capture: Capture, part: PointGrid) -> Capture:
+    """Return the capture with other sensor points, and laser points where they are the same."""
+    is_same = capture.laser_grid is capture.sensor_grid
+    return replace(capture, sensor_grid=part, laser_grid=part if is_same else capture.laser_grid)

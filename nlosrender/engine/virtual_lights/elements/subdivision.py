@@ -72,7 +72,8 @@ class RegularPoints:
     @classmethod
     def of(cls, grid: PointGrid, unit: float) -> RegularPoints:
         x, y = grid.positions[0, :, 0] / unit, grid.positions[:, 0, 1] / unit
-        steps = tuple(float(axis[1] - axis[0]) if len(axis) > 1 else 1.0 for axis in (x, y))
+        # 1: of one row or column, and of lists that are no lattice, any step does
+        steps = tuple((float(axis[1] - axis[0]) if len(axis) > 1 else 0.0) or 1.0 for axis in (x, y))
         return cls((float(x[0]), float(y[0])), (steps[0], steps[1]), (len(x), len(y)))
 
     def squared_distance(self, points: Float64) -> Float64:
@@ -96,7 +97,7 @@ class WallDistance:
         self._regular: list[RegularPoints] = []
         self._trees: list[cKDTree] = []
         for grid in grids:
-            regular = RegularPoints.of(grid, unit)
+            regular = RegularPoints.of(grid.lattice, unit)
             positions = grid.positions.reshape(-1, 3) / unit
             if regular.squared_distance(positions).max() < GRID_TOLERANCE**2:
                 self._regular.append(regular)

@@ -63,7 +63,7 @@ class Tessellator:
     ):
         self.built, self.capture, self.tuning = built, capture, tuning
         self.distance = WallDistance(capture, built.metres_per_engine_unit)
-        self.reach = max(capture.sensor_grid.size) / (
+        self.reach = max(capture.sensor_grid.lattice.size) / (
             2 * built.metres_per_engine_unit
         )  # half the sensor grid's extent [engine units]
         triangles: list[Elements] = []

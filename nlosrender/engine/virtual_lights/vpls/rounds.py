@@ -193,8 +193,8 @@ class VplBounces:
         if budget.rounds is None and budget.target_error is not None:
             known_squares += self.device.exact_squares(batch)
         histogram = self.histogram(batch, self.options.replicas)
-        grid = self.device.capture.sensor_grid
-        contrasts = RoundContrasts(histogram, self.device.sensor_indices(batch), (grid.nx, grid.ny))
+        places = self.device.capture.sensor_grid.places[self.device.sensor_indices(batch)]
+        contrasts = RoundContrasts(histogram, places)
         done, skipped, units, before = 0, 0, 1, 0.0
         if (earlier := passes.resumed("sums")) is not None:
             histogram.sums = on_device(mi.Float64, earlier.arrays["sums"])
