@@ -15,13 +15,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from nlosrender.analysis.laser_view import dotted, list_on_wall
 from nlosrender.analysis.theme import COLORMAP, EDGE, FAINT, GROUND, INK, MARK, PANEL
 from nlosrender.errors import FileError
 from nlosrender.files.atomic_write import replacing
 from nlosrender.files.dataset_index import read_index
 from nlosrender.files.file_kinds import PNG
 from nlosrender.files.reading.reader import open_capture
-from nlosrender.files.reading.scan import chosen_bounces, moved, read_light, wall_frame
+from nlosrender.files.reading.scan import chosen_bounces, read_light
 from nlosrender.files.truth_datasets import read_ground_truth
 
 if TYPE_CHECKING:
@@ -31,7 +32,6 @@ SIDE = 96  # pixels of each of the three pictures of a capture
 LINES, LINE = 3, 13  # lines of text below the pictures, and their height [pixels]
 GAP = 6  # between pictures [pixels]
 LETTER = 6  # width of a character of Pillow's default font [pixels]
-DOT = 4  # side of the dot of a listed point [pixels]
 EMPTY = 0.06  # brightness where there is nothing
 COLUMNS = 5
 MAX_CAPTURES = 100
@@ -93,27 +93,15 @@ def capture_pictures(path: Path) -> tuple[Picture | None, Picture, Picture]:
     with open_capture(path) as capture:
         sizes = capture.header.sizes
         laser = (0, 0) if capture.header.confocal else (sizes["laser_y"] // 2, sizes["laser_x"] // 2)
-        points = moved(capture.positions.sensor_positions[0], wall_frame(capture.header))
-        is_list = capture.header.is_list()
+        points = list_on_wall(capture)
         light = read_light(capture, laser, None, None, chosen_bounces(capture.header, "all")).astype(np.float64)
     truth = read_ground_truth(path, ("gt_depth", "gt_instance"))
     peak = int(light.sum(axis=(0, 1)).argmax())
     brightest = np.unravel_index(int(light.sum(axis=2).argmax()), light.shape[:2])
-    front, wall = _front(truth), _colored(light[..., peak])
-    if is_list:
-        wall = _dots(points, wall[0])
-        front = _dots(points, front[0]) if front is not None and front.shape[:2] == light.shape[:2] else front
-    return front, wall, _scaled(light[brightest])
-
-
-def _dots(points: Picture, colors: Picture) -> Picture:
-    """Return the points of a list (points, 3) [m] as dots on a dark square (SIDE, SIDE, 3), the last on top."""
-    picture = np.full((SIDE, SIDE, 3), EMPTY)
-    low, extent = points.min(axis=0), max(float(np.ptp(points[:, :2], axis=0).max()), 1e-9)
-    places = ((points - low)[:, :2] / extent * (SIDE - DOT)).astype(int)
-    for (x, y), color in zip(places, colors, strict=True):
-        picture[y : y + DOT, x : x + DOT] = color
-    return picture
+    front = _front(truth)
+    if front is not None and front.shape[:2] == light.shape[:2]:  # seen from the sensor points
+        front = dotted(points, front, EMPTY)
+    return front, dotted(points, _colored(light[..., peak]), EMPTY), _scaled(light[brightest])
 
 
 def _front(truth: Mapping[str, Picture]) -> Picture | None:

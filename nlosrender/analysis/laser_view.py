@@ -10,12 +10,14 @@ from numpy.typing import NDArray
 
 from nlosrender.errors import FileError
 from nlosrender.files.reading.reader import BAND_BYTES, StoredCapture
+from nlosrender.files.reading.scan import moved, wall_frame
 from nlosrender.files.reading.stored_header import intensity
 
 Float64 = NDArray[np.float64]
 
 FRAME_SHARES = (0.02, 0.2, 0.45, 0.7, 0.95)  # of the light that has arrived at the moments shown
 WINDOW_SHARES = (0.0005, 0.9995)  # of it at the ends of the part of the time axis that is worth showing
+DOTTED, DOT = 96, 4  # pixels of the side of a picture of listed points, and of each of them
 MAX_ROW_BYTES = 2**30  # of one row of sensor points, which is read at once
 MAX_LASER_BYTES = 2**36  # minutes of reading; beyond it a file is more likely damaged than meant
 
@@ -104,6 +106,28 @@ def row_over_time(capture: StoredCapture, laser: tuple[int, int], row: int) -> F
     """
     block = capture.read_block(lasers=laser, sensors=(row, None))
     return intensity(capture.header, block[:, :, 0, 0, 0].astype(np.float64)).sum(axis=0)
+
+
+def list_on_wall(capture: StoredCapture) -> Float64 | None:
+    """Return where the points of a list are on the wall, x and y (points, 2) [m]; None for a grid."""
+    if not capture.header.is_list():
+        return None
+    return np.asarray(moved(capture.positions.sensor_positions[0], wall_frame(capture.header))[:, :2])
+
+
+def dotted(points: Float64 | None, values: Float64, empty: float = np.nan) -> Float64:
+    """Return values of a list (1, points, ...) as dots on a square (rows, columns, ...), the last on top.
+
+    Rows ascend in wall y, columns in x, as of a grid, for which ``points`` are None and ``values`` are returned.
+    """
+    if points is None:
+        return values
+    picture = np.full((DOTTED, DOTTED, *values.shape[2:]), empty)
+    extent = max(float(np.ptp(points, axis=0).max()), 1e-9)
+    places = ((points - points.min(axis=0)) / extent * (DOTTED - DOT)).astype(int)
+    for (x, y), value in zip(places, values[0], strict=True):
+        picture[y : y + DOT, x : x + DOT] = value
+    return picture
 
 
 def frame_bins(time: Float64) -> list[int]:

@@ -16,6 +16,7 @@ from nlosrender.analysis.laser_view import (
     LaserView,
     frame_bins,
     laser_view,
+    list_on_wall,
     lit_window,
     point_histograms,
     row_over_time,
@@ -43,7 +44,6 @@ from nlosrender.constants import opl_to_seconds
 from nlosrender.errors import OptionError
 from nlosrender.files.atomic_write import check_writable
 from nlosrender.files.reading.reader import StoredCapture, open_capture
-from nlosrender.files.reading.scan import moved, wall_frame
 from nlosrender.files.reading.stored_header import StoredHeader
 
 if TYPE_CHECKING:
@@ -174,7 +174,7 @@ def _draw_frames(figure: SubFigure, capture: StoredCapture, view: LaserView, pix
     left, right, bottom, top = extent
     rows, columns = header.sensor_grid
     at_pixel = (left + (pixel[1] + 0.5) / columns * (right - left), bottom + (pixel[0] + 0.5) / rows * (top - bottom))
-    points = _list_on_wall(capture)
+    points = list_on_wall(capture)
     if points is not None:
         at_pixel = (float(points[pixel[1], 0]), float(points[pixel[1], 1]))
         xlabel, ylabel = "wall x [m]", "wall y [m]"
@@ -288,13 +288,6 @@ def _wall_extent(header: StoredHeader) -> tuple[tuple[float, float, float, float
         return (-width / 2, width / 2, -height / 2, height / 2), "wall x [m]", "wall y [m]"
     rows, columns = header.sensor_grid
     return (-0.5, columns - 0.5, -0.5, rows - 0.5), "column", "row"
-
-
-def _list_on_wall(capture: StoredCapture) -> Float64 | None:
-    """Return where the points of a list are on the wall, x and y (points, 2) [m]; None for a grid."""
-    if not capture.header.is_list():
-        return None
-    return np.asarray(moved(capture.positions.sensor_positions[0], wall_frame(capture.header))[:, :2])
 
 
 def _at_most(light: Float64, lines: int) -> Float64:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from nlosrender.analysis.comparison.blocks import blocks
 from nlosrender.analysis.comparison.captures import open_aligned
 from nlosrender.analysis.comparison.differences import index_of_max
+from nlosrender.analysis.laser_view import list_on_wall
 from nlosrender.files.reading.stored_header import StoredHeader
 
 Float64 = NDArray[np.float64]
@@ -30,6 +31,8 @@ class DifferenceView:
         (row, column) of the sensor point with most squared difference.
     histogram, reference_histogram
         (bin,) of that point.
+    points
+        (points, 2) where the sensor points are on the wall [m], where they are a list.
     """
 
     header: StoredHeader
@@ -39,6 +42,7 @@ class DifferenceView:
     reference_wall: Float64
     histogram: Float64
     reference_histogram: Float64
+    points: Float64 | None
 
 
 def difference_view(path: str | Path, reference: str | Path, laser: tuple[int, int]) -> DifferenceView:
@@ -61,4 +65,5 @@ def difference_view(path: str | Path, reference: str | Path, laser: tuple[int, i
             if squares[row, column] > most:
                 most, histograms = float(squares[row, column]), light[:, row, column]
                 sensor = (block.rows.start + row, block.columns.start + column)
-        return DifferenceView(header, laser, sensor, walls[0], walls[1], histograms[0], histograms[1])
+        points = list_on_wall(pair.b.capture)
+        return DifferenceView(header, laser, sensor, walls[0], walls[1], histograms[0], histograms[1], points)

@@ -13,8 +13,10 @@ from nlosrender import __version__
 from nlosrender.analysis.capture_table import summary_rows
 from nlosrender.analysis.laser_view import (
     LaserView,
+    dotted,
     frame_bins,
     laser_view,
+    list_on_wall,
     lit_window,
     point_histograms,
     row_over_time,
@@ -105,6 +107,7 @@ def _pictures(capture: StoredCapture) -> dict[str, Any]:
         "laser": view.laser if header.scan_type == "exhaustive" else None,
         "frames": _frames(capture, view),
         "brightest": (row, column),
+        "is_list": header.is_list(),
         "curves": _curves(capture, histograms),
         "top": float(histograms.max()),
         "span": f"{ends[0]:.4g} to {ends[1]:.4g} m ({_ns(ends[0])} to {_ns(ends[1])} ns)",
@@ -127,8 +130,9 @@ def _frames(capture: StoredCapture, view: LaserView) -> list[dict[str, str]]:
         captions.append(f"{opl:.3f} m, {_ns(opl)} ns")
     shown = [view.wall, *wall_frames(capture, view.laser, windows)]
     tops = [max(float(frame.max()), 0.0) for frame in shown]
+    points = list_on_wall(capture)
     return [
-        {"uri": colored(frame, COLORMAP, 0, top), "caption": caption, "range": f"0 to {top:.3g}"}
+        {"uri": colored(dotted(points, frame), COLORMAP, 0, top), "caption": caption, "range": f"0 to {top:.3g}"}
         for frame, top, caption in zip(shown, tops, captions, strict=True)
     ]
 

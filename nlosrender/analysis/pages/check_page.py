@@ -10,7 +10,7 @@ import numpy as np
 from nlosrender import __version__
 from nlosrender.analysis.comparison.dataset import CheckedFile, DatasetCheck
 from nlosrender.analysis.comparison.difference_view import DifferenceView, difference_view
-from nlosrender.analysis.laser_view import lit_window
+from nlosrender.analysis.laser_view import dotted, lit_window
 from nlosrender.analysis.pages.html_page import colored, curve, write_page
 from nlosrender.analysis.theme import COLORMAP
 from nlosrender.errors import FileError
@@ -80,11 +80,12 @@ def _walls(view: DifferenceView) -> list[dict[str, str]]:
     top = max(float(view.wall.max()), float(view.reference_wall.max()), 0.0)
     most = float(np.abs(difference).max())
     unit = view.header.unit
+    new, old, change = (dotted(view.points, wall) for wall in (view.wall, view.reference_wall, difference))
     return [
-        {"uri": colored(view.wall, COLORMAP, 0, top), "caption": "new", "range": f"0 to {top:.3g} {unit}"},
-        {"uri": colored(view.reference_wall, COLORMAP, 0, top), "caption": "reference", "range": "same scale"},
+        {"uri": colored(new, COLORMAP, 0, top), "caption": "new", "range": f"0 to {top:.3g} {unit}"},
+        {"uri": colored(old, COLORMAP, 0, top), "caption": "reference", "range": "same scale"},
         {
-            "uri": colored(difference, DIFFERENCE_COLORS, -most, most),
+            "uri": colored(change, DIFFERENCE_COLORS, -most, most),
             "caption": "new - reference: red brighter, blue darker",
             "range": f"-{most:.3g} to {most:.3g} {unit}",
         },

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 
 Float64 = NDArray[np.float64]
 MAX_TEXT = 2000  # characters of one text from a file
+EMPTY = 0.45  # grey where there is no point (NaN)
 MAX_CURVE = 480  # points of a histogram, which is about as many pixels wide
 
 
@@ -67,11 +68,12 @@ def percent(share: float | None, infinite: str = "infinite") -> str:
 
 
 def colored(values: Float64, colormap: str, low: float, high: float) -> str:
-    """Return (rows, columns) on the wall as a picture's address: one pixel per point, the first row at the bottom."""
+    """Return (rows, columns) on the wall as a picture's address: the first row at the bottom."""
     from matplotlib import colormaps
 
     share = (values[::-1] - low) / (high - low if high > low else 1.0)
-    return picture_uri(np.round(255 * np.asarray(colormaps[colormap](np.clip(share, 0, 1)))[..., :3]).astype(np.uint8))
+    colors = np.asarray(colormaps[colormap](np.clip(share, 0, 1)))[..., :3]
+    return picture_uri(np.round(255 * np.where(np.isnan(share)[..., None], EMPTY, colors)).astype(np.uint8))
 
 
 def picture_uri(picture: NDArray[np.uint8]) -> str:
