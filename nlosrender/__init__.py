@@ -11,6 +11,8 @@ if TYPE_CHECKING:
     from nlosrender.api.opened_capture import Capture
     from nlosrender.api.opened_capture import open_file as open
     from nlosrender.api.renders import render, render_all
+    from nlosrender.api.transient_light import Transient, transient
+    from nlosrender.engine.backend.start import start_backend
     from nlosrender.errors import NlosError, NlosWarning
 
 __all__ = [
@@ -18,18 +20,23 @@ __all__ = [
     "Configuration",
     "NlosError",
     "NlosWarning",
+    "Transient",
     "Validation",
     "load",
     "open",
     "plan",
     "render",
     "render_all",
+    "start_backend",
+    "transient",
     "validate",
 ]
 _PLACES = {  # imported when a name is first asked for: ``import nlosrender`` takes milliseconds
     "api.configuration": ("Configuration", "Validation", "load", "plan", "validate"),
     "api.opened_capture": ("Capture", "open"),
     "api.renders": ("render", "render_all"),
+    "api.transient_light": ("Transient", "transient"),
+    "engine.backend.start": ("start_backend",),
     "errors": ("NlosError", "NlosWarning"),
 }
 

@@ -246,6 +246,20 @@ def test_xarray_has_names_metres_and_seconds(rendered: nr.Capture) -> None:
     assert part.equals(samples.isel(sensor_y=slice(1, 3), sensor_x=[4]).sel(bounce=[3]))
 
 
+@pytest.mark.filterwarnings("ignore::nlosrender.NlosWarning")
+def test_listed_points_have_places_of_their_own(tmp_path: Path) -> None:
+    """No rectangle has their coordinates; the nearest of them is found."""
+    pytest.importorskip("xarray")
+    scene = flat_wall(Z, spp=16)
+    points = [[0.5, 0.25], [-0.5, 0.25], [0.25, -0.5], [0.0, 0.75]]
+    del scene["capture"]["sensor_grid"]
+    capture = nr.render(scene, tmp_path / "list.hdf5", {"capture.sensor_points": points})
+    samples = capture.xarray()
+    places = np.stack([samples.sensor_position_x, samples.sensor_position_y], axis=-1)[0]
+    assert places == pytest.approx(np.array(points), abs=1e-6)
+    assert np.array_equal(capture.histogram(0.2, -0.4), capture.histogram(pixel=(0, 2)))
+
+
 @pytest.mark.parametrize(
     ("call", "message"),
     [

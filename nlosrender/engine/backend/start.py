@@ -98,6 +98,26 @@ def _started(wanted: BackendName, colored: bool, polarized: bool) -> Backend:
     return Backend(name, variant, library)
 
 
+def join_backend() -> tuple[Backend, bool]:
+    """Return the backend of the variant that a program has set itself, and whether it renders three channels.
+
+    Raises
+    ------
+    BackendError
+        It has set none, or one that the engines do not run on, or Dr.Jit has an LLVM that may abort.
+    """
+    mitsuba = sys.modules.get("mitsuba")
+    variant = None if mitsuba is None else mitsuba.variant()
+    names: dict[str, tuple[BackendName, bool]] = {
+        f"{name}_ad_{color}": (name, color == "rgb") for name in ("llvm", "cuda") for color in ("mono", "rgb")
+    }
+    if variant not in names:
+        found = "no variant of Mitsuba is set" if variant is None else f"Mitsuba's variant is {variant}"
+        raise BackendError(f"{found}, need one of {', '.join(names)}. nlosrender.start_backend() sets one.")
+    name, colored = names[variant]
+    return start_backend(name, colored=colored), colored
+
+
 def limit_threads(count: int) -> None:
     """Let Dr.Jit use so many threads of this process; the backend is started."""
     import drjit

@@ -20,18 +20,21 @@ from nlosrender.scene.transforms import transform_matrix
 
 TEXEL_ROUNDING = 1e-3  # half-precision images, of 2^-11, and their filters may pass 1 a little
 BENDING = ("RoughDielectric", "Principled")  # BSDF classes that refract in directions a connection can take
+LOADED = "loaded"  # the only key of a BSDF dict that holds a Mitsuba object
 TRANSFORMS = ("to_world", "to_uv")  # keys of a plugin that hold a matrix or a list of steps
 _SOURCE = re.compile(r"\[\w+\.(?:cpp|h|py):\d+\] |At dictionary node \"root\": ")
 
 
 def load_bsdf(bsdf: Mapping[str, object], key: str) -> mi.BSDF:
-    """Load a BSDF and look at its images.
+    """Load a BSDF and look at its images; of ``{LOADED: bsdf}``, which a program has loaded, it is that one.
 
     Raises
     ------
     ConfigError
         Mitsuba rejects it, or an image holds values that no reflectance has; ``key`` is named.
     """
+    if LOADED in bsdf:
+        return bsdf[LOADED]
     try:
         for image in image_files(bsdf):
             check_image(image)
