@@ -36,6 +36,7 @@ def _rows(summary: dict[str, Any]) -> list[tuple[str, str]]:
         ("scan type", _text(summary["scan_type"])),
         ("pixels" if is_view else "sensor points", _grid(summary, "sensor")),
         ("laser points", "" if is_view else _grid(summary, "laser")),
+        ("of a camera", _pixels(summary)),
         ("camera at" if is_view else "sensor at", _lengths(summary["sensor_position"])),
         ("laser at", "" if is_view else _lengths(summary["laser_position"])),
         ("time axis", f"{bins}, {window}"),
@@ -69,6 +70,15 @@ def _rows(summary: dict[str, Any]) -> list[tuple[str, str]]:
         ("check", _verdict(summary)),
         *(("differs", str(difference)) for difference in summary.get("deviations", ())),
     ]
+
+
+def _pixels(summary: dict[str, Any]) -> str:
+    """Return how many points of a camera are empty, and how many the laser does not reach."""
+    if summary["empty_sensor_points"] is None:
+        return ""
+    counts = f"{summary['empty_sensor_points']} of its pixels see nothing"
+    unlit = summary["unlit_laser_points"]
+    return f"{counts}, {unlit} laser points are hidden from the laser" if unlit else counts
 
 
 def measurement_rows(found: Mapping[str, object]) -> list[tuple[str, str]]:

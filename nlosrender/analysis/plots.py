@@ -178,10 +178,13 @@ def _draw_frames(figure: SubFigure, capture: StoredCapture, view: LaserView, pix
     if points is not None:
         at_pixel = (float(points[pixel[1], 0]), float(points[pixel[1], 1]))
         xlabel, ylabel = "wall x [m]", "wall y [m]"
-    all_axes = np.ravel(figure.subplots(1, len(bins), sharex=True, sharey=True, squeeze=False))
-    for axes, frame, index in zip(all_axes, frames, bins, strict=True):
-        opl = header.start_opl + (index + 0.5) * header.bin_width_opl
-        style(axes, f"{opl:.3f} m   {opl_to_seconds(opl) * 1e9:.2f} ns", xlabel, ylabel if axes is all_axes[0] else "")
+    moments = [header.start_opl + (index + 0.5) * header.bin_width_opl for index in bins]
+    titles = [f"{opl:.3f} m   {opl_to_seconds(opl) * 1e9:.2f} ns" for opl in moments]
+    if header.has_pixels:
+        frames, titles = np.concatenate([view.wall[None], frames]), ["sum over time", *titles]
+    all_axes = np.ravel(figure.subplots(1, len(titles), sharex=True, sharey=True, squeeze=False))
+    for axes, frame, title in zip(all_axes, frames, titles, strict=True):
+        style(axes, title, xlabel, ylabel if axes is all_axes[0] else "")
         scale: dict[str, Any] = {"cmap": COLORMAP, "vmin": 0, "vmax": max(frame.max(), 0) or 1}
         if points is None:
             axes.imshow(frame, origin="lower", extent=extent, **scale)
@@ -282,7 +285,7 @@ def _bounce_label(header: StoredHeader, slot: int) -> str:
 
 def _wall_extent(header: StoredHeader) -> tuple[tuple[float, float, float, float], str, str]:
     """Return (left, right, bottom, top) of the sensor grid, and labels for its axes; indices without a known size."""
-    size = None if _is_view(header) else header.sensor_grid_size
+    size = None if header.has_pixels else header.sensor_grid_size
     if size is not None and len(size) == 2 and all(np.isfinite(length) and length > 0 for length in size):
         width, height = size
         return (-width / 2, width / 2, -height / 2, height / 2), "wall x [m]", "wall y [m]"

@@ -9,6 +9,7 @@ from pathlib import Path
 from nlosrender.analysis.json_values import finite_or_none
 from nlosrender.constants import opl_to_seconds
 from nlosrender.errors import FileError
+from nlosrender.files import layout
 from nlosrender.files.attributes import text_list
 from nlosrender.files.capture_results import OMITTED, UNSAMPLED, WARNINGS, ZERO
 from nlosrender.files.reading.reader import read_header
@@ -64,6 +65,7 @@ def summarise(path: str | Path) -> dict[str, object]:
         "channels": attributes.get("channels", "grey" if header.sizes["channel"] == 1 else None),
         "frame": attributes.get("frame"),
         "planar_wall": _flag(attributes.get("planar_wall")),
+        **{name: attributes.get(name) for name in (layout.EMPTY_POINTS, layout.UNLIT_POINTS)},
         "hidden_volume_position": _listed(header.hidden_volume_position),
         "hidden_volume_size": _listed(header.hidden_volume_edges),
         "data_shape": list(header.data_shape),

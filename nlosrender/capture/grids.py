@@ -7,16 +7,17 @@ from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from nlosrender.capture.bounces import LINE_OF_SIGHT
 from nlosrender.errors import ConfigError
 from nlosrender.scene.pose import Float64
-from nlosrender.scene.walls.wall import EDGE_TOLERANCE, RelayWall
+from nlosrender.scene.walls.wall import EDGE_TOLERANCE, RectangleWall, RelayWall
 
 if TYPE_CHECKING:
     from nlosrender.config.capture import CaptureConfig, GridConfig
     from nlosrender.config.point_list import PointList
+    from nlosrender.scene.pixel_points import PixelPoints
 
 EVENNESS = 1e-6  # of the spacing: decimal coordinates of a grid with few digits
 SCAN_TYPES = ("single", "confocal", "exhaustive", LINE_OF_SIGHT)
@@ -31,6 +32,7 @@ class PointGrid:
     normals: Float64  # (ny, nx, 3), unit
     size: tuple[float, float]  # extent the cells cover (width, height) [m], of a list its points'; (0, 0) for one point
     is_list: bool = False  # one row of points that stand anywhere, in the order they were given
+    is_empty: NDArray[np.bool_] | None = None  # (ny, nx) pixels that see nothing; None: there is no camera
 
     @property
     def ny(self) -> int:
@@ -90,6 +92,7 @@ class Capture:
     account_first_and_last_bounces: bool
     laser_energy: float  # J per pulse
     laser_spot_radius: float  # m; 0 = a point
+    n_unlit_lasers: int = 0  # laser points that a camera sees and the laser does not light
 
     def __post_init__(self) -> None:
         if self.scan_type not in SCAN_TYPES:
@@ -190,8 +193,8 @@ def single_point(wall: RelayWall, xy: ArrayLike) -> PointGrid:
     return _grid_at(wall, np.asarray(xy, dtype=np.float64).reshape(1, 1, 2), (0.0, 0.0))
 
 
-def build_capture(capture_config: CaptureConfig, wall: RelayWall) -> Capture:
-    """Build the capture of a configuration, in the wall's local frame.
+def build_capture(capture_config: CaptureConfig, wall: RelayWall, pixels: PixelPoints | None = None) -> Capture:
+    """Build the capture of a configuration, in the wall's local frame; ``pixels``: the points that a camera sees.
 
     Raises
     ------
@@ -200,6 +203,8 @@ def build_capture(capture_config: CaptureConfig, wall: RelayWall) -> Capture:
     ValueError
         A point is off the wall, or a value is out of range.
     """
+    if pixels is not None:
+        return _capture_of_pixels(capture_config, wall, pixels)
     sensor_grid = _configured_points(capture_config, "sensor", wall)
     if capture_config.scan_type == "confocal":
         laser_grid = sensor_grid
@@ -208,12 +213,45 @@ def build_capture(capture_config: CaptureConfig, wall: RelayWall) -> Capture:
     else:
         laser_point = capture_config.laser_point
         laser_grid = single_point(wall, (0.0, 0.0) if laser_point is None else laser_point)
+    devices = (_device_position(at, wall) for at in (capture_config.laser_position, capture_config.sensor_position))
+    return _capture(capture_config, sensor_grid, laser_grid, *devices)
+
+
+def _capture_of_pixels(capture_config: CaptureConfig, wall: RelayWall, pixels: PixelPoints) -> Capture:
+    both = pixels.sensors, pixels.lasers
+    if isinstance(wall, RectangleWall):
+        sensor_grid, laser_grid = (
+            replace(_grid_at(wall, xy, _extent(xy)), is_empty=hits.is_empty)
+            for hits, xy in zip(both, pixels.wall_coordinates(wall), strict=True)
+        )
+    else:
+        sensor_grid, laser_grid = (
+            PointGrid(
+                np.zeros((*hits.shapes.shape, 2)), hits.positions, hits.normals, (0.0, 0.0), is_empty=hits.is_empty
+            )
+            for hits in both
+        )
+    if capture_config.scan_type == "confocal":
+        laser_grid = sensor_grid
+    laser, eye = (wall.pose.to_local(pixels.frame.to_scene(at)) for at in (pixels.laser, pixels.sensors.origin))
+    n_unlit = int((~pixels.lasers.is_reached & ~pixels.lasers.is_empty).sum())
+    return replace(_capture(capture_config, sensor_grid, laser_grid, laser, eye), n_unlit_lasers=n_unlit)
+
+
+def _extent(xy: Float64) -> tuple[float, float]:
+    width, height = np.ptp(xy.reshape(-1, 2), axis=0).tolist()
+    return width, height
+
+
+def _capture(
+    capture_config: CaptureConfig, sensor_grid: PointGrid, laser_grid: PointGrid, laser: Float64, sensor: Float64
+) -> Capture:
     return Capture(
         scan_type=capture_config.scan_type,
         sensor_grid=sensor_grid,
         laser_grid=laser_grid,
-        laser_position=_device_position(capture_config.laser_position, wall),
-        sensor_position=_device_position(capture_config.sensor_position, wall),
+        laser_position=laser,
+        sensor_position=sensor,
         account_first_and_last_bounces=bool(capture_config.account_first_and_last_bounces),
         laser_energy=float(capture_config.laser_energy),
         laser_spot_radius=float(capture_config.laser_spot_radius),

@@ -88,6 +88,6 @@ def refuse_impossible_samples(
 
 def _words(capture_config: CaptureConfig) -> tuple[str, str]:
     """Return what sensor points are called, and the key that sets their number."""
-    if capture_config.is_line_of_sight:
+    if capture_config.is_line_of_sight or capture_config.camera is not None:
         return "pixels", "capture.camera"
     return "points", f"capture.{capture_config.sensor_key}"

@@ -1,4 +1,4 @@
-"""``capture.camera``: where a line-of-sight capture is seen from."""
+"""``capture.camera``: where a scene is seen from."""
 
 from __future__ import annotations
 

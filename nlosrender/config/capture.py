@@ -20,7 +20,7 @@ from nlosrender.config.fields import (
     Point3,
 )
 from nlosrender.config.point_list import PointList, WallPoints, point_list
-from nlosrender.config.section import ONE_OF, Section
+from nlosrender.config.section import LIST, ONE_OF, Section
 from nlosrender.errors import ValidationIssue
 
 ScanType = Literal["single", "confocal", "exhaustive", "line_of_sight"]
@@ -51,21 +51,29 @@ class CaptureConfig(Section):
     """single: one laser point; confocal: laser and sensor on the same point; exhaustive: every pair;
     line_of_sight: what a camera sees of a scene with emitters"""
     sensor_grid: GridConfig | None = None
-    """the measured points; line_of_sight: the camera's pixels, not set here"""
+    """the measured points; with a camera: its pixels, not set here"""
     sensor_points: WallPoints | None = None
     """instead of a grid: [[x, y], ...] in wall coordinates [m], or {file: points.csv}, also .npy"""
     camera: CameraConfig | None = None
-    """line_of_sight: where the scene is seen from; null: the camera of scene.mitsuba"""
+    """line_of_sight: where the scene is seen from; other scans: what each pixel sees first is its sensor point, on
+    whatever surface; null: the camera of scene.mitsuba"""
+    pixel_point: Point2 | None = None
+    """where in its pixel a sensor point is seen, in pixels from the lower left corner; null: [0.5, 0.5], the centre"""
     laser_grid: GridConfig | None = None
     """the lit points of an exhaustive scan"""
     laser_points: WallPoints | None = None
     """instead of laser_grid, as sensor_points"""
     laser_point: Point2 | None = None
     """m, wall coordinates (x, y) from the wall's centre; the lit point of a single scan, default [0, 0]"""
+    laser_target: Point3 | None = None
+    """m, scene coordinates; single scan with a camera: the beam from laser_position towards it lights what it meets
+    first"""
+    laser_targets: Annotated[tuple[Point3, ...], LIST] | None = None
+    """m, scene coordinates; exhaustive scan with a camera: as laser_target, a list; null: the points of the pixels"""
     laser_position: Point3 | None = None
-    """m, scene coordinates; null: 1 m in front of the wall's centre"""
+    """m, scene coordinates; null: 1 m in front of the wall's centre, or where the camera stands"""
     sensor_position: Point3 | None = None
-    """m, scene coordinates; null: 1 m in front of the wall's centre"""
+    """m, scene coordinates; null: 1 m in front of the wall's centre; with a camera: it stands there, not set here"""
     laser_energy: Energy = 1.0
     """J per pulse"""
     laser_spot_radius: LengthOrZero = 0.0
@@ -77,9 +85,9 @@ class CaptureConfig(Section):
     def with_defaults(cls, raw: dict[str, Any], validation: ValidationInfo) -> dict[str, Any]:
         """Light the wall's centre, or make the camera's pixels the sensor grid."""
         scan = raw.get("scan_type")
-        if scan == "single" and raw.get("laser_point") is None:
+        if scan == "single" and raw.get("laser_point") is None and raw.get("laser_target") is None:
             raw["laser_point"] = [0.0, 0.0]
-        if scan == "line_of_sight" and "sensor_grid" not in raw:
+        if (scan == "line_of_sight" or raw.get("camera") is not None) and "sensor_grid" not in raw:
             pixels = {"nx": 1, "ny": 1}  # what the camera lacks is its own mistake
             if isinstance(camera := raw.get("camera"), Mapping):
                 sizes = {"nx": camera.get("width"), "ny": camera.get("height")}
@@ -89,14 +97,10 @@ class CaptureConfig(Section):
 
     def rule_sensor_points(self) -> Iterator[ValidationIssue]:
         """A scan measures a grid or a list."""
-        yield from self._one_of("sensor", "it is required: the measured points")
+        yield from self.one_of("sensor", "it is required: the measured points")
 
-    def rule_laser_points(self) -> Iterator[ValidationIssue]:
-        """An exhaustive scan has a grid or a list."""
-        if self.scan_type == "exhaustive":
-            yield from self._one_of("laser", "an exhaustive scan needs it")
-
-    def _one_of(self, name: str, why: str) -> Iterator[ValidationIssue]:
+    def one_of(self, name: str, why: str) -> Iterator[ValidationIssue]:
+        """Yield what is wrong where ``sensor`` or ``laser`` points are neither a grid nor a list, or both."""
         grid, points = getattr(self, f"{name}_grid"), getattr(self, f"{name}_points")
         if grid is None and points is None:
             message = f"missing, {why}, such as {{nx: 4, ny: 3}}, or a list as {name}_points."
@@ -108,10 +112,10 @@ class CaptureConfig(Section):
     def rule_pixels(self) -> Iterator[ValidationIssue]:
         """The grid of a camera is its pixels."""
         camera, grid = self.camera, self.sensor_grid
-        if not self.is_line_of_sight or grid is None:
+        if grid is None or not (self.is_line_of_sight or camera is not None):
             return
         if grid.width or grid.height or (camera and (grid.nx, grid.ny) != (camera.width, camera.height)):
-            message = "the sensor points of a line_of_sight capture are the camera's pixels; remove it, and set "
+            message = "the sensor points of a capture with a camera are its pixels; remove it, and set "
             message += "capture.camera.width and height."
             yield ValidationIssue(("sensor_grid",), message, "key")
 
@@ -143,6 +147,8 @@ class CaptureConfig(Section):
     @property
     def n_lasers(self) -> int:
         """Number of laser points that have a histogram of their own; 1 for a confocal scan, whose pairs are fixed."""
+        if self.scan_type == "exhaustive" and self.laser_grid is None and self.laser_points is None:  # of a camera
+            return self.n_sensors if self.laser_targets is None else len(self.laser_targets)
         return _count(self.laser_grid, self.laser_list)
 
 

@@ -74,12 +74,12 @@ class Config(Section):
             filled["output"] = {**output, "path": path}
         return _film_of_scene(_grids_on_patch(filled), validation)
 
-    # --- line-of-sight captures ---
+    # --- captures with a camera ---
 
     def rule_camera(self) -> Iterator[ValidationIssue]:
         """There is one, here or in the Mitsuba scene."""
         mitsuba = self.scene.mitsuba
-        if not self.capture.is_line_of_sight or self.capture.camera is not None:
+        if self.capture.camera is not None or not (self.capture.is_line_of_sight or mitsuba is not None):
             return
         path, example = (
             ("capture", "camera"),
@@ -104,28 +104,52 @@ class Config(Section):
 
     def rule_ground_truth(self) -> Iterator[ValidationIssue]:
         """It is seen from a relay wall."""
-        if self.output.ground_truth and self.capture.is_line_of_sight:
-            message = "is seen from a relay wall, and a line_of_sight capture has none; remove it."
+        if self.output.ground_truth and (self.capture.is_line_of_sight or self.has_pixel_points):
+            message = "is seen from a grid on a relay wall, and a capture with a camera has none; remove it."
             yield ValidationIssue(("output", "ground_truth"), message, "key")
         if "occupancy" in self.output.ground_truth and self.capture.sensor_points and not self.output.ground_truth_grid:
             message = "occupancy needs a grid, and the sensor points are a list; give output.ground_truth_grid."
             yield ValidationIssue(("output", "ground_truth"), message)
 
+    def rule_pixel_points(self) -> Iterator[ValidationIssue]:
+        """Laser and sensor of a scan whose points a camera sees: what they need, and what is for relay walls."""
+        capture = self.capture
+        if not self.has_pixel_points:
+            for key in ("pixel_point", "laser_target", "laser_targets"):
+                if getattr(capture, key) is not None:
+                    message = "is for scans with a camera; a grid on a relay wall has laser_point or laser_grid."
+                    yield ValidationIssue(("capture", key), message, "key")
+            return
+        if capture.pixel_point is not None and not all(0 <= share <= 1 for share in capture.pixel_point):
+            message = mismatch(capture.pixel_point, "two numbers from 0 to 1", "[0.5, 0.5] is the pixel's centre.")
+            yield ValidationIssue(("capture", "pixel_point"), message)
+        if capture.scan_type == "single" and capture.laser_target is None:
+            message = "missing, the laser of a single scan with a camera needs it, such as [0, 0, 0]: the point it is "
+            yield ValidationIssue(("capture", "laser_target"), f"{message}aimed at from capture.laser_position.")
+        if capture.laser_targets is not None and not capture.laser_targets:
+            message = mismatch([], "at least one point, or null for the points of the camera's pixels")
+            yield ValidationIssue(("capture", "laser_targets"), message)
+        needs = "the points of a camera lie on any surface; need a grid on a rectangle relay wall."
+        if capture.laser_spot_radius > 0:
+            message = f"got {shown(capture.laser_spot_radius)}, and {needs.replace('need', 'need 0, or')}"
+            yield ValidationIssue(("capture", "laser_spot_radius"), message)
+        if self.render.polarized:
+            yield ValidationIssue(("render", "polarized"), f"got true, and {needs}")
+
     # --- captures of a relay wall ---
 
     def rule_relay_wall(self) -> Iterator[ValidationIssue]:
         """There is one."""
-        if self.scene.relay_wall is None and not self.capture.is_line_of_sight:
+        if self.scene.relay_wall is None and not self.capture.is_line_of_sight and not self.has_pixel_points:
             message = "missing, it is required: the visible surface, told by its type; "
-            message += "only scan_type: line_of_sight does without."
+            message += "only captures with a capture.camera, such as scan_type: line_of_sight, do without."
             yield ValidationIssue(("scene", "relay_wall"), message)
 
-    def rule_mitsuba_scene(self) -> Iterator[ValidationIssue]:
-        """A whole Mitsuba scene is seen by a camera."""
-        if self.scene.mitsuba is not None and not self.capture.is_line_of_sight:
-            message = "a whole Mitsuba scene is for scan_type: line_of_sight; here its shapes go into hidden_geometry, "
-            message += "one by one, as {type: mitsuba, shape: {...}, bsdf: {...}} or {type: mesh, ...}."
-            yield ValidationIssue(("scene", "mitsuba"), message, "key")
+    def rule_laser_points(self) -> Iterator[ValidationIssue]:
+        """An exhaustive scan has a grid or a list."""
+        if self.capture.scan_type == "exhaustive" and not self.has_pixel_points:
+            for issue in self.capture.one_of("laser", "an exhaustive scan needs it"):
+                yield ValidationIssue(("capture", *issue.path), issue.message, issue.at)
 
     def rule_polarized(self) -> Iterator[ValidationIssue]:
         """Polarised light is for paths from a point of a rectangle."""
@@ -182,7 +206,7 @@ class Config(Section):
     def rule_devices_before_the_wall(self) -> Iterator[ValidationIssue]:
         """Laser and sensor stand on the lit side of a flat wall."""
         wall = self.scene.relay_wall
-        if not isinstance(wall, RectangleWallConfig):
+        if not isinstance(wall, RectangleWallConfig) or self.has_pixel_points:
             return
         for key in ("laser_position", "sensor_position"):
             with suppress(WrongValueRead):
@@ -202,7 +226,8 @@ class Config(Section):
 
     def rule_laser_can_be_found(self) -> Iterator[ValidationIssue]:
         """Paths find a point by sampling it alone."""
-        if not self.render.laser_sampling and self.capture.laser_spot_radius == 0 and self.scene.relay_wall:
+        is_point = self.capture.laser_spot_radius == 0 and not self.capture.is_line_of_sight
+        if not self.render.laser_sampling and is_point and (self.scene.relay_wall or self.has_pixel_points):
             message = "got false with a laser that is a point, which no path finds by chance; "
             message += "need capture.laser_spot_radius > 0, such as 0.01."
             yield ValidationIssue(("render", "laser_sampling"), message)
@@ -237,6 +262,12 @@ class Config(Section):
             yield ValidationIssue(path, f"{message}Use fewer {counted.split()[-1]} or bins.")
 
     @property
+    def has_pixel_points(self) -> bool:
+        """Whether a camera sees laser and sensor points: its pixels' first surfaces, instead of a grid on the wall."""
+        with_camera = self.capture.camera is not None or self.scene.mitsuba is not None
+        return with_camera and not self.capture.is_line_of_sight
+
+    @property
     def is_colored(self) -> bool:
         """Whether three channels are rendered: ``render.color``, or for ``auto`` what the scene needs."""
         if self.render.polarized:
@@ -253,7 +284,7 @@ def _film_of_scene(raw: dict[str, Any], validation: ValidationInfo) -> dict[str,
     """Make the film of a Mitsuba scene the sensor grid where no camera is given."""
     name, capture = _mapping(raw, "scene").get("mitsuba"), _mapping(raw, "capture")
     has_pixels = capture.get("camera") is not None or "sensor_grid" in capture
-    if not isinstance(name, str) or capture.get("scan_type") != "line_of_sight" or has_pixels:
+    if not isinstance(name, str) or has_pixels:
         return raw
     try:
         _, size = read_mitsuba_xml(config_folder(validation) / name)

@@ -30,6 +30,9 @@ LEFT_OUT = (  # of the canonical JSON, if empty
     ("output", "ground_truth_grid"),
     ("capture", "sensor_points"),
     ("capture", "laser_points"),
+    ("capture", "pixel_point"),
+    ("capture", "laser_target"),
+    ("capture", "laser_targets"),
 )
 MAX_ISSUES = 100  # told at once; nobody reads more
 SectionT = TypeVar("SectionT", bound=Section)

@@ -23,13 +23,14 @@ class SceneConfig(Section):
     """What is rendered; coordinates in metres, right-handed."""
 
     relay_wall: RelayWallConfig | None = None
-    """the visible surface, told by its type; every scan but line_of_sight needs it"""
+    """the visible surface, told by its type; captures without a camera need it"""
     hidden_geometry: Annotated[tuple[HiddenItemConfig, ...], LIST] = ()
     """a list of items, told apart by their types; empty: H is zero"""
     emitters: Annotated[tuple[EmitterConfig, ...], LIST] = ()
     """line_of_sight: what flashes at t = 0, a list of items told apart by their types"""
     mitsuba: MitsubaXml | None = None
-    """line_of_sight: a Mitsuba scene as .xml, in m; its shapes, emitters and camera join what is given here"""
+    """captures with a camera: a Mitsuba scene as .xml, in m; its shapes, camera and, for line_of_sight, emitters join
+    what is given here"""
 
     @classmethod
     def with_defaults(cls, raw: dict[str, Any], validation: ValidationInfo) -> dict[str, Any]:
@@ -92,10 +93,10 @@ class SceneConfig(Section):
         Raises
         ------
         ValueError
-            There is none: a line-of-sight capture.
+            There is none: a capture with a camera.
         """
         if self.relay_wall is None:
-            raise ValueError("scene.relay_wall: a line_of_sight capture has none")
+            raise ValueError("scene.relay_wall: a capture with a camera needs none")
         return self.relay_wall
 
 

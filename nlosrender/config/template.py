@@ -40,6 +40,13 @@ _CAMERA = """\
   camera:                        # line_of_sight, instead of everything about sensors and lasers below
     {position: [0, 0.5, -3], look_at: [0, 0, 0.8], up: [0, 1, 0], fov_deg: 40, width: 64, height: 48}  # pixels
 """
+_PIXELS = """\
+  # Other scans with a camera: what each of its pixels sees first is a sensor point, on any surface (docs/scans.md);
+  # instead of sensor_grid, sensor_position, laser_point, laser_grid. No relay_wall is needed.
+  # pixel_point: [0.5, 0.5]      # where in its pixel a point is seen, from the lower left corner; default the centre
+  # laser_target: [0, 0, 0]      # single: the beam from laser_position to it lights what it meets first
+  # laser_targets: [[0, 0, 0]]   # exhaustive: several; default null: the points of the pixels
+"""
 _SENSOR_GRID = """\
   sensor_grid:                   # the measured points: cell centres (i + 0.5) / n
     nx: 32                       # integer >= 1
@@ -103,6 +110,7 @@ scene:
 capture:
   scan_type: {scan_type}{pad}# single | confocal | exhaustive | line_of_sight
 {camera}\
+{pixels}\
 {grids}\
   account_first_and_last_bounces: true  # count the legs laser to wall and wall to sensor in time; default true
 
@@ -223,6 +231,7 @@ def starter_config(scan_type: ScanType = "confocal", name: str = "capture", file
         wall=_commented(_WALL) if is_view else _WALL,
         emitters=_EMITTERS if is_view else _commented(_EMITTERS),
         camera=_CAMERA if is_view else _commented(_CAMERA),
+        pixels=_PIXELS,
         grids=_commented(grids) if is_view else grids,
         bin_width=bin_width,
         bin_pad=" " * (16 - len(bin_width)),

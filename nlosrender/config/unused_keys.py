@@ -25,7 +25,9 @@ _NEEDED_BY: dict[str, tuple[str, ...]] = {
     "capture.laser_grid": ("exhaustive",),
     "capture.laser_points": ("exhaustive",),
     "capture.laser_point": ("single",),
-    "capture.camera": ("line_of_sight",),
+    "capture.laser_target": ("single",),
+    "capture.laser_targets": ("exhaustive",),
+    "capture.pixel_point": _OF_WALLS,
     "scene.emitters": ("line_of_sight",),
     "capture.laser_position": _OF_WALLS,
     "capture.sensor_position": _OF_WALLS,
@@ -34,6 +36,9 @@ _NEEDED_BY: dict[str, tuple[str, ...]] = {
     "render.laser_sampling": _OF_WALLS,
     "render.hidden_geometry_sampling": _OF_WALLS,
 }
+_OF_GRIDS = tuple(
+    f"capture.{key}" for key in ("sensor_points", "laser_grid", "laser_points", "laser_point", "sensor_position")
+)
 _SECTIONS: dict[str, type[Section]] = {"scene": SceneConfig, "capture": CaptureConfig, "render": RenderConfig}
 # an item or a wall without them would stand elsewhere than its author thinks: they stay mistakes
 _PLACING = ("center", "translate", "rotate_deg", "scale", "fit")
@@ -82,6 +87,18 @@ def _by_scan_type(kept: dict[str, Any]) -> Iterator[str]:
         unused.append("capture.sensor_grid")
     owners = {name for key in unused for name in _NEEDED_BY.get(key, _OF_WALLS)}
     yield from _note(unused, f"capture.scan_type: {scan}", [name for name in _SCANS if name in owners])
+    if scan in _OF_WALLS and _has_camera(kept):
+        idle = [key for key in _OF_GRIDS if _take(kept, key)]
+        if _is_no_film(capture.get("sensor_grid"), capture.get("camera")):
+            del capture["sensor_grid"]
+            idle.append("capture.sensor_grid")
+        yield from _note(idle, "a camera", ["grids on a relay wall"])
+
+
+def _has_camera(kept: Mapping[str, Any]) -> bool:
+    scene = kept.get("scene")
+    whole = scene.get("mitsuba") if isinstance(scene, Mapping) else None
+    return kept["capture"].get("camera") is not None or whole is not None
 
 
 def _take(kept: dict[str, Any], path: str) -> bool:

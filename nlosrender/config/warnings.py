@@ -24,6 +24,8 @@ def config_warnings(config: Config) -> tuple[str, ...]:
     """Return one sentence for each thing in a valid config that is pointless or surprising."""
     if config.capture.is_line_of_sight:
         return (*config.notes, *_dark_view(config), *_budget(config))
+    if config.has_pixel_points:
+        return (*config.notes, *_budget(config), *_file(config))
     return (
         *config.notes,
         *_dark_scene(config),

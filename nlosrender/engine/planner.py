@@ -14,7 +14,7 @@ from nlosrender.engine.line_of_sight.engine import LineOfSightEngine
 from nlosrender.engine.path.engine import PathEngine
 from nlosrender.engine.virtual_lights.elements.tessellator import can_tessellate, wall_sees_itself
 from nlosrender.engine.virtual_lights.engine import VirtualLightEngine
-from nlosrender.scene.build import BuiltScene
+from nlosrender.scene.build import BuiltScene, SceneWithoutWall
 from nlosrender.scene.view import BuiltView
 
 TOUCHING = 2e-3  # engine units: a surface this near to laser or sensor points takes patches of its own for each of them
@@ -83,6 +83,8 @@ def _obstacle_close_by(engine: VirtualLightEngine, capture: Capture) -> str | No
 
 def _obstacle(render: RenderConfig, capture: Capture, built: BuiltScene) -> str | None:
     """Return why the virtual lights cannot render a scene; None when they can."""
+    if isinstance(built, SceneWithoutWall):
+        return f"virtual lights need a rectangle relay wall: {built.reason}"
     if render.polarized:
         return "only paths carry polarised light"
     if render.spp is not None:

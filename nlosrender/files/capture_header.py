@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from nlosrender.capture.bounces import FILE_BOUNCES, LINE_OF_SIGHT, first_bounce_of
 from nlosrender.files.layout import CHUNK_SAMPLES, FRAMES, SCAN_TYPES, Float64, chunk_shape
@@ -47,6 +47,9 @@ class CaptureHeader:
     pose: Pose  # of the local frame in the scene
     frame: str = "znlos"  # of the positions in the file, one of ``layout.FRAMES``
     planar_wall: bool = True
+    empty_sensors: NDArray[np.bool_] | None = None  # (Ny, Nx) pixels that see nothing; None: there is no camera
+    empty_lasers: NDArray[np.bool_] | None = None  # (Ly, Lx)
+    n_unlit_lasers: int = 0  # that are hidden from the laser
     shared_samples: str = ""  # which samples have errors in common, in words: their variances may not be summed
     point_lists: tuple[str, ...] = ()  # which of "sensor" and "laser" points are a list, see ``layout.POINT_LISTS``
     chunk_samples: int = CHUNK_SAMPLES  # of a chunk of the file at most

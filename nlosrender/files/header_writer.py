@@ -6,6 +6,7 @@ from collections.abc import Mapping
 
 import h5py
 import numpy as np
+from numpy.typing import NDArray
 
 from nlosrender.capture.bounces import (
     FILE_BOUNCES,
@@ -24,6 +25,11 @@ _VIEW_TEXT = {
     "sensor_points": "centres of a camera's pixels on an image plane, which takes the relay wall's place in this file; "
     "rows ascend upwards in the picture, columns to the right; cameraPosition is the camera's",
     "laser_points": "none: emitters in the scene flash at t = 0; the laser's datasets mean nothing",
+}
+_PIXELS_TEXT = {
+    "sensor_points": "what each pixel of a camera sees first, on whatever surface; rows ascend upwards in the picture, "
+    "columns to the right; pixels that see nothing have zeros as position, normal and light",
+    "laser_points": "what the beam from laserPosition meets first; those that are hidden from the laser light nothing",
 }
 _VIEW_QUANTITY = (
     "of a pixel's steady radiance the share that arrives in the bin: the sum over bins, and what falls outside the "
@@ -114,11 +120,12 @@ def dataset_values(header: CaptureHeader) -> dict[str, object]:
     frame = layout.file_frame(header.frame, header.pose)
     sizes = layout.grid_sizes(header.sizes, header.confocal)
     center, rotation, edges = _hidden_volume(header)
+    sensors, lasers = header.empty_sensors, header.empty_lasers
     return {
-        "cameraGridPositions": layout.axes_first(frame.to_scene(header.sensor_positions)),
-        "cameraGridNormals": layout.axes_first(frame.direction_to_scene(header.sensor_normals)),
-        "laserGridPositions": layout.axes_first(frame.to_scene(header.laser_positions)),
-        "laserGridNormals": layout.axes_first(frame.direction_to_scene(header.laser_normals)),
+        "cameraGridPositions": _points(frame.to_scene(header.sensor_positions), sensors),
+        "cameraGridNormals": _points(frame.direction_to_scene(header.sensor_normals), sensors),
+        "laserGridPositions": _points(frame.to_scene(header.laser_positions), lasers),
+        "laserGridNormals": _points(frame.direction_to_scene(header.laser_normals), lasers),
         "cameraPosition": frame.to_scene(header.sensor_position),
         "laserPosition": frame.to_scene(header.laser_position),
         "cameraGridSize": header.sensor_grid_size,
@@ -133,6 +140,10 @@ def dataset_values(header: CaptureHeader) -> dict[str, object]:
         "hiddenVolumeSize": edges.max(),
         "isConfocal": int(header.confocal),
     }
+
+
+def _points(values: layout.Float64, is_empty: NDArray[np.bool_] | None) -> layout.Float64:
+    return layout.axes_first(values if is_empty is None else np.where(is_empty[..., None], 0.0, values))
 
 
 def root_attributes(header: CaptureHeader) -> dict[str, object]:
@@ -163,6 +174,11 @@ def root_attributes(header: CaptureHeader) -> dict[str, object]:
         }
     if header.point_lists:
         attributes[layout.POINT_LISTS] = " ".join(header.point_lists)
+    if header.empty_sensors is not None:
+        attributes |= _PIXELS_TEXT | {
+            layout.EMPTY_POINTS: int(header.empty_sensors.sum()),
+            layout.UNLIT_POINTS: header.n_unlit_lasers,
+        }
     if header.n_channels in layout.CHANNELS:
         attributes["channels"] = layout.CHANNELS[header.n_channels]
     if attributes.get("channels") == layout.STOKES:

@@ -94,6 +94,9 @@ STOKES = "stokes"
 # Attribute of captures whose points are lists, not grids: "sensor", "laser" or both. The points are one row then
 # (ny = 1), stand anywhere on the wall, and the grid's size is that of the box around them.
 POINT_LISTS = "point_lists"
+# Attributes of captures whose points a camera sees: how many of its pixels see nothing, and how many laser points are
+# hidden from the laser. Empty points have zeros as position and normal.
+EMPTY_POINTS, UNLIT_POINTS = "empty_sensor_points", "unlit_laser_points"
 CHANNELS = {3: "rgb", 4: STOKES}  # grey: files without the attribute
 DATA_UNIT = "J m^-2 sr^-1"  # radiance leaving a sensor point, integrated over the bin, for one pulse
 VIEW_UNIT = "W m^-2 sr^-1"  # line_of_sight: of a pixel's steady radiance the share that arrives in the bin

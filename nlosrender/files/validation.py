@@ -197,13 +197,17 @@ def _points(file: h5py.File, path: Path, sizes: Mapping[str, int], confocal: boo
     grids = {
         name: stored_points(file, path, name, sizes) for name in layout.SPECS if name.endswith(("itions", "ormals"))
     }
+    attributes = get_attributes(file)
+    has_camera = layout.EMPTY_POINTS in attributes
     for name in ("cameraGridNormals", "laserGridNormals"):
-        if np.abs(np.linalg.norm(grids[name], axis=-1) - 1).max() > NORMAL_TOLERANCE:
+        lengths = np.linalg.norm(grids[name], axis=-1)
+        if has_camera and name == "cameraGridNormals" and (lengths == 0).sum() != attributes[layout.EMPTY_POINTS]:
+            found.append(f"{name}: {(lengths == 0).sum()} are zero, {layout.EMPTY_POINTS} says otherwise")
+        if (np.abs(lengths - 1) > NORMAL_TOLERANCE)[(lengths > 0) | (not has_camera)].any():
             found.append(f"{name}: not unit normals")
     for name in ("Positions", "Normals"):
         if confocal and not np.array_equal(grids[f"cameraGrid{name}"], grids[f"laserGrid{name}"]):
             found.append(f"laserGrid{name}: differs from cameraGrid{name} although the capture is confocal")
-    attributes = get_attributes(file)
     lists = str(attributes.get(layout.POINT_LISTS, "")).split()
     for name, axis in (("sensor", "sensor_y"), ("laser", "laser_y")):
         if name in lists and sizes[axis] != 1:
@@ -212,12 +216,12 @@ def _points(file: h5py.File, path: Path, sizes: Mapping[str, int], confocal: boo
             )
     if attributes.get("frame") == "znlos" and attributes.get("planar_wall") == 1:
         for name in ("cameraGrid", "laserGrid"):
-            points = grids[f"{name}Positions"]
+            points, normals = grids[f"{name}Positions"], grids[f"{name}Normals"]
             if np.abs(points[..., 1]).max() > PLANE_TOLERANCE:
                 found.append(f"{name}Positions: a planar wall lies in Y = 0 in the Z-NLOS frame")
-            if not np.allclose(grids[f"{name}Normals"], (0, -1, 0), atol=NORMAL_TOLERANCE):
+            if not np.allclose(normals[normals.any(axis=-1)], (0, -1, 0), atol=NORMAL_TOLERANCE):
                 found.append(f"{name}Normals: a planar wall faces (0, -1, 0) in the Z-NLOS frame")
-            if name.removesuffix("Grid").replace("camera", "sensor") in lists:
+            if has_camera or name.removesuffix("Grid").replace("camera", "sensor") in lists:
                 continue
             if (np.diff(points[..., 2], axis=0) <= 0).any() or (np.diff(points[..., 0], axis=1) <= 0).any():
                 found.append(f"{name}Positions: rows must ascend in Z and columns in X")

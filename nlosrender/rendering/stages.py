@@ -84,7 +84,10 @@ def load_view(config: Config) -> BuiltView:
 def load_scene(config: Config) -> BuiltScene:
     """Stage 2: place wall and hidden geometry in the local frame and hand them to Mitsuba (backend started)."""
     from nlosrender.scene.build import build_scene
+    from nlosrender.scene.loading.pixel_scene import build_pixel_scene
 
+    if config.has_pixel_points:
+        return build_pixel_scene(config.scene, config.capture)
     wall, surfaces = place_scene(config)
     return build_scene(wall, config.scene.wall.bsdf, surfaces)
 
@@ -104,7 +107,7 @@ def place_scene(config: Config) -> tuple[RelayWall, tuple[Surface, ...]]:
 def describe_capture(config: Config, wall: RelayWall, built: BuiltScene | BuiltView) -> tuple[Capture, TimeAxis]:
     """Stage 3: laser and sensor points, legs and bins."""
     refuse_impossible_grids(config.capture, config.render.memory_limit_bytes or physical_memory())
-    capture = build_capture(config.capture, wall)
+    capture = build_capture(config.capture, wall, getattr(built, "pixels", None))
     latest = latest_arrival(capture, wall, built.hidden_bounds, config.render.max_bounces)
     time_axis = resolve_time_axis(config.time_axis, latest)
     refuse_wide_kernel(config.render.temporal_kernel_opl, time_axis)
@@ -190,6 +193,9 @@ def describe_file(
         pose=built.wall.pose,
         frame=config.output.frame,
         planar_wall=built.wall.is_planar,
+        empty_sensors=capture.sensor_grid.is_empty,
+        empty_lasers=capture.laser_grid.is_empty,
+        n_unlit_lasers=capture.n_unlit_lasers,
         shared_samples=shared,
         point_lists=capture.point_lists,
     )

@@ -24,6 +24,7 @@ from nlosrender.scene.loading.separation import load_separated
 from nlosrender.scene.meshes.mesh_report import MeshReport
 from nlosrender.scene.meshes.triangle_mesh import TriangleMesh
 from nlosrender.scene.picture_orientation import upright_bsdf
+from nlosrender.scene.pixel_points import PixelPoints
 from nlosrender.scene.pose import Float64
 from nlosrender.scene.read_surfaces import read_surfaces
 from nlosrender.scene.surfaces import ShapeDescription, Surface
@@ -55,6 +56,7 @@ class BuiltScene(EngineScene):
 
     wall_shape: mi.Shape
     poses: tuple[Float64, ...] = ()  # (4, 4) of each surface, from its own coordinates to the local frame [m]
+    pixels: PixelPoints | None = None  # laser and sensor points of a capture with a camera
 
     @property
     def all_flat(self) -> bool:
@@ -90,6 +92,78 @@ class BuiltScene(EngineScene):
     def wall_bsdf(self) -> mi.BSDF:
         """BSDF of the relay wall."""
         return self.wall_shape.bsdf()
+
+    # What engines ask of laser and sensor points, wherever these lie
+
+    @property
+    def sampled_shapes(self) -> tuple[mi.Shape, ...]:
+        """The shapes of hidden geometry sampling."""
+        return self.hidden_shapes
+
+    @property
+    def lit_shapes(self) -> tuple[mi.Shape, ...]:
+        """The shapes that laser points lie on."""
+        return (self.wall_shape,)
+
+    def is_wall(self, shapes: mi.ShapePtr) -> mi.Bool:
+        """Return whether shapes are the relay wall."""
+        return shapes == mi.ShapePtr(self.wall_shape)
+
+    def bsdf_at(self, point: mi.SurfaceInteraction3f) -> mi.BSDF:
+        """Return the BSDF at laser or sensor points."""
+        return self.wall_bsdf
+
+    def shape_at(self, point: mi.SurfaceInteraction3f) -> mi.ShapePtr:
+        """Return the shape that laser or sensor points lie on."""
+        return mi.ShapePtr(self.wall_shape)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class SceneWithoutWall(BuiltScene):
+    """The scene of a capture with a camera whose points lie on any of its surfaces; ``wall_shape`` is None.
+
+    All shapes are ``hidden_shapes``: each may reflect light to another one.
+    """
+
+    pixels: PixelPoints
+    reason: str  # why it has no relay wall
+
+    @cached_property
+    def _walls(self) -> set[int]:
+        """Numbers of the shapes that laser and sensor points lie on."""
+        hits = self.pixels.sensors, self.pixels.lasers
+        return {int(number) for hit in hits for number in np.unique(hit.shapes[hit.is_reached])}
+
+    @cached_property
+    def _is_wall(self) -> mi.Bool:
+        registry = np.array(dr.reinterpret_array(mi.UInt32, self.scene.shapes_dr()))
+        values = np.zeros(int(registry.max(initial=0)) + 1, bool)
+        values[registry[sorted(self._walls)]] = True
+        table = mi.Bool(values)
+        dr.eval(table)
+        return table
+
+    @cached_property
+    def sampled_shapes(self) -> tuple[mi.Shape, ...]:
+        return tuple(shape for number, shape in enumerate(self.scene.shapes()) if number not in self._walls)
+
+    @property
+    def lit_shapes(self) -> tuple[mi.Shape, ...]:
+        lasers, shapes = self.pixels.lasers, self.scene.shapes()
+        return tuple(shapes[number] for number in np.unique(lasers.shapes[lasers.is_reached]))
+
+    def is_wall(self, shapes: mi.ShapePtr) -> mi.Bool:
+        return dr.gather(mi.Bool, self._is_wall, dr.reinterpret_array(mi.UInt32, shapes), shapes != None)  # noqa: E711
+
+    def bsdf_at(self, point: mi.SurfaceInteraction3f) -> mi.BSDF:
+        return point.bsdf()
+
+    def shape_at(self, point: mi.SurfaceInteraction3f) -> mi.ShapePtr:
+        return point.shape
+
+    def set_up(self) -> None:
+        """Make the tables: not while a kernel is recorded."""
+        _ = self.curvatures, self._is_wall
 
 
 def build_scene(wall: RelayWall, wall_bsdf: Mapping[str, object], surfaces: Sequence[Surface]) -> BuiltScene:

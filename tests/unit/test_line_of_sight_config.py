@@ -88,13 +88,13 @@ def test_mistakes_of_an_emitter(emitter: dict[str, Any], key: str, message: str)
 
 
 def test_a_whole_scene_is_for_cameras(tmp_path: Path) -> None:
-    """Left out before a relay wall, the hidden scene would be missing: a mistake, with what to do."""
+    """Whatever the scan, it is seen by a camera, its own or the configuration's."""
     (tmp_path / "box.xml").write_text("<scene version='3.0.0'/>", encoding="utf-8")
-    config = flat_wall()
+    config = flat_wall(scan="confocal")
     config["scene"] |= {"mitsuba": "box.xml"}
     key, text = problem_of(config, tmp_path)
-    assert key == "scene.mitsuba"
-    assert "its shapes go into hidden_geometry" in text
+    assert key == "capture.camera"
+    assert "box.xml has no perspective sensor" in text
 
 
 def test_a_relay_wall_is_missing() -> None:

@@ -11,7 +11,7 @@ import numpy as np
 from nlosrender.capture.arrivals import sampled_indices
 from nlosrender.engine.launch.device_arrays import rays_on_device
 from nlosrender.engine.launch.ray_offsets import WALL_OFFSET, ray_offset
-from nlosrender.scene.build import BuiltScene, wall_box
+from nlosrender.scene.build import BuiltScene, SceneWithoutWall, wall_box
 from nlosrender.scene.loading.round_surfaces import curvature
 
 if TYPE_CHECKING:
@@ -36,7 +36,8 @@ def wall_offset(built: BuiltScene) -> float:
     if built.wall.is_planar:
         return WALL_OFFSET
     farthest = float(np.abs(wall_box(built.wall)).max()) / built.metres_per_engine_unit
-    return ray_offset(built) * (1 + farthest) * max(1.0, curvature(built.wall_shape))
+    walls = built.scene.shapes() if isinstance(built, SceneWithoutWall) else [built.wall_shape]
+    return ray_offset(built) * (1 + farthest) * max(1.0, *map(curvature, walls))
 
 
 def nearest_above(built: BuiltScene, grid: PointGrid) -> tuple[float, Float64]:

@@ -11,7 +11,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from nlosrender.scene.build import BuiltScene
+from nlosrender.scene.build import BuiltScene, SceneWithoutWall
 from nlosrender.scene.pose import Float64
 
 MIN_COSINE = 1e-2  # between a ray and a surface's normal
@@ -68,12 +68,20 @@ def off_the_surface(built: BuiltScene, positions: Float64, normals: Float64, sha
     return positions + normals * scale[:, None]
 
 
-def off_the_wall(built: BuiltScene, wall_point: mi.SurfaceInteraction3f) -> mi.Point3f:
-    """Return the origin of a ray that leaves a laser or sensor point on the lit side."""
+def off_the_wall(
+    built: BuiltScene, wall_point: mi.SurfaceInteraction3f, direction: mi.Vector3f | None = None
+) -> mi.Point3f:
+    """Return the origin of a ray that leaves a laser or sensor point on the lit side.
+
+    Points of a ``SceneWithoutWall`` have the side in ``direction``, without one that of the laser or sensor.
+    """
     if built.wall.is_planar:
         offset = mi.Float(WALL_OFFSET)
     else:
-        offset = ray_offset_at(built, wall_point.p, mi.ShapePtr(built.wall_shape))
+        offset = ray_offset_at(built, wall_point.p, built.shape_at(wall_point))
+    if isinstance(built, SceneWithoutWall):
+        towards = wall_point.to_world(wall_point.wi) if direction is None else direction
+        offset = dr.mulsign(offset, dr.dot(wall_point.n, towards))
     return wall_point.p + wall_point.n * offset
 
 
@@ -102,6 +110,6 @@ def connection_segment(
     Both ends are moved along the normals, see the module.
     """
     # aimed at the offset end: a parallel ray would pass beside the point, behind the wall at oblique incidence
-    start, end = off_the_wall(built, wall_point), offset_origin(built, si, direction)
+    start, end = off_the_wall(built, wall_point, -direction), offset_origin(built, si, direction)
     distance = dr.norm(end - start)
     return mi.Ray3f(start, (end - start) / distance, distance, mi.Float(0), [])

@@ -7,7 +7,8 @@ import mitsuba as mi
 
 from nlosrender.engine.launch.histogram import DeviceHistogram
 from nlosrender.engine.launch.launch_params import LaunchParams
-from nlosrender.engine.launch.ray_offsets import connection_segment
+from nlosrender.engine.launch.ray_offsets import connection_segment, ray_offset_at
+from nlosrender.scene.build import BuiltScene, SceneWithoutWall
 
 COINCIDENT = 1e-6  # engine units; a confocal pair has no path between its points
 
@@ -28,9 +29,11 @@ def deposit_second_bounce(params: LaunchParams, histogram: DeviceHistogram) -> N
         to_laser = lit.p - sensor.p
         distance = dr.norm(to_laser)
         apart = distance > COINCIDENT
+        if dr.hint(isinstance(built, SceneWithoutWall), mode="scalar"):
+            apart &= ~_on_one_plane(built, sensor, lit, to_laser)
         direction = to_laser / dr.maximum(distance, COINCIDENT)
-        received = built.wall_bsdf.eval(context, sensor, sensor.to_local(direction), apart)
-        emitted = built.wall_bsdf.eval(context, lit, lit.to_local(-direction), apart)
+        received = built.bsdf_at(sensor).eval(context, sensor, sensor.to_local(direction), apart)
+        emitted = built.bsdf_at(lit).eval(context, lit, lit.to_local(-direction), apart)
         value = received * emitted / dr.square(dr.maximum(distance, COINCIDENT))
         active = apart & dr.any(value > 0)
         active &= ~built.scene.ray_test(
@@ -38,3 +41,14 @@ def deposit_second_bounce(params: LaunchParams, histogram: DeviceHistogram) -> N
         )
         histogram.deposit(lane, laser, mi.UInt32(0), params.delay_bin(points, distance), value, active)
         laser += 1
+
+
+def _on_one_plane(
+    built: BuiltScene, sensor: mi.SurfaceInteraction3f, lit: mi.SurfaceInteraction3f, to_laser: mi.Vector3f
+) -> mi.Bool:
+    """Return whether points lie in each other's tangent plane, as far as float32 knows: no light goes between them.
+
+    On a tilted plane their cosines are not 0 exactly, and the light of a point very close has no bound.
+    """
+    height = dr.maximum(dr.abs(dr.dot(sensor.n, to_laser)), dr.abs(dr.dot(lit.n, to_laser)))
+    return height < ray_offset_at(built, sensor.p, sensor.shape)

@@ -18,7 +18,7 @@ from nlosrender.engine.launch.device_arrays import on_device
 from nlosrender.engine.launch.facing_triangles import facing_triangles, is_one_sided
 from nlosrender.engine.launch.morton import morton_order
 from nlosrender.scene.build import BuiltScene
-from nlosrender.scene.loading.mitsuba_shapes import WALL_ID
+from nlosrender.scene.loading.number_of_shape import pointer_index
 from nlosrender.scene.triangle_point import triangle_weights
 
 SAMPLEABLE_PLUGINS = ("Rectangle", "Disk", "Sphere", "Cylinder")
@@ -51,7 +51,7 @@ class SurfaceSampler:
 
     def __init__(self, built: BuiltScene):
         self._built = built
-        hidden = built.hidden_shapes
+        hidden = built.sampled_shapes
         self._analytic = [shape for shape in hidden if not shape.is_mesh() and shape.class_name() in SAMPLEABLE_PLUGINS]
         self.has_analytic = bool(self._analytic)
         self.covers_everything = all(shape.is_mesh() or shape.class_name() in SAMPLEABLE_PLUGINS for shape in hidden)
@@ -172,9 +172,9 @@ class SurfaceSampler:
             return same & (si.prim_index == primitive)
         return same & dr.select(primitive == ANALYTIC, near, si.prim_index == primitive)
 
-    def covers(self, si: mi.SurfaceInteraction3f, wall: mi.ShapePtr) -> mi.Bool:
+    def covers(self, si: mi.SurfaceInteraction3f, on_wall: mi.Bool) -> mi.Bool:
         """Return whether the density of ``sample`` at ``si`` is 1 / ``area`` (hidden, of a sampled kind)."""
-        hidden = si.is_valid() & (si.shape != wall)
+        hidden = si.is_valid() & ~on_wall
         if self.covers_everything:
             return hidden
         sampled = mi.Bool(False)
@@ -221,8 +221,9 @@ class _Table:
         corners = [np.zeros((0, 3, 3))]
         shape_indices, primitives, analytic_areas = [np.zeros(0, np.uint32)], [np.zeros(0, np.uint32)], [np.zeros(0)]
         analytic_indices: list[int] = []
+        sampled = set(map(pointer_index, built.sampled_shapes))
         for index, shape in enumerate(built.scene.shapes()):
-            if shape.id() == WALL_ID:
+            if pointer_index(shape) not in sampled:
                 continue
             if shape.is_mesh():
                 triangles, numbers = facing_triangles(built, shape)

@@ -12,11 +12,12 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from nlosrender.capture.grids import Capture
+from nlosrender.capture.grids import Capture, PointGrid
 from nlosrender.capture.time_axis import TimeAxis
 from nlosrender.engine.launch.device_arrays import columns, on_device
-from nlosrender.scene.build import BuiltScene
+from nlosrender.scene.build import BuiltScene, SceneWithoutWall
 from nlosrender.scene.loading.mitsuba_shapes import WALL_ID
+from nlosrender.scene.pixel_points import FirstHits
 from nlosrender.scene.pose import Float64
 from nlosrender.scene.walls.mesh_wall import MIN_SAME_COSINE, too_fine
 
@@ -47,27 +48,33 @@ class WallPoints:
 
 def sensor_points(built: BuiltScene, capture: Capture, time_axis: TimeAxis, index: NDArray[np.integer]) -> WallPoints:
     """Return the sensor points with flat indices ``index``, legs and the window's start as their delay."""
-    grid = capture.sensor_grid
     delay = (capture.sensor_legs.reshape(-1)[index] - time_axis.start_opl) / time_axis.bin_width_opl
-    positions, normals = grid.positions.reshape(-1, 3)[index], grid.normals.reshape(-1, 3)[index]
-    return _wall_points(built, positions, normals, capture.sensor_position, delay)
+    grid, hits = capture.sensor_grid, None if built.pixels is None else built.pixels.sensors
+    return _wall_points(built, grid, hits, index, capture.sensor_position, delay)
 
 
 def laser_points(built: BuiltScene, capture: Capture, time_axis: TimeAxis, index: NDArray[np.integer]) -> WallPoints:
     """Return the laser points with flat indices ``index``, their legs as delay."""
-    grid = capture.laser_grid
     delay = capture.laser_legs.reshape(-1)[index] / time_axis.bin_width_opl
-    positions, normals = grid.positions.reshape(-1, 3)[index], grid.normals.reshape(-1, 3)[index]
-    return _wall_points(built, positions, normals, capture.laser_position, delay)
+    grid, hits = capture.laser_grid, None if built.pixels is None else built.pixels.lasers
+    return _wall_points(built, grid, hits, index, capture.laser_position, delay)
 
 
 def _wall_points(
-    built: BuiltScene, positions: Float64, normals: Float64, device: Float64, delay: Float64
+    built: BuiltScene,
+    grid: PointGrid,
+    hits: FirstHits | None,
+    index: NDArray[np.integer],
+    device: Float64,
+    delay: Float64,
 ) -> WallPoints:
+    positions, normals = grid.positions.reshape(-1, 3)[index], grid.normals.reshape(-1, 3)[index]
     point = mi.Point3f(*columns(positions / built.metres_per_engine_unit))
     normal = mi.Vector3f(*columns(normals))
     # The wall's own intersection gives shading frame and texture coordinates for every wall type and BSDF.
-    if built.wall_shape.class_name() == "Mesh":
+    if isinstance(built, SceneWithoutWall) and hits is not None:
+        interaction = dr.gather(mi.SurfaceInteraction3f, hits.interactions, on_device(mi.UInt32, index))
+    elif built.wall_shape.class_name() == "Mesh":
         interaction = _on_mesh(built, point, normal)
     else:
         interaction = built.wall_shape.ray_intersect(mi.Ray3f(point + 1e-2 * normal, -normal))
@@ -75,6 +82,9 @@ def _wall_points(
     to_device = device - positions
     to_device /= np.maximum(np.linalg.norm(to_device, axis=-1, keepdims=True), 1e-300)
     interaction.wi = interaction.to_local(mi.Vector3f(*columns(to_device)))
+    if hits is not None and not hits.is_reached.all():  # seen from behind, where the wall is black
+        is_dark = on_device(mi.UInt32, ~hits.is_reached.ravel()[index]) > 0
+        interaction.wi.z = dr.select(is_dark, -dr.abs(interaction.wi.z), interaction.wi.z)
     whole = np.floor(delay)
     points = WallPoints(
         interaction,

@@ -102,7 +102,6 @@ def trace_paths(
     Throughput is in units of radiance per (engine unit)^-2; the caller scales by energy and unit.
     """
     built, sampler, sensor = params.built, params.sampler, params.sensors.interaction
-    wall = mi.ShapePtr(built.wall_shape)
     q = settings.p_hidden_sampling
     steps = recurrence_steps(2) if 0 < q < 1 else (*recurrence_steps(1), 1)
     stride = systematic.stride
@@ -159,7 +158,7 @@ def trace_paths(
         bounce = dr.select(start, mi.UInt32(FIRST_BOUNCE), bounce)
         is_past_gate &= ~start
         is_specular &= ~start
-        on_wall = vertex.shape == wall
+        on_wall = built.is_wall(vertex.shape)
 
         # ---- Sample the next direction ------------------------------------------------------------------------------
         if dr.hint(settings.goes_on, mode="scalar"):

@@ -119,7 +119,7 @@ def _connect(
     reflected = si.to_world_mueller(reflected, -wo, si.wi)
     # light comes from the laser at wi and leaves along wo, which matters to polarised light alone
     from_laser = mi.BSDFContext(mi.TransportMode.Importance) if mi.is_polarized else context
-    emitted = built.wall_bsdf.eval(from_laser, lit, towards, active)  # includes the laser point's cosine
+    emitted = built.bsdf_at(lit).eval(from_laser, lit, towards, active)  # includes the laser point's cosine
     emitted = lit.to_world_mueller(emitted, -lit.wi, towards)
     value = vertex.throughput * reflected * emitted / distance2
     if settings.finds_spot:

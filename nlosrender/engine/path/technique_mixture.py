@@ -15,6 +15,7 @@ from nlosrender.engine.launch.hidden_aabb import HiddenAabb
 from nlosrender.engine.launch.ray_offsets import offset_origin
 from nlosrender.engine.launch.wall_points import sensor_points
 from nlosrender.engine.path.tuning import PathTuning
+from nlosrender.scene.build import SceneWithoutWall
 
 
 def choose_p_hidden_sampling(device: DeviceCapture, tuning: PathTuning) -> float:
@@ -25,11 +26,16 @@ def choose_p_hidden_sampling(device: DeviceCapture, tuning: PathTuning) -> float
     distance = built.hidden_bounds[0][2] / built.metres_per_engine_unit
     # All light comes from sampled surfaces, and no delta lobe of the wall needs BSDF sampling.
     only_hidden = built.wall.is_planar and sampler.covers_everything
-    only_hidden &= not built.wall_bsdf.flags() & mi.BSDFFlags.Delta
+    only_hidden = only_hidden and not built.wall_bsdf.flags() & mi.BSDFFlags.Delta
     if only_hidden and distance > 0 and sampler.area < tuning.max_area_ratio * math.pi * distance**2:
         return 1.0
     # cosine-weighted share of directions from the sensor points that meet hidden geometry
-    is_met = built.scene.ray_test(_rays_from_sensors(device))
+    rays = _rays_from_sensors(device)
+    if isinstance(built, SceneWithoutWall):
+        hit = built.scene.ray_intersect_preliminary(rays)
+        is_met = hit.is_valid() & ~built.is_wall(hit.shape)
+    else:
+        is_met = built.scene.ray_test(rays)
     return 0.0 if _share(is_met) > tuning.surrounded_share else 0.5
 
 

@@ -97,7 +97,7 @@ def _connect_sample(
         leg = sample.p - sensor.p
         distance = dr.norm(leg)
         direction = leg / distance
-        received = built.wall_bsdf.eval(mi.BSDFContext(), sensor, sensor.to_local(direction), active)
+        received = built.bsdf_at(sensor).eval(mi.BSDFContext(), sensor, sensor.to_local(direction), active)
         si = sampler.surface(sample, direction, active, settings.is_plain_diffuse)
         throughput = received * (dr.abs(dr.dot(si.n, direction)) * sampler.area / dr.square(distance))
         seen = active & dr.any(throughput > 0)

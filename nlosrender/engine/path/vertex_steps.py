@@ -42,7 +42,7 @@ class Departure:
     @classmethod
     def none(cls, built: BuiltScene) -> Departure:
         """Return the state before the first path."""
-        ray, origin, shape = dr.zeros(mi.Ray3f), mi.Point3f(0), mi.ShapePtr(built.wall_shape)
+        ray, origin, shape = dr.zeros(mi.Ray3f), mi.Point3f(0), dr.zeros(mi.ShapePtr)
         zero, no = mi.Float(0), mi.Bool(False)
         return cls(ray, origin, mi.Spectrum(0), zero, zero, no, no, no, mi.Point3f(0), shape, mi.UInt32(0))
 
@@ -91,7 +91,6 @@ def intersect(settings: PathSettings, built: BuiltScene, ray: mi.Ray3f, active: 
 def arrive(settings: PathSettings, params: PathParams, way: Departure, active: mi.Bool) -> Arrival:
     """Trace a ray to the next vertex and return it with the density of the direction."""
     built, sampler, q = params.built, params.sampler, settings.p_hidden_sampling
-    wall = mi.ShapePtr(built.wall_shape)
     si = intersect(settings, built, way.ray, active)
     is_reached = active & si.is_valid()
     leg = dr.select(way.has_target, si.p - way.origin, leg_to_tangent_plane(built, si, way.origin, way.ray.d))
@@ -101,14 +100,14 @@ def arrive(settings: PathSettings, params: PathParams, way: Departure, active: m
     if q > 0:
         # occluded: the ray met something in front of the sampled point
         is_reached &= ~way.has_target | sampler.reached(si, way.target, way.target_shape, way.target_primitive)
-    on_wall = si.shape == wall
+    on_wall = built.is_wall(si.shape)
     if built.wall.is_planar:
         si.p.z = dr.select(on_wall, 0, si.p.z)  # exactly: rays that leave the wall there need no offset
     density = mi.Float(way.bsdf_density)
     if q > 0:
         # by the leg, not the ray: the ray's offset origin matters for hidden geometry close to the wall
         cosine = dr.abs(dr.dot(si.n, leg)) / distance
-        jacobian = dr.select(sampler.covers(si, wall), distance2 / dr.maximum(cosine, 1e-9), 0)
+        jacobian = dr.select(sampler.covers(si, on_wall), distance2 / dr.maximum(cosine, 1e-9), 0)
         density += way.hidden_density * jacobian
     return Arrival(si, is_reached, on_wall, leg, distance, distance2, density)
 
@@ -168,7 +167,7 @@ def leave(
         way.target, way.target_shape, way.target_primitive = sample.p, sample.shape, sample.primitive
         to_target = sample.p - vertex.p
         local = vertex.to_local(to_target * dr.rsqrt(dr.squared_norm(to_target)))
-        f, pdf = built.wall_bsdf.eval_pdf(context, vertex, local, has_target)
+        f, pdf = built.bsdf_at(vertex).eval_pdf(context, vertex, local, has_target)
         f = vertex.to_world_mueller(f, -local, vertex.wi)
         wo = dr.select(has_target, local, wo)
         way.value = dr.select(has_target, f, way.value)

@@ -19,7 +19,7 @@ from nlosrender.engine.launch.facing_triangles import facing_triangles
 from nlosrender.engine.launch.near_surfaces import points_above_wall
 from nlosrender.engine.launch.surface_sampler import SAMPLEABLE_PLUGINS
 from nlosrender.engine.preflight.near_wall_warnings import near_wall_warnings
-from nlosrender.scene.build import BuiltScene, wall_box
+from nlosrender.scene.build import BuiltScene, SceneWithoutWall, wall_box
 from nlosrender.scene.pose import Float64
 from nlosrender.scene.surfaces import Surface
 from nlosrender.scene.triangle_point import triangle_weights
@@ -54,9 +54,11 @@ def scene_warnings(engine: Engine) -> tuple[str, ...]:
     if isinstance(built, BuiltView):
         own = _view_warnings(built)
         return (*built.warnings, *own, *window, *_bin_warnings(built, time_axis), *engine.warnings())
+    has_wall = not isinstance(built, SceneWithoutWall)
     return (
         *built.warnings,
-        *dark_surface_warnings(built, capture, max_bounces),
+        *_pixel_warnings(built),
+        *(dark_surface_warnings(built, capture, max_bounces) if has_wall else ()),
         *window,
         *near_wall_warnings(built, capture),
         *_bin_warnings(built, time_axis),
@@ -67,6 +69,18 @@ def scene_warnings(engine: Engine) -> tuple[str, ...]:
 def _view_warnings(built: BuiltView) -> Iterator[str]:
     if not built.scene.emitters():
         yield "nothing in the scene shines: the picture is black. Add scene.emitters."
+
+
+def _pixel_warnings(built: BuiltScene) -> Iterator[str]:
+    """Yield how many pixels of a camera see nothing, and how many of their points the laser does not light."""
+    if built.pixels is None:
+        return
+    is_empty, is_lit = built.pixels.sensors.is_empty, built.pixels.lasers.is_reached
+    if is_empty.any():
+        yield f"{int(is_empty.sum())} of {is_empty.size} pixels see no surface: they stay empty, H is zero there."
+    unlit = int((~is_lit & ~built.pixels.lasers.is_empty).sum())
+    if unlit:
+        yield f"{unlit} of {is_lit.size} laser points are hidden from the laser: H is zero there. Move laser_position."
 
 
 def dark_surface_warnings(built: BuiltScene, capture: Capture, max_bounces: int | None) -> Iterator[str]:

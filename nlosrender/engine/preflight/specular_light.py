@@ -23,7 +23,7 @@ from nlosrender.engine.launch.mirror_connections import Mirrors, mirrors_of
 from nlosrender.engine.launch.ray_offsets import offset_origin
 from nlosrender.engine.launch.surface_sampler import SAMPLEABLE_PLUGINS
 from nlosrender.engine.launch.wall_points import laser_points
-from nlosrender.scene.build import BuiltScene
+from nlosrender.scene.build import BuiltScene, SceneWithoutWall
 from nlosrender.scene.loading.number_of_shape import pointer_index
 from nlosrender.scene.pose import Float64
 from nlosrender.scene.view import BuiltView
@@ -74,7 +74,7 @@ def light_after_laser(
     lit = laser_points(built, capture, time_axis, lasers).interaction
     aim = mi.Point3f(*columns(np.tile(targets, (len(index), 1))))
     direction = dr.normalize(aim - lit.p)
-    emitted = built.wall_bsdf.eval(mi.BSDFContext(), lit, lit.to_local(direction))
+    emitted = built.bsdf_at(lit).eval(mi.BSDFContext(), lit, lit.to_local(direction))
     sent = dr.any(mi.unpolarized_spectrum(emitted) > 0)
     rays = _Rays(_ray(built, lit, direction, sent), False)
     return list(_followed(built, capture, time_axis, rays, max_bounces, 1, mirrors_of(built)))
@@ -84,12 +84,12 @@ def light_mirrored_by_wall(
     built: BuiltScene, capture: Capture, time_axis: TimeAxis, max_bounces: int | None
 ) -> list[SpecularLight]:
     """Return the laser's beam as mirrored by delta lobes of the wall, where it meets anything; parameters as above."""
-    if not bool(built.wall_bsdf.flags() & mi.BSDFFlags.Delta):
+    if not any(bool(shape.bsdf().flags() & mi.BSDFFlags.Delta) for shape in built.lit_shapes):
         return []
     index = sampled_indices(capture.laser_grid)
     lasers = np.repeat(index, MIN_RAYS).astype(np.uint32)
     lit = laser_points(built, capture, time_axis, lasers).interaction
-    bs, weight = built.wall_bsdf.sample(mi.BSDFContext(), lit, *_numbers(len(lasers), 0))
+    bs, weight = built.bsdf_at(lit).sample(mi.BSDFContext(), lit, *_numbers(len(lasers), 0))
     mirrored = _is_delta(bs) & _carries(weight)
     rays = _Rays(_ray(built, lit, lit.to_world(bs.wo), mirrored), True)
     found = _followed(built, capture, time_axis, rays, max_bounces, 1)
@@ -192,7 +192,7 @@ def _measured(
     )
     place = np.array(si.p, dtype=np.float64).T
     near = ((place >= points.min(axis=0) - margin) & (place <= points.max(axis=0) + margin)).all(axis=-1)
-    on_wall = np.array(si.shape == mi.ShapePtr(built.wall_shape), dtype=bool)
+    on_wall = np.array(built.is_wall(si.shape), dtype=bool)
     chosen = points[np.random.default_rng(seed).integers(len(points), size=len(place))]
     direction = mi.Point3f(*columns(chosen)) - si.p
     distance = dr.norm(direction)
@@ -205,13 +205,14 @@ def _measured(
 
 
 def _with_wall(built: BuiltScene) -> tuple[mi.Shape, ...]:
-    return (*built.hidden_shapes, *(() if built.wall.is_planar else (built.wall_shape,)))
+    has_wall = not (built.wall.is_planar or isinstance(built, SceneWithoutWall))
+    return (*built.hidden_shapes, *((built.wall_shape,) if has_wall else ()))
 
 
 def _names(built: BuiltScene | BuiltView) -> dict[int, str]:
     """Return the items by the numbers that shape pointers have on the device."""
     names: dict[int, str] = {}
-    if isinstance(built, BuiltScene):
+    if isinstance(built, BuiltScene) and not isinstance(built, SceneWithoutWall):
         names[pointer_index(built.wall_shape)] = WALL_NAME
     keyed = len(built.surfaces) == len(built.hidden_shapes)  # a Mitsuba scene has shapes of its own
     for place, shape in enumerate(built.hidden_shapes):

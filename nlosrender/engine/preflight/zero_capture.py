@@ -15,7 +15,7 @@ from nlosrender.engine.launch.ray_offsets import offset_origin
 from nlosrender.engine.launch.wall_points import laser_points, sensor_points
 from nlosrender.engine.preflight.scene_warnings import dark_surface_warnings
 from nlosrender.engine.preflight.unsampled_paths import UnsampledPaths
-from nlosrender.scene.build import BuiltScene
+from nlosrender.scene.build import BuiltScene, SceneWithoutWall
 from nlosrender.scene.view import BuiltView
 
 DIRECTIONS = 256  # tried at each of a sample of laser or sensor points: about 1 % of the hemisphere may be missed
@@ -62,7 +62,8 @@ def _dark(engine: Engine) -> Iterator[str]:
         yield "there is no hidden geometry"
     if built.wall.is_planar and highest is not None and highest < THIRD_BOUNCE:
         yield "render.max_bounces is 2, and no light goes straight from a point of a flat wall to another"
-    yield from (text.rstrip(".") for text in dark_surface_warnings(built, engine.capture, highest))
+    if not isinstance(built, SceneWithoutWall):
+        yield from (text.rstrip(".") for text in dark_surface_warnings(built, engine.capture, highest))
     yield from _black_surfaces(engine, built)
 
 
@@ -78,10 +79,10 @@ def _black_surfaces(engine: Engine, built: BuiltScene) -> Iterator[str]:
         start = points(built, capture, time_axis, index).interaction
         draw = np.random.default_rng(0).random((6, len(index))).astype(np.float32)
         direction = start.to_world(mi.warp.square_to_cosine_hemisphere(mi.Point2f(draw[0], draw[1])))
-        if not dr.any(_is_bright(built.wall_bsdf.eval(context, start, start.to_local(direction)))):
+        if not dr.any(_is_bright(built.bsdf_at(start).eval(context, start, start.to_local(direction)))):
             yield f"the relay wall reflects nothing at the {name} points"
         si = built.scene.ray_intersect(mi.Ray3f(offset_origin(built, start, direction), direction))
-        on_hidden = si.is_valid() & (si.shape != mi.ShapePtr(built.wall_shape))
+        on_hidden = si.is_valid() & ~built.is_wall(si.shape)
         _, weight = si.bsdf().sample(context, si, mi.Float(draw[2]), mi.Point2f(draw[3], draw[4]), on_hidden)
         if dr.any(on_hidden) and not dr.any(on_hidden & _is_bright(weight)):
             yield f"all hidden surfaces that {name} points see are black there"

@@ -100,6 +100,11 @@ class StoredHeader:
         return f"{columns} listed" if self.is_list(name) else f"{columns} x {rows}"
 
     @property
+    def has_pixels(self) -> bool:
+        """Whether rows and columns are those of a camera's picture, not of a grid on a wall."""
+        return self.scan_type == LINE_OF_SIGHT or layout.EMPTY_POINTS in self.attributes
+
+    @property
     def is_measured(self) -> bool:
         """Whether the samples are a detector's counts."""
         return self.data_attributes.get("unit") == layout.COUNTS_UNIT

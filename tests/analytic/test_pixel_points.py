@@ -1,0 +1,229 @@
+"""Scans whose points a camera sees: any surface is measured where a pixel sees it, by its own normal and BSDF."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+import pytest
+from support.agreement import assert_agrees, relative_l2
+from support.quadrature import Frame, Setup, rectangle_cells, third_bounces
+from support.rendering import Rendering, configured, flat_wall, render
+
+from nlosrender.engine.backend.start import start_backend
+from nlosrender.errors import ConfigError
+from nlosrender.rendering import stages
+
+NONE: Mapping[str, Any] = MappingProxyType({})
+PLATE = {"type": "rectangle", "width": 0.6, "height": 0.5, "center": [0.1, 0.05, 0.8], "normal": [0.1, 0.2, -1]}
+BALL = {"type": "sphere", "center": [-0.5, -0.2, 0.6], "radius": 0.2}
+CAMERA = {"position": [0.0, 0.0, 0.25], "look_at": [0, 0, 0], "width": 5, "height": 3}
+CAMERA |= {"fov_deg": 2 * math.degrees(math.atan(1.0 / 0.25))}  # sees 2.0 x 1.2 m of the wall
+DEVICES = {"laser_position": [-0.4, 0.1, 0.2], "account_first_and_last_bounces": True}
+LASERS = {"single": {"laser_target": [0.3, -0.2, 0]}, "exhaustive": {"laser_targets": [[-0.375, 0, 0], [0.375, 0, 0]]}}
+TWO_SIDED = {"bsdf": {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": 1.0}}}  # no wall of virtual lights
+FIELDS = ("sensor_grid", "laser_grid", "laser_point")
+
+
+def seen(scan: str, *items: Any, wall: Any = NONE, camera: Any = NONE, capture: Any = NONE, **render: Any) -> Any:
+    """Return a configuration whose points a camera sees."""
+    config = flat_wall(*items, scan=scan, wall=wall, **render)
+    for key in FIELDS:
+        config["capture"].pop(key, None)
+    config["capture"] |= {**DEVICES, "camera": {**CAMERA, **camera}, **LASERS.get(scan, {}), **capture}
+    if not wall:
+        return config
+    if wall.get("type") == "none":
+        del config["scene"]["relay_wall"]
+    return config
+
+
+def gridded(scan: str, **render: Any) -> Any:
+    """Return the capture of the points that ``CAMERA`` sees, as a grid."""
+    config = flat_wall(PLATE, BALL, scan=scan, sensors=(5, 3), lasers=(2, 1), **render)
+    config["capture"] |= {**DEVICES, "sensor_position": CAMERA["position"]}
+    config["capture"]["sensor_grid"] |= {"width": 2.0, "height": 1.2}
+    return config
+
+
+@pytest.mark.parametrize("scan", ["single", "confocal", "exhaustive"])
+def test_a_camera_that_looks_straight_at_a_wall_gives_the_grid(scan: str) -> None:
+    """Pixels of a camera that looks straight at a rectangle are its grid: the same bits by paths."""
+    grid, pixels = render(gridded(scan, spp=16)), render(seen(scan, PLATE, BALL, spp=16))
+    assert grid.mean.any()
+    np.testing.assert_allclose(pixels.capture.sensor_grid.positions, grid.capture.sensor_grid.positions, atol=1e-15)
+    np.testing.assert_array_equal(pixels.mean, grid.mean)
+
+
+def test_virtual_lights_render_what_a_camera_sees_of_a_rectangle() -> None:
+    """H of both captures is the same within the error asked for, and no relay wall has to be named."""
+    asked = {"engine": "virtual_lights", "spp": None, "target_error": 0.01}
+    grid = render(gridded("single", **asked))
+    rectangle = {"type": "rectangle", "width": 2.0, "height": 1.6, "normal": [0, 0, 1], "center": [0, 0, 0]}
+    pixels = render(seen("single", PLATE, BALL, rectangle, wall={"type": "none"}, **asked))
+    assert pixels.samples == 0  # no paths
+    assert relative_l2(pixels.total - grid.total, grid.total) < 0.01
+
+
+@pytest.mark.parametrize("scan", ["single", "confocal", "exhaustive"])
+def test_a_surface_without_wall_is_rendered_as_a_wall_is(scan: str) -> None:
+    """The scene without relay wall is another code path of the same estimator: H agrees within the noise."""
+    asked = {"spp": 2048, "max_bounces": 4}
+    grid, pixels = render(gridded(scan, **asked)), render(seen(scan, PLATE, BALL, wall=TWO_SIDED, **asked))
+    for bounce in (3, 4):
+        assert_agrees(
+            pixels.bounce(bounce),
+            pixels.bounce_variance(bounce),
+            grid.bounce(bounce),
+            reference_variance=grid.bounce_variance(bounce),
+            replicas=pixels.plan.replicas,
+            share=0.2,
+        )
+    assert not pixels.bounce(2).any()  # the points lie on a plane
+
+
+def test_third_bounce_of_a_tilted_surface() -> None:
+    """The third bounce of a tilted surface in any place is the integral over the hidden plate (float64 quadrature)."""
+    frame, middle = Frame.of([0.6, 0.3, 1.0], [0.1, 1, 0]), np.array([3.0, -2.0, 1.0])
+
+    def placed(x: float, y: float, z: float) -> list[float]:
+        return (middle + x * frame.x + y * frame.y + z * frame.normal).tolist()
+
+    wall = {"center": middle.tolist(), "normal": frame.normal.tolist(), "up": frame.y.tolist(), **TWO_SIDED}
+    plate = {"type": "rectangle", "width": 0.6, "height": 0.5, "center": placed(0.1, 0, 0.9), "up": frame.y.tolist()}
+    plate |= {"normal": (-frame.normal).tolist()}
+    camera = {"position": placed(-0.6, 0.2, 0.3), "look_at": placed(0.1, -0.1, 0), "up": [0, 1, 0], "fov_deg": 25}
+    aim = {"laser_position": placed(0.5, 0, 0.4), "laser_target": placed(0.2, -0.3, 0)}
+    result = render(seen("single", plate, wall=wall, camera=camera, capture=aim, spp=2048))
+    grid, axis = result.capture.sensor_grid, result.time_axis
+    to_scene = _frame_of(seen("single", plate, wall=wall, camera=camera, capture=aim))
+    sensors = to_scene.to_scene(grid.positions)
+    np.testing.assert_allclose((sensors - middle) @ frame.normal, 0, atol=1e-6)  # float32 of coordinates near 4 m
+    laser = np.array([[placed(0.2, -0.3, 0)]])
+    np.testing.assert_allclose(to_scene.to_scene(result.capture.laser_grid.positions), laser, atol=1e-6)
+    edges = axis.start_opl + axis.bin_width_opl * np.arange(axis.n_bins + 1)
+    expected = np.zeros(result.bounce(3).shape)
+    cells = rectangle_cells(0.6, 0.5, plate["center"], plate["normal"], plate["up"], n=300)
+    for row, column in np.ndindex(3, 5):
+        legs = np.linalg.norm(aim["laser_position"] - laser), np.linalg.norm(sensors[row, column] - camera["position"])
+        setup = Setup(cells, edges, wall_normal=frame.normal, laser_leg=float(legs[0]), sensor_leg=float(legs[1]))
+        expected[:, :, row, column] = third_bounces(setup, laser, sensors[None, None, row, column])[:, :, 0, 0]
+    # floor: light of a cell of the quadrature, 2 mm, may fall into the next of 0.02 m bins
+    assert_agrees(result.bounce(3), result.bounce_variance(3), expected, replicas=result.plan.replicas, floor=0.01)
+
+
+def _frame_of(config: Any) -> Any:
+    validated = configured(config)
+    start_backend("llvm")
+    return stages.load_scene(validated).wall.pose
+
+
+CORNER = (  # a floor and a wall that meet at x = 1, and nothing else
+    {"type": "rectangle", "width": 2.0, "height": 2.0, "center": [0, 0, 0], "normal": [0, 0, 1]},
+    {"type": "rectangle", "width": 2.0, "height": 2.0, "center": [1, 0, 1], "normal": [-1, 0, 0], "up": [0, 0, 1]},
+)
+RHO = (0.8, 0.3)
+EYE = {"position": [-0.7, 0.2, 1.1], "look_at": [1, 0.3, 0.9], "up": [0, 0, 1], "width": 4, "height": 3, "fov_deg": 30}
+
+
+def corner(scan: str, capture: Any, *more: Any, camera: Any = EYE, **render_keys: Any) -> Rendering:
+    items = [{**item, "bsdf": {"type": "diffuse", "reflectance": rho}} for item, rho in zip(CORNER, RHO, strict=True)]
+    aim = {"laser_position": [-0.7, 0, 1.2], **capture}
+    asked = {"spp": 16, **render_keys}
+    return render(seen(scan, *items, *more, wall={"type": "none"}, camera=camera, capture=aim, **asked))
+
+
+def test_second_bounce_between_two_surfaces() -> None:
+    """From a spot on the floor to points of a wall: rho rho' cos cos' / (pi r)^2, exact, in the bin of its length."""
+    target = np.array([0.3, -0.2, 0.0])
+    result = corner("single", {"laser_target": target.tolist()})
+    sensors = _frame_of_corner(result)
+    way = sensors - target
+    r = np.linalg.norm(way, axis=-1)
+    cosines = np.maximum(way[..., 2], 0) / r * (np.maximum(way[..., 0], 0) / r)  # floor's normal +z, wall's -x
+    expected = RHO[0] * RHO[1] * cosines / (np.pi * r) ** 2
+    second = result.bounce(2)[0, 0]
+    np.testing.assert_allclose(second.sum(axis=-1), expected, rtol=2e-5)  # float32 positions: 1e-6 of 1 m legs, squared
+    opl = np.linalg.norm(target - [-0.7, 0, 1.2]) + r + np.linalg.norm(sensors - EYE["position"], axis=-1)
+    assert (second.argmax(axis=-1) == np.floor(opl / result.time_axis.bin_width_opl)).all()
+
+
+def _frame_of_corner(result: Rendering) -> Any:
+    """Return the sensor points in the scene: a scene without relay wall has its frame at the camera's target."""
+    return result.capture.sensor_grid.positions + np.array(EYE["look_at"])
+
+
+def test_points_of_pixels_and_their_normals() -> None:
+    """A point lies where the pixel's ray meets its surface; its normal is the surface's, on the side that is seen."""
+    result = corner("single", {"laser_target": [0.3, -0.2, 0.0]})
+    points, normals = _frame_of_corner(result), result.capture.sensor_grid.normals
+    np.testing.assert_allclose(points[..., 0], 1, atol=1e-6)
+    np.testing.assert_allclose(normals, np.broadcast_to([-1, 0, 0], normals.shape), atol=1e-6)
+    assert (np.diff(points[..., 2], axis=0) > 0).all()  # rows ascend in the picture
+    assert (np.diff(points[..., 1], axis=1) < 0).all()  # columns go right: looking along +x with +z up, that is -y
+    shifted = corner("single", {"laser_target": [0.3, -0.2, 0.0], "pixel_point": [0, 1]}).capture.sensor_grid.positions
+    finer = corner("single", {"laser_target": [0.3, -0.2, 0.0]}, camera={**EYE, "width": 8, "height": 6})
+    between = finer.capture.sensor_grid.positions  # of twice as many pixels, four meet in such a point
+    mean = (between[1:-1:2, 1:-1:2] + between[2::2, 2::2] + between[1:-1:2, 2::2] + between[2::2, 1:-1:2]) / 4
+    # curvature of a plane in perspective over a pixel of 0.1 m seen at 9 degrees: below 1 mm
+    np.testing.assert_allclose(shifted[:-1, 1:], mean, atol=1e-3)
+
+
+def test_pixels_that_see_nothing_are_empty() -> None:
+    """A pixel beside all surfaces has no light, and the others have theirs as if it were not there."""
+    wide = {**EYE, "fov_deg": 100}
+    result = corner("single", {"laser_target": [0.3, -0.2, 0.0]}, camera=wide)
+    is_empty = result.capture.sensor_grid.is_empty
+    assert is_empty is not None
+    assert 0 < is_empty.sum() < is_empty.size
+    assert not result.total[0, 0][is_empty].any()
+    points = _frame_of_corner(result)[~is_empty]
+    assert (np.isclose(points[:, 0], 1, atol=1e-6) | np.isclose(points[:, 2], 0, atol=1e-6)).all()
+
+
+def test_the_laser_lights_what_it_meets_first() -> None:
+    """A target behind a surface lights the surface; the spot is the same for each target along the beam."""
+    place, target = np.array([-0.7, 0, 1.2]), np.array([0.3, -0.2, 0.0])
+    spots = [
+        corner("single", {"laser_target": (place + share * (target - place)).tolist()}).capture.laser_grid.positions
+        for share in (0.5, 1.0, 3.0)
+    ]
+    for spot in spots:
+        np.testing.assert_allclose(spot[0, 0] + EYE["look_at"], target, atol=1e-6)
+
+
+@pytest.mark.parametrize(("scan", "key"), [("single", "laser_target"), ("exhaustive", "laser_targets.1")])
+def test_a_laser_that_hits_nothing_is_refused(scan: str, key: str) -> None:
+    """Its capture would be black: a mistake, with the beam."""
+    away = [-0.7, 0.0, 3.0]
+    aim = {"laser_target": away} if scan == "single" else {"laser_targets": [[0.3, 0, 0], away]}
+    with pytest.raises(ConfigError, match=rf"capture\.{key}: the beam from \[-0\.7, .*meets no surface"):
+        corner(scan, aim)
+
+
+def test_confocal_points_hidden_from_the_laser_stay_dark() -> None:
+    """A plate before the laser hides part of the wall: dark and counted there, elsewhere as without the plate."""
+    plate = {"type": "rectangle", "width": 0.02, "height": 0.02, "center": [-0.6, 0.01, 1.18], "normal": [1, 0, 0]}
+    black = {"bsdf": {"type": "diffuse", "reflectance": 0.0}}
+    near = {"laser_position": [-0.7, 0, 1.2]}
+    camera = {**EYE, "position": [-0.5, 0.2, 1.1]}
+    free = corner("confocal", near, camera=camera, max_bounces=4, spp=256)
+    shaded = corner("confocal", near, {**plate, **black, "up": [0, 0, 1]}, camera=camera, max_bounces=4, spp=256)
+    n_unlit = shaded.capture.n_unlit_lasers
+    assert free.capture.n_unlit_lasers == 0
+    assert 0 < n_unlit < 12
+    energy = shaded.total.sum(axis=-1)[0, 0]
+    assert (energy == 0).sum() == n_unlit
+    assert (free.total.sum(axis=-1) > 0).all()
+
+
+def test_an_exhaustive_scan_of_the_pixels_is_symmetrical() -> None:
+    """Without targets the laser points are the pixels': the second bounce is the same from l to s as from s to l."""
+    result = corner("exhaustive", {"laser_targets": None}, camera={**EYE, "fov_deg": 70, "look_at": [0.8, 0.3, 0.4]})
+    second = result.bounce(2).sum(axis=-1).reshape(12, 12)
+    assert np.count_nonzero(second) > 30  # pairs of a point on the floor and one on the wall
+    np.testing.assert_allclose(second, second.T, rtol=1e-5)
+    assert not np.diag(second).any()
