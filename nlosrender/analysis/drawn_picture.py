@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from nlosrender.analysis.theme import GROUND
 from nlosrender.errors import OptionError
 from nlosrender.files.atomic_write import replacing
 from nlosrender.files.file_kinds import PICTURES, FileKind
@@ -25,6 +24,7 @@ class Picture:
     """A matplotlib figure that is drawn; a notebook shows it where it is the value of a cell."""
 
     figure: Figure
+    dots_per_inch: float = DOTS_PER_INCH  # of pixels in it, whatever its format
 
     def save(self, path: str | Path, sources: Iterable[str | Path] = ()) -> Path:
         """Write it as .png, .pdf or .svg, by the suffix of ``path``, and return ``path``.
@@ -38,14 +38,17 @@ class Picture:
         OptionError
             Pictures have no such format.
         """
+        from matplotlib import rc_context
+
         path = Path(path)
-        with replacing(path, picture_kind(path), sources) as partial:
-            self.figure.savefig(partial, format=path.suffix[1:].lower(), dpi=DOTS_PER_INCH, facecolor=GROUND)
+        # TrueType: publishers refuse matplotlib's own Type 3 fonts
+        with replacing(path, picture_kind(path), sources) as partial, rc_context({"pdf.fonttype": 42}):
+            self.figure.savefig(partial, format=path.suffix[1:].lower(), dpi=self.dots_per_inch)
         return path
 
     def _repr_png_(self) -> bytes:
         content = io.BytesIO()
-        self.figure.savefig(content, format="png", dpi=NOTEBOOK_DOTS_PER_INCH, facecolor=GROUND)
+        self.figure.savefig(content, format="png", dpi=NOTEBOOK_DOTS_PER_INCH)
         return content.getvalue()
 
 

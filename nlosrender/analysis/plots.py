@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import re
 from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
@@ -11,35 +10,29 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 
 from nlosrender.analysis.drawn_picture import Picture, picture_kind
+from nlosrender.analysis.frames_plot import draw_frames, is_view, per_bin, unit_text, wall_extent
 from nlosrender.analysis.laser_view import (
     Float64,
     LaserView,
-    frame_bins,
     laser_view,
-    list_on_wall,
     lit_window,
     point_histograms,
     row_over_time,
-    wall_frames,
 )
 from nlosrender.analysis.measured_plot import MeasuredPair, draw_counts, draw_response, measured_pair, point_name
+from nlosrender.analysis.picture_style import PictureStyle
 from nlosrender.analysis.theme import (
     COLORMAP,
-    EDGE,
-    FAINT,
-    GROUND,
-    INK,
-    MARK,
-    PANEL,
     TICK_SIZE,
+    Theme,
+    add_legend,
     add_nanoseconds,
     color_bar,
+    drawable,
     line_colors,
     power_of_ten,
     style,
 )
-from nlosrender.capture.bounces import LINE_OF_SIGHT
-from nlosrender.config.encodable import encodable
 from nlosrender.constants import opl_to_seconds
 from nlosrender.errors import OptionError
 from nlosrender.files.atomic_write import check_writable
@@ -51,7 +44,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure, SubFigure
 
 DECADES = 5  # shown of a logarithmic axis
-DOT_AREA = 4000.0  # square points, of the dots of a list together
+MAX_TITLE = 120  # characters of a file name
 MAX_ROW_LINES = 1200  # of the row over time, whose panel is about 500 pixels high
 
 
@@ -61,6 +54,7 @@ def plot_capture(
     laser: tuple[int, int] | None = None,
     pixel: tuple[int, int] | None = None,
     ideal: Path | None = None,
+    look: PictureStyle | None = None,
 ) -> Path:
     """Draw one laser point's part of a capture; only that part is read, a few rows at a time.
 
@@ -73,6 +67,8 @@ def plot_capture(
         is shown, by default the brightest.
     ideal
         The capture that a file of counts was measured from: its histogram is drawn beside the counts.
+    look
+        Theme, size and resolution; None: dark, for a screen.
 
     Raises
     ------
@@ -83,7 +79,7 @@ def plot_capture(
     """
     picture = Path(picture)
     check_writable(picture, picture_kind(picture), [path])  # before the work, not after it
-    return capture_picture(path, laser, pixel, ideal).save(picture, [path])
+    return capture_picture(path, laser, pixel, ideal, look).save(picture, [path])
 
 
 def capture_picture(
@@ -91,13 +87,16 @@ def capture_picture(
     laser: tuple[int, int] | None = None,
     pixel: tuple[int, int] | None = None,
     ideal: Path | None = None,
+    look: PictureStyle | None = None,
 ) -> Picture:
     """Draw as ``plot_capture`` without writing a file; parameters and errors are its own."""
+    look = look or PictureStyle()
     with open_capture(path) as capture, ExitStack() as stack:
         sizes = capture.header.sizes
         check_point("--laser", laser, sizes["laser_y"], sizes["laser_x"])
         check_point("--pixel", pixel, sizes["sensor_y"], sizes["sensor_x"])
-        return Picture(_draw(capture, laser, pixel, measured_pair(capture, ideal, stack)))
+        figure = _draw(capture, laser, pixel, measured_pair(capture, ideal, stack), look)
+        return Picture(figure, look.dots_per_inch)
 
 
 def check_point(option: str, point: tuple[int, int] | None, rows: int, columns: int) -> None:
@@ -112,7 +111,8 @@ def _draw(
     capture: StoredCapture,
     laser: tuple[int, int] | None,
     pixel: tuple[int, int] | None,
-    measured: MeasuredPair | None = None,
+    measured: MeasuredPair | None,
+    style_asked: PictureStyle,
 ) -> Figure:
     from matplotlib.figure import Figure
     from matplotlib.layout_engine import ConstrainedLayoutEngine
@@ -121,29 +121,31 @@ def _draw(
     middle = (header.sizes["laser_y"] // 2, header.sizes["laser_x"] // 2)
     view = laser_view(capture, middle if laser is None else laser)
     pixel = view.brightest if pixel is None else pixel
+    look = style_asked.look
     spacing = ConstrainedLayoutEngine(w_pad=0.08, h_pad=0.08, hspace=0.04, wspace=0.02)
-    figure = Figure(figsize=(14, 7.6), facecolor=GROUND, layout=spacing)
-    heading, upper, lower = cast("list[SubFigure]", figure.subfigures(3, 1, height_ratios=[0.17, 1, 1.12]))
+    figure = Figure(figsize=style_asked.size, facecolor=look.ground, layout=spacing)
+    heading, upper, lower = cast("list[SubFigure]", figure.subfigures(3, 1, height_ratios=[0.17, 1.05, 1.12]))
     for part in (heading, upper, lower):
-        part.set_facecolor(GROUND)
+        part.set_facecolor(look.ground)
     # a dollar sign in a file name is not the start of a formula
-    title = encodable(header.path.name)
-    heading.text(0.012, 0.66, title, color=INK, size=15, weight="bold", va="center", parse_math=False)
-    heading.text(0.012, 0.12, _subtitle(header, view), color=FAINT, size=10.5, va="center", parse_math=False)
-    _draw_frames(upper, capture, view, pixel)
+    text: dict[str, Any] = {"x": 0.012, "va": "center", "parse_math": False}
+    title = drawable(header.path.name)[:MAX_TITLE]
+    heading.text(y=0.66, s=title, color=look.ink, size=look.size(15), weight="bold", **text)
+    heading.text(y=0.12, s=drawable(_subtitle(header, view)), color=look.faint, size=look.size(10.5), **text)
+    draw_frames(upper, capture, view, pixel, look, style_asked.shared_scale)
     left, center, right = lower.subplots(1, 3, width_ratios=[1.55, 0.75, 1.2])
     if measured is not None:
-        draw_counts(left, measured, view.laser, pixel)
-        draw_response(center, measured)
+        draw_counts(left, measured, view.laser, pixel, look)
+        draw_response(center, measured, look)
     else:
-        _draw_histogram(left, capture, view, pixel)
-        _draw_bounces(center, header, view)
-    _draw_row(right, capture, view)
+        _draw_histogram(left, capture, view, pixel, look)
+        _draw_bounces(center, header, view, look)
+    _draw_row(right, capture, view, look)
     return figure
 
 
 def _subtitle(header: StoredHeader, view: LaserView) -> str:
-    parts = [header.scan_type, f"{header.counted_points()} {'pixels' if _is_view(header) else 'sensor points'}"]
+    parts = [header.scan_type, f"{header.counted_points()} {'pixels' if is_view(header) else 'sensor points'}"]
     if header.scan_type == "exhaustive":
         parts.append(f"laser in row {view.laser[0]}, column {view.laser[1]} of {header.counted_points('laser')}")
     width = header.bin_width_opl
@@ -162,41 +164,7 @@ def _subtitle(header: StoredHeader, view: LaserView) -> str:
     return "  ·  ".join(parts)
 
 
-def _draw_frames(figure: SubFigure, capture: StoredCapture, view: LaserView, pixel: tuple[int, int]) -> None:
-    """Draw the wall at a few moments, each scaled by itself: the last are orders of magnitude darker."""
-    header = capture.header
-    first, last = lit_window(view.time)
-    half = (last - first) // 400  # a single bin is mostly noise where bins are many
-    bins = frame_bins(view.time)
-    windows = [slice(max(index - half, 0), index + half + 1) for index in bins]
-    frames = wall_frames(capture, view.laser, windows)
-    extent, xlabel, ylabel = _wall_extent(header)
-    left, right, bottom, top = extent
-    rows, columns = header.sensor_grid
-    at_pixel = (left + (pixel[1] + 0.5) / columns * (right - left), bottom + (pixel[0] + 0.5) / rows * (top - bottom))
-    points = list_on_wall(capture)
-    if points is not None:
-        at_pixel = (float(points[pixel[1], 0]), float(points[pixel[1], 1]))
-        xlabel, ylabel = "wall x [m]", "wall y [m]"
-    moments = [header.start_opl + (index + 0.5) * header.bin_width_opl for index in bins]
-    titles = [f"{opl:.3f} m   {opl_to_seconds(opl) * 1e9:.2f} ns" for opl in moments]
-    if header.has_pixels:
-        frames, titles = np.concatenate([view.wall[None], frames]), ["sum over time", *titles]
-    all_axes = np.ravel(figure.subplots(1, len(titles), sharex=True, sharey=True, squeeze=False))
-    for axes, frame, title in zip(all_axes, frames, titles, strict=True):
-        style(axes, title, xlabel, ylabel if axes is all_axes[0] else "")
-        scale: dict[str, Any] = {"cmap": COLORMAP, "vmin": 0, "vmax": max(frame.max(), 0) or 1}
-        if points is None:
-            axes.imshow(frame, origin="lower", extent=extent, **scale)
-        else:
-            area = max(4.0, min(80.0, DOT_AREA / len(points)))
-            axes.scatter(*points.T, c=frame[0], s=area, edgecolors=EDGE, linewidths=0.5, **scale)
-            axes.set_aspect("equal")
-            axes.margins(0.08)
-        axes.plot(*at_pixel, marker="+", markersize=9, markeredgewidth=1.2, color=MARK, clip_on=False)
-
-
-def _draw_histogram(axes: Axes, capture: StoredCapture, view: LaserView, pixel: tuple[int, int]) -> None:
+def _draw_histogram(axes: Axes, capture: StoredCapture, view: LaserView, pixel: tuple[int, int], look: Theme) -> None:
     header = capture.header
     first, last = lit_window(view.time)
     histograms = point_histograms(capture, view.laser, pixel)[:, first : last + 1]
@@ -205,29 +173,28 @@ def _draw_histogram(axes: Axes, capture: StoredCapture, view: LaserView, pixel: 
     logarithmic = len(shown) > 1  # higher bounces are orders of magnitude darker
     factor, power = (1.0, "") if logarithmic else power_of_ten(float(histograms.max()))
     top = float(histograms.max()) / factor
-    title = point_name(header, pixel)
-    style(axes, title, "optical path length [m]", _per_bin(header, power))
-    for slot, color in zip(shown, line_colors(len(shown)), strict=True):
+    style(axes, point_name(header, pixel), "optical path length [m]", per_bin(header, power), look)
+    for slot, color in zip(shown, line_colors(len(shown), look), strict=True):
         label = _bounce_label(header, slot)
-        axes.stairs(histograms[slot] / factor, edges, baseline=None, color=color, lw=1.3, label=label)
+        axes.stairs(histograms[slot] / factor, edges, baseline=None, color=color, lw=look.size(1.3), label=label)
     if logarithmic and top > 0:
         axes.set_yscale("log")
         axes.set_ylim(top * 10.0**-DECADES, top * 2)
     elif top > 0:
         axes.set_ylim(0, top * 1.08)
     if shown:
-        axes.legend(facecolor=PANEL, edgecolor="none", labelcolor=INK, fontsize=9, loc="upper right", framealpha=0.75)
+        add_legend(axes, look)
     axes.set_xlim(edges[0], edges[-1])
-    add_nanoseconds(axes)
+    add_nanoseconds(axes, look)
 
 
-def _draw_bounces(axes: Axes, header: StoredHeader, view: LaserView) -> None:
+def _draw_bounces(axes: Axes, header: StoredHeader, view: LaserView, look: Theme) -> None:
     energy = view.bounces
     slots = range(len(energy))
     lit = [slot for slot in slots if energy[slot] > 0]
-    summed = f"sum over {'pixels' if _is_view(header) else 'wall'} and time [{_unit(header)}]"
-    style(axes, "light of each bounce", "bounce", summed)
-    axes.bar(lit, energy[lit], color=line_colors(len(lit)), width=0.7)
+    summed = f"sum over {'pixels' if is_view(header) else 'wall'} and time [{unit_text(header)}]"
+    style(axes, "light of each bounce, in %", "bounce", summed, look)
+    axes.bar(lit, energy[lit], color=line_colors(len(lit), look), width=0.7)
     axes.set_xticks(slots, [_bounce_label(header, slot).removeprefix("bounce ") for slot in slots])
     axes.set_xlim(-1, len(energy))
     if lit:
@@ -236,12 +203,17 @@ def _draw_bounces(axes: Axes, header: StoredHeader, view: LaserView) -> None:
         axes.set_ylim(max(bottom / 10, top * 1e-12), top * 4)
     for slot in lit:
         percent = 100 * energy[slot] / energy[lit].sum()
-        share = f"{percent:.0f} %" if percent >= 10 else f"{percent:.2g} %"
+        share = f"{percent:.0f}" if percent >= 10 else f"{percent:.2g}"
         place = (slot, float(energy[slot]))
-        axes.annotate(share, place, (0, 3), textcoords="offset points", ha="center", color=INK, size=TICK_SIZE)
+        text: dict[str, Any] = {
+            "ha": "center",
+            "color": look.ink,
+            "size": look.size(TICK_SIZE if len(lit) < 5 else TICK_SIZE - 1.5),
+        }
+        axes.annotate(share, place, (0, 3), textcoords="offset points", **text)
 
 
-def _draw_row(axes: Axes, capture: StoredCapture, view: LaserView) -> None:
+def _draw_row(axes: Axes, capture: StoredCapture, view: LaserView, look: Theme) -> None:
     from matplotlib.colors import PowerNorm
 
     header = capture.header
@@ -249,48 +221,24 @@ def _draw_row(axes: Axes, capture: StoredCapture, view: LaserView) -> None:
     first, last = lit_window(view.time)
     light = _at_most(row_over_time(capture, view.laser, row)[:, first : last + 1].T, MAX_ROW_LINES)
     factor, power = power_of_ten(float(light.max()))
-    (left, right, _, _), xlabel, _ = _wall_extent(header)
+    (left, right, _, _), xlabel, _ = wall_extent(header)
     if header.is_list():
         left, right, xlabel = -0.5, header.sensor_grid[1] - 0.5, "point, in the order of the list"
     early, late = (header.start_opl + index * header.bin_width_opl for index in (first, last + 1))
     title = "listed points over time" if header.is_list() else f"brightest row ({row}) over time"
-    style(axes, title, xlabel, "optical path length [m]")
+    style(axes, title, xlabel, "optical path length [m]", look)
     # square root: one bright front would leave everything behind it black
     scale = PowerNorm(0.5, vmin=0, vmax=max(float(light.max()), 0.0) / factor or 1.0, clip=True)
     extent = (left, right, early, late)
     image = axes.imshow(
         light / factor, origin="lower", extent=extent, aspect="auto", cmap=COLORMAP, norm=scale, interpolation="nearest"
     )
-    color_bar(axes.figure, image, axes, _per_bin(header, power))
-
-
-def _is_view(header: StoredHeader) -> bool:
-    return header.scan_type == LINE_OF_SIGHT
-
-
-def _per_bin(header: StoredHeader, power: str) -> str:
-    if header.is_measured:
-        return f"counts per bin{f' [{power.strip()}]' if power else ''}"
-    return f"{'radiance' if _is_view(header) else 'H'} per bin [{power}{_unit(header)}]"
-
-
-def _unit(header: StoredHeader) -> str:
-    return re.sub(r"\^(-\d)", r"$^{\1}$", header.unit)
+    color_bar(axes.figure, image, axes, per_bin(header, power), look)
 
 
 def _bounce_label(header: StoredHeader, slot: int) -> str:
     name = header.bounce_name(header.bounce_indices[slot]).replace(" and above", "+")
     return "all bounces" if name == "all" else f"bounce {name}"
-
-
-def _wall_extent(header: StoredHeader) -> tuple[tuple[float, float, float, float], str, str]:
-    """Return (left, right, bottom, top) of the sensor grid, and labels for its axes; indices without a known size."""
-    size = None if header.has_pixels else header.sensor_grid_size
-    if size is not None and len(size) == 2 and all(np.isfinite(length) and length > 0 for length in size):
-        width, height = size
-        return (-width / 2, width / 2, -height / 2, height / 2), "wall x [m]", "wall y [m]"
-    rows, columns = header.sensor_grid
-    return (-0.5, columns - 0.5, -0.5, rows - 0.5), "column", "row"
 
 
 def _at_most(light: Float64, lines: int) -> Float64:

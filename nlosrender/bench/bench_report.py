@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import textwrap
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +12,7 @@ from nlosrender.files.atomic_write import replacing
 from nlosrender.files.file_kinds import PNG, REPORT
 
 FAR = "never"
+LABEL_STEP = 0.04  # between labels, of the height of the axes: a line of 8 points in 4 inches
 NOTABLE = 0.1  # of the CPU time: setting up the engine is shown apart
 
 
@@ -132,7 +135,7 @@ def _process_line(process: dict[str, Any]) -> str:
 
 
 def write_plot(path: Path, report: dict[str, Any]) -> None:
-    """Draw the error of every contender against seconds, one panel per scene, slopes in the legend.
+    """Draw the error of every contender against seconds, one panel per scene; lines are labelled with their slopes.
 
     Raises
     ------
@@ -147,7 +150,7 @@ def write_plot(path: Path, report: dict[str, Any]) -> None:
     scenes = report["scenes"]
     columns = min(2, max(1, len(scenes)))
     rows = max(1, -(-len(scenes) // columns))
-    figure = Figure(figsize=(7.2 * columns, 5.2 * rows), facecolor=GROUND, layout="constrained")
+    figure = Figure(figsize=(8.4 * columns, 5.2 * rows), facecolor=GROUND, layout="constrained")
     for axes, scene in zip(figure.subplots(rows, columns, squeeze=False).flat, scenes, strict=False):
         _draw_scene(axes, scene)
     for axes in figure.axes[len(scenes) :]:
@@ -159,25 +162,51 @@ def write_plot(path: Path, report: dict[str, Any]) -> None:
 def _draw_scene(axes: Any, scene: dict[str, Any]) -> None:
     from matplotlib import colormaps
 
-    from nlosrender.analysis.theme import FAINT, INK, PANEL, style
+    from nlosrender.analysis.theme import FAINT, INK, style
 
-    palette = colormaps["tab10"]
+    palette = colormaps["Set2"](range(8))  # bright enough to be read as text on the dark ground
     for number, curve in enumerate(scene["curves"]):
-        slope = "" if curve["slope"] is None else f", slope {curve['slope']:.2f}"
         peer = curve["name"].startswith("mitransient")
-        axes.plot(
-            [point["seconds"] for point in curve["points"]],
-            [point["error"] for point in curve["points"]],
-            marker="s" if peer else "o",
-            linestyle="--" if peer else "-",
-            markersize=4,
-            color=palette(number),
-            label=curve["name"] + slope,
-        )
+        seconds, errors = ([point[key] for point in curve["points"]] for key in ("seconds", "error"))
+        line, marker = ("--", "s") if peer else ("-", "o")
+        color = palette[number % len(palette)]
+        axes.plot(seconds, errors, marker=marker, linestyle=line, markersize=4, color=color)
     axes.axhline(scene["target"], color=INK, linewidth=0.8, linestyle=":")
     axes.axhline(scene["reference"]["error"], color=FAINT, linewidth=0.8)
     axes.set_xscale("log")
     axes.set_yscale("log")
     axes.grid(visible=True, which="major", color=FAINT, alpha=0.2)
-    style(axes, scene["title"], "seconds", "relative L2 error of H")
-    axes.legend(facecolor=PANEL, edgecolor=FAINT, labelcolor=INK, fontsize=8)
+    style(axes, textwrap.fill(scene["title"], 70), "seconds", "relative L2 error of H")
+    _label_lines(axes, scene)
+
+
+def _label_lines(axes: Any, scene: dict[str, Any]) -> None:
+    """Write the name of every line at the right of the axes, as high as its end, pushed apart where they would meet."""
+    names = [
+        curve["name"] + ("" if curve["slope"] is None else f", slope {curve['slope']:.2f}") for curve in scene["curves"]
+    ]
+    right, bottom = axes.get_xlim()[1], axes.get_ylim()[0]
+    axes.set(xlim=axes.get_xlim(), ylim=axes.get_ylim())  # no label may move the axes
+    labelled = []
+    for name, line in zip([*names, "target", "error of the reference"], list(axes.lines), strict=True):
+        x, y = line.get_data()
+        if len(y) and y[-1] > 0:
+            labelled.append((name, line, (x[-1] if name in names else right, max(float(y[-1]), bottom))))
+    to_axes = axes.transScale + axes.transLimits
+    heights = pushed_apart([float(to_axes.transform(end)[1]) for _, _, end in labelled], LABEL_STEP)
+    for (name, line, end), height in zip(labelled, heights, strict=True):
+        leader = {"arrowstyle": "-", "color": line.get_color(), "linewidth": 0.5, "alpha": 0.6}
+        text = {"color": line.get_color(), "fontsize": 8, "va": "center", "arrowprops": leader}
+        axes.annotate(name, end, (1.02, height), textcoords="axes fraction", **text)
+
+
+def pushed_apart(heights: Sequence[float], step: float) -> list[float]:
+    """Return heights from 0 to 1 moved until they are at least ``step`` apart, in the same order."""
+    order = sorted(range(len(heights)), key=lambda index: heights[index])
+    placed = [min(max(heights[index], 0.0), 1.0) for index in order]
+    for at in range(1, len(placed)):
+        placed[at] = max(placed[at], placed[at - 1] + step)
+    for at in reversed(range(len(placed))):  # those that were pushed out at the top come down again
+        placed[at] = min(placed[at], 1.0 - (len(placed) - 1 - at) * step)
+    found = dict(zip(order, placed, strict=True))
+    return [found[index] for index in range(len(heights))]

@@ -64,7 +64,12 @@ def plot(
     output: Annotated[
         Path | None,
         typer.Option(
-            "-o", "--output", metavar="OUT.png", help="Picture to write.", show_default="FILE.png", readable=False
+            "-o",
+            "--output",
+            metavar="OUT",
+            help="Picture: .png, .pdf or .svg.",
+            show_default="FILE.png",
+            readable=False,
         ),
     ] = None,
     laser: Annotated[
@@ -83,19 +88,32 @@ def plot(
         Path | None,
         typer.Option(metavar="FILE", help="Of counts: the capture they were measured from.", readable=False),
     ] = None,
+    theme: Annotated[str, typer.Option(metavar="dark|light", help="Ground of the picture.")] = "dark",
+    size: Annotated[
+        str | None,
+        typer.Option(metavar="WxH", help="Width and height in inches, or as 18x10cm.", show_default="14x7.6"),
+    ] = None,
+    dpi: Annotated[float, typer.Option(help="Pixels per inch of .png, and of the frames in .pdf and .svg.")] = 130,
+    shared_scale: Annotated[
+        bool, typer.Option("--shared-scale", help="One colour scale for all frames; else each has its own.")
+    ] = False,
 ) -> None:
     """Draw a capture: the relay wall over time, one histogram, the light of each bounce, one row over time.
 
     Of a measured capture: the counts of a point beside its ideal histogram, and the detector's response.
 
+    For a paper: `--theme light --size 18x10cm -o figure.pdf`.
+
     Example: `nlosrender plot z.hdf5 --pixel 6,8` creates z.png and prints its path.
     """
+    from nlosrender.analysis.picture_style import PictureStyle, picture_size
     from nlosrender.analysis.plots import plot_capture
 
     need = "a row and a column counted from 0, such as 6,8"
     laser_at, pixel_at = two_numbers(laser, ",", "--laser", need), two_numbers(pixel, ",", "--pixel", need)
+    look = PictureStyle(theme, picture_size(size), dpi, shared_scale)
     picture = output or beside(file, ".png")
-    typer.echo(str(plot_capture(file, picture, laser=laser_at, pixel=pixel_at, ideal=ideal)))
+    typer.echo(str(plot_capture(file, picture, laser=laser_at, pixel=pixel_at, ideal=ideal, look=look)))
 
 
 def frames(

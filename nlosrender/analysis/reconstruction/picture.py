@@ -10,8 +10,7 @@ import numpy as np
 from nlosrender.analysis.drawn_picture import Picture
 from nlosrender.analysis.reconstruction.reconstruct import SEPARATOR, Reconstruction, settings_text
 from nlosrender.analysis.reconstruction.score import Score, otsu_threshold
-from nlosrender.analysis.theme import COLORMAP, FAINT, GROUND, INK, MARK, color_bar, style
-from nlosrender.config.encodable import encodable
+from nlosrender.analysis.theme import COLORMAP, FAINT, GROUND, INK, MARK, color_bar, drawable, style
 from nlosrender.files.layout import Float64
 from nlosrender.files.reading.scan import Float32
 
@@ -54,7 +53,7 @@ def _figure(reconstruction: Reconstruction, silhouette: Float64 | None, score: S
     side, below = max(depth, 0.25 * width), max(depth, 0.25 * height)
     tall = 11.0 * (height + below) / (2.25 * width + side) + 1.5
     figure = Figure(figsize=(13.0, min(max(tall, 4.5), 14.0)), facecolor=GROUND, layout="constrained")
-    title = encodable(reconstruction.source.name)
+    title = drawable(reconstruction.source.name)
     figure.suptitle(title, color=INK, size=14, weight="bold", x=0.01, ha="left", parse_math=False)
     axes = figure.subplots(2, 3, width_ratios=[width, side, 1.15 * width], height_ratios=[height, below])
     front = reconstruction.front_view()
