@@ -9,10 +9,8 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 from functools import lru_cache
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
-import numpy as np
-from numpy.typing import NDArray
 from pydantic import ValidationInfo
 
 from nlosrender.config.fields import MAX_LENGTH, Checked, finite_numbers
@@ -20,6 +18,10 @@ from nlosrender.config.frozen import FrozenDict
 from nlosrender.config.issues import InvalidValue, invalid_value, mismatch, shown
 from nlosrender.config.plugin_check import config_folder, existing_file
 from nlosrender.errors import KeyPath, ValidationIssue
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
 
 SUFFIXES = (".csv", ".npy")
 MAX_POINTS = 2**24  # 4096 x 4096, beyond any scan
@@ -38,6 +40,8 @@ class PointList:
     """
 
     def __init__(self, rows: Sequence[object], places: Sequence[str] | None = None):
+        import numpy as np  # only where there is a list: validate is quick without it
+
         self._places = places  # of a file: "points.csv:3"; None: the YAML's own items
         numbers = [finite_numbers(row, 2) for row in rows]
         wrong = [index for index, xy in enumerate(numbers) if xy is None or max(map(abs, xy)) > MAX_LENGTH]
@@ -103,6 +107,8 @@ def point_list(value: Sequence[object] | Mapping[str, Any]) -> PointList:
 
 def off_the_wall(points: PointList, extent: tuple[float, float], tolerance: float) -> Iterator[ValidationIssue]:
     """Yield the first few points off a wall of width and height ``extent`` [m]; paths start at the list."""
+    import numpy as np
+
     half = np.array(extent) / 2
     outside = np.flatnonzero((np.abs(points.xy) > half * (1 + tolerance)).any(axis=1))
     need = f"need x from {-half[0]:.6g} to {half[0]:.6g} m and y from {-half[1]:.6g} to {half[1]:.6g} m."
@@ -144,6 +150,8 @@ def _read(path: Path, changed: int, size: int) -> PointList:
 
 
 def _array_rows(path: Path) -> tuple[list[Any], list[str]]:
+    import numpy as np
+
     try:
         array = np.load(path, allow_pickle=False, mmap_mode="r")
     except (ValueError, EOFError) as error:
