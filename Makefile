@@ -6,7 +6,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
 # Exact versions that passed the test suite; pyproject.toml holds the ranges that are allowed.
 PINS := -c .constraints.txt
 
-.PHONY: help install render test test-slow stress lint format peers bench bench-peers paper paper-quick clean
+.PHONY: help install render test test-slow stress lint format peers bench bench-peers paper paper-quick wheel clean
 .DEFAULT_GOAL := help
 
 help: ## Show this list.
@@ -78,5 +78,10 @@ paper: install ## Reproduce the paper's figures and tables: out/paper/index.html
 paper-quick: install ## The same with fewer points and paths, in minutes. FIGURES='4 8'
 	$(BIN)/nlosrender paper --quick $(foreach name,$(FIGURES),--figure $(name)) -o out/paper
 
+wheel: $(VENV)/.dev ## Build the package: dist/nlosrender-VERSION-py3-none-any.whl.
+	rm -rf build  # modules of an earlier build that are gone would be in the wheel
+	$(PIP) wheel --no-deps --no-build-isolation --wheel-dir dist .
+	@ls -s --block-size=KiB dist/*.whl
+
 clean: ## Remove what make made, but not out/.
-	rm -rf $(VENV) .venv-peers .venv-peers-mitransient build *.egg-info .pytest_cache .mypy_cache .ruff_cache
+	rm -rf $(VENV) .venv-peers .venv-peers-mitransient build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache

@@ -40,7 +40,6 @@ app = typer.Typer(
     name="nlosrender",
     help="Simulate non-line-of-sight captures: one YAML in, one Z-NLOS HDF5 file out.",
     no_args_is_help=True,
-    add_completion=False,
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
 )

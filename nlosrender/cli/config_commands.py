@@ -31,7 +31,12 @@ class ScanTypeOption(StrEnum):
 def new(
     path: Annotated[str, typer.Argument(metavar="[PATH]", help="File to write; - for standard output.")] = "-",
     force: Annotated[bool, typer.Option("--force", help="Overwrite PATH.")] = False,
-    scan_type: Annotated[ScanTypeOption, typer.Option(help="Scan the starter is for.")] = ScanTypeOption.confocal,
+    scan_type: Annotated[
+        ScanTypeOption | None, typer.Option(help="Scan the starter is for.", show_default="confocal")
+    ] = None,
+    example: Annotated[
+        str | None, typer.Option(metavar="NAME", help="Instead: an example with its files; list: their names.")
+    ] = None,
 ) -> None:
     """Write a commented starter config that can be rendered as it is.
 
@@ -39,17 +44,38 @@ def new(
     """
     import shlex
 
+    from nlosrender.config.examples import Example, example_names, read_example
     from nlosrender.config.template import starter_config
+    from nlosrender.errors import OptionError
     from nlosrender.files.atomic_write import replacing
     from nlosrender.files.file_kinds import CONFIG, FileKind
 
-    if path == "-":
-        typer.echo(starter_config(scan_type.value), nl=False)
+    if example == "list":
+        typer.echo("\n".join(example_names()))
         return
-    target = Path(path)
-    text = starter_config(scan_type.value, target.stem, target.name)
-    with replacing(path, CONFIG if force else FileKind(lambda _: "exists already; --force overwrites it.")) as partial:
-        partial.write_text(text, encoding="utf-8")
+    if example is not None and scan_type is not None:
+        raise typer.BadParameter("has a scan type of its own; leave --scan-type away", param_hint="--example")
+    target = Path("capture.yaml" if path == "-" else path)
+    chosen = (
+        Example(starter_config((scan_type or ScanTypeOption.confocal).value, target.stem, target.name), ())
+        if example is None
+        else read_example(example, target.name)
+    )
+    if path == "-":
+        if chosen.files:
+            raise OptionError(f"--example: {example} comes with {chosen.files[0].name}; name a file to write")
+        typer.echo(chosen.text, nl=False)
+        return
+    kind = CONFIG if force else FileKind(lambda _: "exists already; --force overwrites it.")
+    with replacing(path, kind) as partial:
+        partial.write_text(chosen.text, encoding="utf-8")
+    for file in chosen.files:
+        beside = target.with_name(file.name)
+        content = file.read_bytes()
+        if not beside.is_file() or beside.read_bytes() != content:
+            with replacing(beside, FileKind(lambda _: "exists already and is another file.")) as partial:
+                partial.write_bytes(content)
+            typer.echo(f"{beside}: written")
     typer.echo(f"{path}: written; nlosrender validate {shlex.quote(path)} checks it after changes.")
 
 

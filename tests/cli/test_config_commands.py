@@ -12,7 +12,9 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
+from nlosrender.api.configuration import load
 from nlosrender.cli.app import app
+from nlosrender.config.examples import example_names
 from nlosrender.errors import EXIT_BAD_INPUT, EXIT_USAGE, ConfigError, FileError
 
 runner = CliRunner()
@@ -92,6 +94,30 @@ def test_new_explains_a_place_it_cannot_write_to(name: str, message: str, tmp_pa
     result = runner.invoke(app, ["new", str(tmp_path / name)])
     assert isinstance(result.exception, FileError)
     assert message in str(result.exception)
+
+
+@pytest.mark.parametrize("name", ["circular-confocal", "mesh-wall", "mitsuba-scene", "sparse-random", "z-letter"])
+def test_an_example_stands_in_any_folder(name: str, tmp_path: Path) -> None:
+    """It is valid there, with the files it names; it writes beside itself, and an unchanged file is no obstacle."""
+    target = tmp_path / "mine.yaml"
+    for options in ([], ["--force"]):
+        assert runner.invoke(app, ["new", str(target), "--example", name, *options]).exit_code == 0
+    assert load(target).config.output.path == Path(f"{name}.hdf5")
+    assert not any(word in target.read_text() for word in ("configs/", "scenes/", "out/"))
+
+
+def test_new_refuses_examples_that_it_cannot_write(tmp_path: Path) -> None:
+    """Unknown names, a scan type beside one, a file that is lost on standard output, another file of the same name."""
+    assert set(runner.invoke(app, ["new", "--example", "list"]).stdout.split()) == set(example_names())
+    unknown = runner.invoke(app, ["new", "--example", "z-leter"]).exception
+    assert "need one of" in str(unknown)
+    assert "Did you mean z-letter?" in str(unknown)
+    assert runner.invoke(app, ["new", "--example", "smoke", "--scan-type", "single"]).exit_code == EXIT_USAGE
+    assert "comes with circle.csv" in str(runner.invoke(app, ["new", "--example", "circular-confocal"]).exception)
+    (tmp_path / "circle.csv").write_text("0,0\n")
+    result = runner.invoke(app, ["new", str(tmp_path / "c.yaml"), "--example", "circular-confocal"])
+    assert "circle.csv: exists already and is another file" in str(result.exception)
+    assert (tmp_path / "circle.csv").read_text() == "0,0\n"
 
 
 def test_new_knows_three_scans() -> None:
