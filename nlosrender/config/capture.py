@@ -95,10 +95,6 @@ class CaptureConfig(Section):
             raw["sensor_grid"] = pixels
         return raw
 
-    def rule_sensor_points(self) -> Iterator[ValidationIssue]:
-        """A scan measures a grid or a list."""
-        yield from self.one_of("sensor", "it is required: the measured points")
-
     def one_of(self, name: str, why: str) -> Iterator[ValidationIssue]:
         """Yield what is wrong where ``sensor`` or ``laser`` points are neither a grid nor a list, or both."""
         grid, points = getattr(self, f"{name}_grid"), getattr(self, f"{name}_points")

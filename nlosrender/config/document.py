@@ -145,11 +145,15 @@ class Config(Section):
             message += "only captures with a capture.camera, such as scan_type: line_of_sight, do without."
             yield ValidationIssue(("scene", "relay_wall"), message)
 
-    def rule_laser_points(self) -> Iterator[ValidationIssue]:
-        """An exhaustive scan has a grid or a list."""
-        if self.capture.scan_type == "exhaustive" and not self.has_pixel_points:
-            for issue in self.capture.one_of("laser", "an exhaustive scan needs it"):
-                yield ValidationIssue(("capture", *issue.path), issue.message, issue.at)
+    def rule_points_on_the_wall(self) -> Iterator[ValidationIssue]:
+        """A scan measures a grid or a list, and an exhaustive one lights one."""
+        if self.capture.is_line_of_sight or self.has_pixel_points:
+            return
+        found = [*self.capture.one_of("sensor", "it is required: the measured points")]
+        if self.capture.scan_type == "exhaustive":
+            found += self.capture.one_of("laser", "an exhaustive scan needs it")
+        for issue in found:
+            yield ValidationIssue(("capture", *issue.path), issue.message, issue.at)
 
     def rule_polarized(self) -> Iterator[ValidationIssue]:
         """Polarised light is for paths from a point of a rectangle."""

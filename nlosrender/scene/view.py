@@ -15,6 +15,7 @@ from nlosrender.config.emitters import PointLamp, SpotLamp
 from nlosrender.errors import ConfigError
 from nlosrender.scene.bounding_box import Bounds, bounds_of, box_corners, joined_bounds
 from nlosrender.scene.build import EngineScene, count_triangles
+from nlosrender.scene.loading.loaded_surfaces import with_vertices
 from nlosrender.scene.loading.materials import check_surface, medium_warnings, mitsuba_spectrum
 from nlosrender.scene.loading.mitsuba_shapes import load_surface, shape_bounds
 from nlosrender.scene.loading.xml_loading import WHERE, load_xml_scene
@@ -67,7 +68,9 @@ def build_view(scene_config: SceneConfig, capture_config: CaptureConfig) -> Buil
     of_whole: tuple[MeshReport, ...] = ()
     left_out: tuple[str, ...] = ()
     if scene_config.mitsuba is not None:
-        whole, of_whole, left_out = load_xml_scene(scene_config.mitsuba)
+        # the shapes of a scan are told apart: those with points on them, and those to be sampled
+        joins_meshes = capture_config.is_line_of_sight
+        whole, of_whole, left_out = load_xml_scene(scene_config.mitsuba, joins_meshes=joins_meshes)
     try:
         plane = _image_plane(capture_config, whole)
     except ValueError as error:
@@ -85,7 +88,8 @@ def build_view(scene_config: SceneConfig, capture_config: CaptureConfig) -> Buil
     shapes = [load_surface(surface, shape, unit) for surface, shape in zip(surfaces, read.shapes, strict=True)]
     contents: dict[str, object] = {f"lamp_{index}": _lamp(lamp, frame, unit) for index, lamp in enumerate(lamps)}
     if whole is not None:
-        shapes += whole.shapes()
+        is_view = capture_config.is_line_of_sight
+        shapes += [shape if is_view else with_vertices(shape, index) for index, shape in enumerate(whole.shapes())]
         for shape in whole.shapes():
             check_surface(shape, WHERE)
         far = [emitter for emitter in whole.emitters() if not emitter.flags() & mi.EmitterFlags.Surface]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
@@ -24,7 +25,10 @@ CAMERA = {"position": [0.0, 0.0, 0.25], "look_at": [0, 0, 0], "width": 5, "heigh
 CAMERA |= {"fov_deg": 2 * math.degrees(math.atan(1.0 / 0.25))}  # sees 2.0 x 1.2 m of the wall
 DEVICES = {"laser_position": [-0.4, 0.1, 0.2], "account_first_and_last_bounces": True}
 LASERS = {"single": {"laser_target": [0.3, -0.2, 0]}, "exhaustive": {"laser_targets": [[-0.375, 0, 0], [0.375, 0, 0]]}}
-TWO_SIDED = {"bsdf": {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": 1.0}}}  # no wall of virtual lights
+NO_WALL = {"type": "none"}
+RECTANGLE = {"type": "rectangle", "width": 2.0, "height": 1.6, "normal": [0, 0, 1], "center": [0, 0, 0]}
+BEHIND = {"type": "sphere", "center": [0, 0, -0.5], "radius": 0.1}  # a rectangle before it is no relay wall
+WHITE = {"type": "diffuse", "reflectance": 1.0}
 FIELDS = ("sensor_grid", "laser_grid", "laser_point")
 
 
@@ -39,6 +43,15 @@ def seen(scan: str, *items: Any, wall: Any = NONE, camera: Any = NONE, capture: 
     if wall.get("type") == "none":
         del config["scene"]["relay_wall"]
     return config
+
+
+def scene_of(config: Any) -> Any:
+    """Return the scene of a configuration that has no relay wall."""
+    validated = configured(config)
+    start_backend("llvm")
+    built = stages.load_scene(validated)
+    assert built.wall_shape is None
+    return built
 
 
 def gridded(scan: str, **render: Any) -> Any:
@@ -62,17 +75,19 @@ def test_virtual_lights_render_what_a_camera_sees_of_a_rectangle() -> None:
     """H of both captures is the same within the error asked for, and no relay wall has to be named."""
     asked = {"engine": "virtual_lights", "spp": None, "target_error": 0.01}
     grid = render(gridded("single", **asked))
-    rectangle = {"type": "rectangle", "width": 2.0, "height": 1.6, "normal": [0, 0, 1], "center": [0, 0, 0]}
-    pixels = render(seen("single", PLATE, BALL, rectangle, wall={"type": "none"}, **asked))
-    assert pixels.samples == 0  # no paths
-    assert relative_l2(pixels.total - grid.total, grid.total) < 0.01
+    for bsdf in (WHITE, {"type": "twosided", "bsdf": WHITE}):
+        pixels = render(seen("single", PLATE, BALL, {**RECTANGLE, "bsdf": bsdf}, wall=NO_WALL, **asked))
+        assert pixels.samples == 0  # no paths
+        assert relative_l2(pixels.total - grid.total, grid.total) < 0.01
 
 
 @pytest.mark.parametrize("scan", ["single", "confocal", "exhaustive"])
 def test_a_surface_without_wall_is_rendered_as_a_wall_is(scan: str) -> None:
     """The scene without relay wall is another code path of the same estimator: H agrees within the noise."""
     asked = {"spp": 2048, "max_bounces": 4}
-    grid, pixels = render(gridded(scan, **asked)), render(seen(scan, PLATE, BALL, wall=TWO_SIDED, **asked))
+    config = seen(scan, PLATE, BALL, RECTANGLE, BEHIND, wall=NO_WALL, **asked)
+    assert "has surfaces behind it" in scene_of(config).reason
+    grid, pixels = render(gridded(scan, **asked)), render(config)
     for bounce in (3, 4):
         assert_agrees(
             pixels.bounce(bounce),
@@ -92,14 +107,15 @@ def test_third_bounce_of_a_tilted_surface() -> None:
     def placed(x: float, y: float, z: float) -> list[float]:
         return (middle + x * frame.x + y * frame.y + z * frame.normal).tolist()
 
-    wall = {"center": middle.tolist(), "normal": frame.normal.tolist(), "up": frame.y.tolist(), **TWO_SIDED}
+    wall = {**RECTANGLE, "center": middle.tolist(), "normal": frame.normal.tolist(), "up": frame.y.tolist()}
+    items = wall, {**BEHIND, "center": placed(0, 0, -0.5)}
     plate = {"type": "rectangle", "width": 0.6, "height": 0.5, "center": placed(0.1, 0, 0.9), "up": frame.y.tolist()}
     plate |= {"normal": (-frame.normal).tolist()}
     camera = {"position": placed(-0.6, 0.2, 0.3), "look_at": placed(0.1, -0.1, 0), "up": [0, 1, 0], "fov_deg": 25}
     aim = {"laser_position": placed(0.5, 0, 0.4), "laser_target": placed(0.2, -0.3, 0)}
-    result = render(seen("single", plate, wall=wall, camera=camera, capture=aim, spp=2048))
+    config = seen("single", plate, *items, wall=NO_WALL, camera=camera, capture=aim, spp=2048)
+    result, to_scene = render(config), scene_of(config).wall.pose
     grid, axis = result.capture.sensor_grid, result.time_axis
-    to_scene = _frame_of(seen("single", plate, wall=wall, camera=camera, capture=aim))
     sensors = to_scene.to_scene(grid.positions)
     np.testing.assert_allclose((sensors - middle) @ frame.normal, 0, atol=1e-6)  # float32 of coordinates near 4 m
     laser = np.array([[placed(0.2, -0.3, 0)]])
@@ -115,12 +131,6 @@ def test_third_bounce_of_a_tilted_surface() -> None:
     assert_agrees(result.bounce(3), result.bounce_variance(3), expected, replicas=result.plan.replicas, floor=0.01)
 
 
-def _frame_of(config: Any) -> Any:
-    validated = configured(config)
-    start_backend("llvm")
-    return stages.load_scene(validated).wall.pose
-
-
 CORNER = (  # a floor and a wall that meet at x = 1, and nothing else
     {"type": "rectangle", "width": 2.0, "height": 2.0, "center": [0, 0, 0], "normal": [0, 0, 1]},
     {"type": "rectangle", "width": 2.0, "height": 2.0, "center": [1, 0, 1], "normal": [-1, 0, 0], "up": [0, 0, 1]},
@@ -133,7 +143,7 @@ def corner(scan: str, capture: Any, *more: Any, camera: Any = EYE, **render_keys
     items = [{**item, "bsdf": {"type": "diffuse", "reflectance": rho}} for item, rho in zip(CORNER, RHO, strict=True)]
     aim = {"laser_position": [-0.7, 0, 1.2], **capture}
     asked = {"spp": 16, **render_keys}
-    return render(seen(scan, *items, *more, wall={"type": "none"}, camera=camera, capture=aim, **asked))
+    return render(seen(scan, *items, *more, wall=NO_WALL, camera=camera, capture=aim, **asked))
 
 
 def test_second_bounce_between_two_surfaces() -> None:
@@ -227,3 +237,26 @@ def test_an_exhaustive_scan_of_the_pixels_is_symmetrical() -> None:
     assert np.count_nonzero(second) > 30  # pairs of a point on the floor and one on the wall
     np.testing.assert_allclose(second, second.T, rtol=1e-5)
     assert not np.diag(second).any()
+
+
+XML = """<scene version="3.0.0"><bsdf type="twosided" id="white"><bsdf type="diffuse">
+<rgb name="reflectance" value="1"/></bsdf></bsdf>
+<shape type="obj"><string name="filename" value="wall.obj"/><ref id="white"/></shape>
+<shape type="rectangle"><transform name="to_world"><scale x="0.3" y="0.25"/><rotate y="1" angle="180"/>
+<translate x="0.1" y="0.05" z="0.8"/></transform><ref id="white"/></shape></scene>"""
+OBJ = "v -1 -0.8 0\nv 1 -0.8 0\nv 1 0.8 0\nv -1 0.8 0\nf 1 2 3 4\n"
+
+
+def test_a_rectangle_of_a_mitsuba_scene_is_a_wall(tmp_path: Path) -> None:
+    """Two triangles of a mesh file that all pixels see are the wall of virtual lights, as a rectangle of ours is."""
+    (tmp_path / "room.xml").write_text(XML, encoding="utf-8")
+    (tmp_path / "wall.obj").write_text(OBJ, encoding="utf-8")
+    asked = {"engine": "virtual_lights", "spp": None, "target_error": 0.01}
+    plate = {**PLATE, "normal": [0, 0, -1], "bsdf": WHITE}
+    own = render(seen("single", plate, {**RECTANGLE, "bsdf": WHITE}, wall=NO_WALL, **asked))
+    config = seen("single", wall=NO_WALL, **asked)
+    config["scene"]["mitsuba"] = "room.xml"
+    theirs = render(config, folder=tmp_path)
+    assert theirs.samples == 0
+    np.testing.assert_allclose(theirs.capture.sensor_grid.positions, own.capture.sensor_grid.positions, atol=1e-6)
+    assert relative_l2(theirs.total - own.total, own.total) < 0.01

@@ -212,6 +212,47 @@ def test_a_camera_stays_a_mitsuba_scene(tmp_path: Path) -> None:
     assert config.scene.mitsuba == tmp_path / "scene.xml"
 
 
+PIXELS = """<scene version="3.0.0"><integrator type="transient_nlos_path">
+<boolean name="nlos_laser_sampling" value="true"/><string name="capture_type" value="SCAN"/></integrator>
+<emitter type="projector"><transform name="to_world"><lookat origin="0.5, 0, 2" target="0.25, 0.125, 0" up="0, 1, 0"/>
+</transform></emitter><shape type="rectangle"/>
+<sensor type="perspective"><float name="fov" value="30"/><film type="transient_hdr_film">
+<integer name="width" value="4"/><integer name="height" value="3"/><integer name="temporal_bins" value="7"/></film>
+</sensor></scene>"""
+
+
+@pytest.mark.parametrize("scan", ["single", "confocal", "exhaustive"])
+def test_a_camera_before_a_hidden_scene(tmp_path: Path, scan: str) -> None:
+    """Its pixels' first surfaces are the points; the laser stands where the projector does and looks along its axis."""
+    config = config_of(tmp_path, PIXELS.replace("SCAN", scan))
+    capture = config.capture
+    assert (capture.scan_type, capture.sensor_grid.nx, capture.sensor_grid.ny) == (scan, 4, 3)
+    assert config.scene.mitsuba == tmp_path / "scene.xml"
+    assert config.has_pixel_points
+    assert capture.laser_position == pytest.approx((0.5, 0, 2))
+    if scan == "single":
+        towards = np.subtract(capture.laser_target, capture.laser_position)
+        assert towards / np.abs(towards[2]) == pytest.approx(np.array([-0.125, 0.0625, -1]))
+        assert capture.pixel_point is None
+    else:
+        assert capture.pixel_point == (0, 1)  # the upper left corner, where mitransient's laser looks
+    assert capture.n_lasers == (12 if scan == "exhaustive" else 1)
+
+
+def test_what_a_camera_before_a_hidden_scene_cannot_have(tmp_path: Path) -> None:
+    """A laser point of a wall, a fan of rays, another lamp: refused with the reason."""
+    _refused(tmp_path, PIXELS.replace("SCAN", "single"), "is a point of a relay wall", laser=(0.0, 0.0))
+    fan = '<boolean name="force_equal_illumination_scanning" value="false"/></integrator>'
+    exhaustive = PIXELS.replace("SCAN", "exhaustive")
+    _refused(tmp_path, exhaustive.replace("</integrator>", fan), "a fan of rays meets the scene")
+    _refused(tmp_path, exhaustive.replace("projector", "point"), "is lit by one <emitter type='projector'>")
+
+
+def _refused(tmp_path: Path, text: str, message: str, **options: object) -> None:
+    translation, _ = imported(tmp_path, text, **options)
+    assert message in str(ConfigError(translation.issues))
+
+
 def test_points_of_ytal(tmp_path: Path) -> None:
     """Sensor points are cell centres of the wall; the laser looks at a place in pixels, or at the middle."""
     config = config_of(tmp_path, YAML + "laser_lookat_x: 1\nlaser_lookat_y: 0\n")
@@ -332,7 +373,6 @@ REFUSED_XML = [  # what is replaced, by what, where it is told, and how
         12,
         "sensor: is not known here; need nlos_capture_meter or perspective",
     ),
-    ('"nlos_capture_meter"', '"perspective"', 12, "each pixel sees first: such captures are not read yet"),
     ('"transient_hdr_film"', '"phasor_hdr_film"', 14, "film.type: stores frequencies"),
     ('"transient_hdr_film"', '"hdrfilm"', 14, "film.type: no film with a time axis"),
     ('type="projector"', 'type="angulararea"', 5, "emitter.* type='angulararea'> is not supported"),

@@ -82,9 +82,9 @@ def _wall_points(
     to_device = device - positions
     to_device /= np.maximum(np.linalg.norm(to_device, axis=-1, keepdims=True), 1e-300)
     interaction.wi = interaction.to_local(mi.Vector3f(*columns(to_device)))
-    if hits is not None and not hits.is_reached.all():  # seen from behind, where the wall is black
+    if hits is not None and not hits.is_reached.all():  # seen along the surface, where every BSDF is black
         is_dark = on_device(mi.UInt32, ~hits.is_reached.ravel()[index]) > 0
-        interaction.wi.z = dr.select(is_dark, -dr.abs(interaction.wi.z), interaction.wi.z)
+        interaction.wi = dr.select(is_dark, mi.Vector3f(1, 0, 0), interaction.wi)
     whole = np.floor(delay)
     points = WallPoints(
         interaction,

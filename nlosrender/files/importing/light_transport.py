@@ -7,6 +7,7 @@ sampling it adds none. So ``filter_bounces`` (``filter_depth`` - 1) of 3 is not 
 
 from __future__ import annotations
 
+from nlosrender.config.issues import did_you_mean
 from nlosrender.config.render import DEFAULT_TARGET_ERROR
 from nlosrender.files.importing.translation import Keys
 
@@ -153,3 +154,15 @@ def say_samples(keys: Keys, name: str, default: int | None = None) -> None:
         keys.translation.remarks["target_error"] = f"there {samples:_} samples per point"
     keys.drop(name, "render.target_error decides here; said beside it in a comment")
     keys.translation.put("render.target_error", DEFAULT_TARGET_ERROR, str(keys.translation.source))
+
+
+def refuse_film(keys: Keys) -> None:
+    """Refuse a film without a time axis."""
+    kind = keys.value("film.type", None)
+    if kind == "phasor_hdr_film":
+        keys.refuse("film.type", "stores frequencies, which are not written yet; use transient_hdr_film")
+        keys.drop_all({"film.wl_mean": "of frequencies", "film.wl_sigma": "of frequencies"})
+    elif kind != "transient_hdr_film":
+        hint = did_you_mean(kind, ("transient_hdr_film",))
+        keys.refuse("film.type", f"no film with a time axis; need transient_hdr_film. {hint}".rstrip(" ."))
+    keys.keep("film.type", "a histogram for each point")

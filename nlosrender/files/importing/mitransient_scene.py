@@ -7,7 +7,6 @@ film, sensor and laser, which that leaves out, are judged here key by key.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 from xml.etree.ElementTree import Element
@@ -18,23 +17,23 @@ from nlosrender.config.issues import did_you_mean
 from nlosrender.config.mitsuba_xml import DEFAULT_FILM, read_mitsuba_xml
 from nlosrender.config.xml_expansion import Expansion
 from nlosrender.config.xml_shapes import placement, shape_parameters
-from nlosrender.config.xml_tree import SceneElement
-from nlosrender.files.importing.light_transport import drop_noise, say_samples, translate_bounces, translate_film
+from nlosrender.files.importing.camera_scenes import (
+    OF_PROJECTORS,
+    refuse_other_emitters,
+    scan_type,
+    translate_pixels,
+    translate_view,
+)
+from nlosrender.files.importing.light_transport import refuse_film, say_samples, translate_bounces, translate_film
 from nlosrender.files.importing.scan_geometry import FlatWall, matrix_of, to_world_of
-from nlosrender.files.importing.translation import Found, Keys, Translation, plain, rounded
-from nlosrender.files.importing.xml_plugins import DEFAULT_DIFFUSE, plugin_of
+from nlosrender.files.importing.translation import Keys, Translation, plain, rounded
+from nlosrender.files.importing.xml_plugins import DEFAULT_DIFFUSE, found_keys, place_in, plugin_of
 from nlosrender.scene.pose import Float64
 
 NLOS = "transient_nlos_path"
 _CAMERAS = ("transient_path", "transient_prbvolpath")
 _METER = "nlos_capture_meter"
-_SCANS = {1: "single", 2: "confocal", 3: "exhaustive"}
-_PARTS = ("film", "sampler", "rfilter")  # elements whose keys are listed under their own names
 _PLACED = re.compile(r"(?:(?P<file>[^\n]*?), )?line (?P<line>\d+): (?P<message>.*)", re.DOTALL)
-_PERSPECTIVE = (
-    "a camera before an NLOS scene, whose points are what each pixel sees first: such captures are not read yet. "
-    f'Put <sensor type="{_METER}"> into the <shape> of the relay wall instead'
-)
 _SAY_LASER = "say it with --laser X,Y (m on the wall, from its centre), as programs that aim the laser do in code"
 
 
@@ -62,7 +61,7 @@ def translate_xml(translation: Translation, laser: tuple[float, float] | None) -
     sensor = _only(translation, kept, "sensor", (_METER, "perspective"))
     for other in sensors if len(kept) == 1 else ():
         if other is not kept[0]:
-            translation.line(_place(path, other), "sensor", other.get("type"), "dropped", "another camera")
+            translation.line(place_in(path, other), "sensor", other.get("type"), "dropped", "another camera")
     try:
         checked, _ = read_mitsuba_xml(path)
     except ValueError as error:
@@ -71,35 +70,13 @@ def translate_xml(translation: Translation, laser: tuple[float, float] | None) -
     if integrator is None or sensor is None:
         return
     if sensor.get("type") == "perspective" and integrator.get("type") == NLOS:
-        translation.refuse(_place(path, sensor), "sensor", "perspective", _PERSPECTIVE)
+        translate_pixels(translation, root, [integrator, sensor], laser)
     elif sensor.get("type") == "perspective":
-        _translate_camera(translation, Keys(translation, dict(_found(path, [integrator, sensor]))))
+        translate_view(translation, Keys(translation, dict(found_keys(path, [integrator, sensor]))))
     elif integrator.get("type") != NLOS:
-        translation.refuse(_place(path, sensor), "sensor", _METER, f"needs the integrator {NLOS}")
+        translation.refuse(place_in(path, sensor), "sensor", _METER, f"needs the integrator {NLOS}")
     elif checked is not None:
         _NlosScene(translation, root, checked, [integrator, sensor]).translate(laser)
-
-
-def _translate_camera(translation: Translation, keys: Keys) -> None:
-    """Judge a line-of-sight scene, which stays a Mitsuba scene: scene.mitsuba reads shapes, emitters and camera."""
-    path = translation.source
-    keys.keep("integrator.type", "capture.scan_type: line_of_sight")
-    translation.put("scene.mitsuba", translation.file_name(path.resolve(), is_absolute=False), str(path))
-    translation.put("capture.scan_type", "line_of_sight", str(path))
-    unwarped = keys.value("integrator.camera_unwarp", False, bool)
-    keys.take("integrator.camera_unwarp", "capture.account_first_and_last_bounces", not unwarped, changed=True)
-    depth = keys.value("integrator.max_depth", 6, int)
-    bounces = None if depth == -1 else depth - 1
-    keys.take("integrator.max_depth", "render.max_bounces", bounces, "0 is what emitters show of themselves")
-    _refuse_film(keys)
-    translate_film(keys, 2048)
-    keys.drop("integrator.discard_direct_light", "bounces have indices of their own in the file")
-    drop_noise(keys)
-    say_samples(keys, "sampler.sample_count")
-    for name in [name for name in keys.found if name.startswith(("sensor.", "film."))]:
-        keys.keep(name, f"read by scene.mitsuba, {path.name}")
-    keys.finish()
-    translation.note(f"shapes and emitters: read by scene.mitsuba, {path.name}, every time the capture is rendered")
 
 
 class _NlosScene:
@@ -110,13 +87,13 @@ class _NlosScene:
         self.emitters = list(root.iter("emitter"))
         self.pixels: dict[str, int] = {}  # by the axes of the sensor grid
         one = self.emitters[:1] if len(self.emitters) == 1 else []
-        self.keys = Keys(translation, dict(_found(self.path, [*parts, *one])))
+        self.keys = Keys(translation, dict(found_keys(self.path, [*parts, *one])))
         self.with_id = {part.get("id", ""): part for part in checked.iter() if part.tag in ("bsdf", "texture")}
         # nothing is taken out of shapes that are checked, so that both trees have them in the same order
         pairs = list(zip(root.iter("shape"), checked.iter("shape"), strict=True))
         self.wall = next((shape for written, shape in pairs if parts[1] in list(written)), None)
         self.hidden = [shape for _, shape in pairs if shape is not self.wall]
-        self.wall_place = _place(self.path, parts[1] if self.wall is None else self.wall)
+        self.wall_place = place_in(self.path, parts[1] if self.wall is None else self.wall)
         absolute = (item.get("value", "") for item in root.iter("string") if item.get("name") == "filename")
         self.absolute = {str(Path(name).resolve()) for name in absolute if Path(name).is_absolute()}
 
@@ -126,11 +103,11 @@ class _NlosScene:
         for part, what in (("integrator", "scene of a relay wall"), ("sensor", "relay_wall"), ("emitter", "the laser")):
             keys.keep(f"{part}.type", what)
         for shape in self.hidden:
-            self._hidden_item(_place(self.path, shape), shape)
+            self._hidden_item(place_in(self.path, shape), shape)
         scan = self._scan()
         self._laser(wall, scan, laser)
         translate_bounces(keys, of_ytal=False)
-        _refuse_film(keys)
+        refuse_film(keys)
         translate_film(keys, 2048)
         say_samples(keys, "sampler.sample_count")
         origin = keys.value("sensor.sensor_origin", [0.0, 0.0, 0.0])
@@ -174,7 +151,7 @@ class _NlosScene:
             parameters["filename"] = self._file(parameters["filename"])
         bsdf = None
         for child in shape:
-            key, at = child.get("name") or child.tag, _place(self.path, child)
+            key, at = child.get("name") or child.tag, place_in(self.path, child)
             if child.tag in ("bsdf", "ref"):
                 bsdf = plugin_of(child, self.with_id, self._file)
                 self.translation.line(at, f"{name}.bsdf", plain(bsdf), "taken", "bsdf")
@@ -195,10 +172,7 @@ class _NlosScene:
     def _scan(self) -> str:
         """Judge the kind of scan and its grids; return the kind."""
         keys = self.keys
-        kind = keys.value("integrator.capture_type", 1)
-        scan = _SCANS.get(kind) if isinstance(kind, int) else str(kind).lower()
-        if scan not in _SCANS.values():
-            keys.refuse("integrator.capture_type", f"need one of {', '.join(_SCANS.values())} or 1, 2, 3")
+        scan = scan_type(keys)
         by_point = "sensor.original_film_width" in keys and "sensor.original_film_height" in keys
         if by_point or keys.value("sensor.confocal", False, bool):
             scan = "confocal"
@@ -236,12 +210,7 @@ class _NlosScene:
     def _laser(self, wall: FlatWall | None, scan: str, given: tuple[float, float] | None) -> None:
         """Judge the laser: where it stands, and which point of a single scan it lights."""
         keys, translation = self.keys, self.translation
-        if [emitter.get("type") for emitter in self.emitters] != ["projector"]:
-            for emitter in self.emitters[-1:] or [self.checked]:
-                why = f"an NLOS scene is lit by one <emitter type='projector'>; it has {len(self.emitters)} emitters"
-                translation.refuse(_place(self.path, emitter), "emitter", emitter.get("type"), why)
-        if any(emitter.find("texture") is not None for emitter in self.emitters):
-            keys.refuse("emitter.irradiance", "a projected picture lights many points, need an <rgb>")
+        refuse_other_emitters(keys, self.emitters, self.checked)
         matrix = matrix_of(placement(self.emitters[0])) if self.emitters else np.eye(4)
         position = rounded(matrix[:3, 3])
         if "emitter.to_world" in keys:
@@ -255,9 +224,7 @@ class _NlosScene:
             translation.line("default", "emitter.to_world", None, "changed", remark)
         aim = self._laser_point(wall, matrix, given) if scan == "single" and wall is not None else ""
         keys.keep("emitter.to_world", f"capture.laser_position: {plain(position)}{aim}")
-        keys.drop("emitter.fov", "the laser is a point here, as it is there with nlos_laser_sampling")
-        for name in ("emitter.irradiance", "emitter.scale"):
-            keys.drop(name, "capture.laser_energy is 1 J: one factor on H, for each laser point")
+        keys.drop_all(OF_PROJECTORS)
 
     def _laser_point(self, wall: FlatWall, matrix: Float64, given: tuple[float, float] | None) -> str:
         """Set the point that the laser lights, and return what of it comes from the projector's transform."""
@@ -281,32 +248,6 @@ class _NlosScene:
         return ""
 
 
-def _refuse_film(keys: Keys) -> None:
-    kind = keys.value("film.type", None)
-    if kind == "phasor_hdr_film":
-        keys.refuse("film.type", "stores frequencies, which are not written yet; use transient_hdr_film")
-        keys.drop_all({"film.wl_mean": "of frequencies", "film.wl_sigma": "of frequencies"})
-    elif kind != "transient_hdr_film":
-        hint = did_you_mean(kind, ("transient_hdr_film",))
-        keys.refuse("film.type", f"no film with a time axis; need transient_hdr_film. {hint}".rstrip(" ."))
-    keys.keep("film.type", "a histogram for each point")
-
-
-def _found(path: Path, elements: list[Element], prefix: str = "") -> Iterator[tuple[str, Found]]:
-    """Yield the keys of integrator, sensor, film, sampler and emitter as ``film.width``, each with its place."""
-    for element in elements:
-        part = prefix or element.tag
-        values = shape_parameters(element)
-        yield f"{part}.type", Found(element.get("type", ""), _place(path, element))
-        for child in element:
-            name = child.get("name") or child.tag
-            if child.tag in _PARTS:
-                yield from _found(path, [child], child.tag)
-            else:
-                said = child.get("value", child.get("type", child.tag))
-                yield f"{part}.{name}", Found(values.get(name, said), _place(path, child))
-
-
 def _only(translation: Translation, elements: list[Element], tag: str, known: tuple[str, ...]) -> Element | None:
     """Return the one element of a kind; refuse none, several and unknown plugins."""
     for element in elements:
@@ -314,18 +255,12 @@ def _only(translation: Translation, elements: list[Element], tag: str, known: tu
         if kind not in known:
             hint = did_you_mean(kind, known)
             why = f"is not known here; need {' or '.join(known)}" + (f". {hint}" if hint else "")
-            translation.refuse(_place(translation.source, element), tag, kind, why)
+            translation.refuse(place_in(translation.source, element), tag, kind, why)
     if len(elements) != 1:
-        place = _place(translation.source, elements[1]) if elements else str(translation.source)
+        place = place_in(translation.source, elements[1]) if elements else str(translation.source)
         translation.refuse(place, tag, "", f"the scene has {len(elements)} of them, need one")
         return None
     return elements[0] if elements[0].get("type") in known else None
-
-
-def _place(path: Path, element: Element) -> str:
-    if not isinstance(element, SceneElement) or not element.line:
-        return str(path)
-    return f"{path.parent / element.file if element.file else path}:{element.line}"
 
 
 def _refuse_error(translation: Translation, error: ValueError) -> None:

@@ -1,16 +1,20 @@
-"""BSDFs and textures of a checked Mitsuba scene -> mappings of a configuration."""
+"""Plugins of a Mitsuba scene: their keys, and BSDFs and textures as mappings of a configuration."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
 from typing import Any
 from xml.etree.ElementTree import Element
 
 from nlosrender.config.xml_shapes import shape_parameters
 from nlosrender.config.xml_transforms import transform_steps
+from nlosrender.config.xml_tree import SceneElement
 from nlosrender.files.importing.scan_geometry import to_world_of
+from nlosrender.files.importing.translation import Found
 
+_PARTS = ("film", "sampler", "rfilter")  # elements whose keys are listed under their own names
 DEFAULT_DIFFUSE = {"type": "diffuse", "reflectance": 0.5}  # Mitsuba's, ours is white
 
 
@@ -49,3 +53,25 @@ def _spectrum(element: Element, file_name: Callable[[str], str]) -> Any:
     if len(pairs) == 1 and len(pairs[0]) == 1:
         return float(pairs[0][0])
     return {"type": "spectrum", "value": [[float(part) for part in pair] for pair in pairs]}
+
+
+def found_keys(path: Path, elements: list[Element], prefix: str = "") -> Iterator[tuple[str, Found]]:
+    """Yield the keys of integrator, sensor, film, sampler and emitter as ``film.width``, each with its place."""
+    for element in elements:
+        part = prefix or element.tag
+        values = shape_parameters(element)
+        yield f"{part}.type", Found(element.get("type", ""), place_in(path, element))
+        for child in element:
+            name = child.get("name") or child.tag
+            if child.tag in _PARTS:
+                yield from found_keys(path, [child], child.tag)
+            else:
+                said = child.get("value", child.get("type", child.tag))
+                yield f"{part}.{name}", Found(values.get(name, said), place_in(path, child))
+
+
+def place_in(path: Path, element: Element) -> str:
+    """Return file and line of an element of the scene in the file ``path``."""
+    if not isinstance(element, SceneElement) or not element.line:
+        return str(path)
+    return f"{path.parent / element.file if element.file else path}:{element.line}"

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from nlosrender.errors import ConfigError
 from nlosrender.scene.pixel_points import NO_SHAPE, FirstHits, PixelPoints
@@ -67,9 +67,9 @@ def _first_hits(view: BuiltView, origin: Float64, targets: Float64) -> FirstHits
     dr.eval(si)
     is_met = np.array(si.shape != None, dtype=bool).ravel()  # noqa: E711
     registry = _registry(view.scene.shapes_dr())
-    shapes = [
-        registry.index(index) if met else NO_SHAPE for index, met in zip(_registry(si.shape), is_met, strict=True)
-    ]
+    order = np.argsort(registry)
+    found = order[np.searchsorted(registry, np.where(is_met, _registry(si.shape), registry[0]), sorter=order)]
+    shapes = np.where(is_met, found, NO_SHAPE)
     positions, normals = (np.array(part, dtype=np.float64).T for part in (si.p, si.n))
     facing = -np.einsum("nx,nx->n", normals, flat)
     normals = np.where(is_met[:, None], normals * np.sign(facing + (facing == 0))[:, None], -flat)
@@ -83,14 +83,14 @@ def _first_hits(view: BuiltView, origin: Float64, targets: Float64) -> FirstHits
         positions=positions.reshape(directions.shape) * unit,
         normals=normals.reshape(directions.shape),
         is_front=(facing > 0).reshape(rows),
-        shapes=np.array(shapes, dtype=np.int64).reshape(rows),
+        shapes=shapes.reshape(rows),
         is_reached=is_met.reshape(rows),
         interactions=si,
     )
 
 
-def _registry(shapes: mi.ShapePtr) -> list[int]:
-    return [int(index) for index in np.array(dr.reinterpret_array(mi.UInt32, shapes)).ravel()]
+def _registry(shapes: mi.ShapePtr) -> NDArray[np.int64]:
+    return np.array(dr.reinterpret_array(mi.UInt32, shapes), dtype=np.int64).ravel()
 
 
 def _lit(view: BuiltView, laser: Float64, points: ArrayLike, keys: Sequence[str]) -> FirstHits:

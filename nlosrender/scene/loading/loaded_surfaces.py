@@ -13,7 +13,7 @@ import numpy as np
 from nlosrender.errors import ConfigError
 from nlosrender.scene.loading.exact_blend import NAME
 from nlosrender.scene.loading.materials import LOADED
-from nlosrender.scene.loading.mitsuba_shapes import triangles_of
+from nlosrender.scene.loading.mitsuba_shapes import load_mesh, triangles_of
 from nlosrender.scene.meshes.triangle_mesh import TriangleMesh
 from nlosrender.scene.pose import Float64, Pose
 from nlosrender.scene.surfaces import ShapeDescription, Surface
@@ -37,10 +37,11 @@ def loaded_surfaces(scene: object, frame: Pose) -> tuple[Surface, ...]:
     if scene.emitters():
         message = f"has {len(scene.emitters())} emitters, and the laser is the only light; take them out."
         raise ConfigError.at("scene", message)
-    return tuple(_surface(shape, frame, index) for index, shape in enumerate(scene.shapes()))
+    return tuple(loaded_surface(shape, frame, index) for index, shape in enumerate(scene.shapes()))
 
 
-def _surface(shape: mi.Shape, frame: Pose, index: int) -> Surface:
+def loaded_surface(shape: mi.Shape, frame: Pose, index: int) -> Surface:
+    """Return a shape [m] in a local frame; ``index`` is its number in the scene. Errors as of ``loaded_surfaces``."""
     key = f"scene.{shape.id() or f'{shape.class_name()}-{index}'}"
     for obstacle in _obstacles(shape):
         raise ConfigError.at(key, obstacle)
@@ -48,11 +49,11 @@ def _surface(shape: mi.Shape, frame: Pose, index: int) -> Surface:
     if shape.class_name() == "Rectangle":  # a mesh, which does not show its vertices
         uvs = (CORNERS[:, :2] + 1) / 2
         mesh = TriangleMesh(CORNERS.astype(np.float64), np.array([[0, 1, 2], [0, 2, 3]]), uvs)
-        placed: TriangleMesh | ShapeDescription = mesh.transformed(to_local @ _to_world(shape))
+        placed: TriangleMesh | ShapeDescription = mesh.transformed(to_local @ to_world_of_shape(shape))
     elif shape.is_mesh():
         placed = triangles_of(shape).transformed(to_local)
     else:
-        description = {"type": ROUND[shape.class_name()], "to_world": to_local @ _to_world(shape)}
+        description = {"type": ROUND[shape.class_name()], "to_world": to_local @ to_world_of_shape(shape)}
         placed = ShapeDescription(description | {"flip_normals": bool(shape.has_flipped_normals())})
     return Surface(shape.id() or key, key, placed, {LOADED: shape.bsdf()})
 
@@ -70,12 +71,22 @@ def _obstacles(shape: mi.Shape) -> Iterator[str]:
         yield "is filled with a medium; light travels straight between surfaces here."
     if shape.is_mesh() and shape.has_flipped_normals():
         yield "has flip_normals; turn its faces round instead."
-    if "to_world" in parameters and np.linalg.det(_to_world(shape)[:3, :3]) <= 0:
+    if "to_world" in parameters and np.linalg.det(to_world_of_shape(shape)[:3, :3]) <= 0:
         yield "is mirrored by its to_world; use a rotation and a scale."
     bsdf = shape.bsdf()
     if "BlendBSDF[" in str(bsdf) and bool(bsdf.flags() & mi.BSDFFlags.Delta):
         yield f"blends a mirror: Mitsuba's blendbsdf samples it wrongly; use type: {NAME}, with the same parameters."
 
 
-def _to_world(shape: mi.Shape) -> Float64:
+def with_vertices(shape: mi.Shape, index: int) -> mi.Shape:
+    """Return a shape, but Mitsuba's rectangle, a mesh that does not show its vertices, as a mesh that does."""
+    if shape.class_name() != "Rectangle":
+        return shape
+    surface = loaded_surface(shape, Pose.identity(), index)
+    assert isinstance(surface.shape, TriangleMesh)
+    return load_mesh(surface.shape, surface, shape.bsdf())
+
+
+def to_world_of_shape(shape: mi.Shape) -> Float64:
+    """Return the (4, 4) matrix of a shape that has one."""
     return np.array(mi.traverse(shape)["to_world"].matrix, dtype=np.float64).reshape(4, 4)

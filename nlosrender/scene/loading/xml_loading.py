@@ -41,8 +41,12 @@ _PARAMETER = re.compile(r'^\s*- \w+ "([^"]+)"', re.MULTILINE)
 _LINE = re.compile(r"(?:[Ee]rror while loading |[Ww]hile loading |[Aa]t |at )?string \(line (\d+), col \d+\)")
 
 
-def load_xml_scene(path: Path) -> tuple[mi.Scene, tuple[MeshReport, ...], tuple[str, ...]]:
+def load_xml_scene(
+    path: Path, *, joins_meshes: bool = True
+) -> tuple[mi.Scene, tuple[MeshReport, ...], tuple[str, ...]]:
     """Load a Mitsuba scene; the backend has to be started before.
+
+    ``joins_meshes``: meshes of one BSDF become one shape.
 
     Returns
     -------
@@ -71,13 +75,13 @@ def load_xml_scene(path: Path) -> tuple[mi.Scene, tuple[MeshReport, ...], tuple[
             check_image(image)
     except ValueError as error:
         raise ConfigError.at(WHERE, f"{path}: {error}.") from error
-    scene, left_out = _loaded(root, path)
+    scene, left_out = _loaded(root, path, joins_meshes)
     for shape in scene.shapes():
         _check_bounds(shape, path)
     return scene, tuple(meshes), (*warnings, *left_out)
 
 
-def _loaded(root: Element, path: Path) -> tuple[mi.Scene, tuple[str, ...]]:
+def _loaded(root: Element, path: Path, joins_meshes: bool) -> tuple[mi.Scene, tuple[str, ...]]:
     """Return the scene, and a sentence for each plugin with parameters that it does not have, which are left out."""
     warnings: list[str] = []
     for element in root.iter("bsdf"):
@@ -86,7 +90,7 @@ def _loaded(root: Element, path: Path) -> tuple[mi.Scene, tuple[str, ...]]:
     while True:
         text, elements = numbered_text(root)
         try:
-            return mi.load_string(text), tuple(warnings)
+            return mi.load_string(text, optimize=joins_meshes), tuple(warnings)
         except (RuntimeError, TypeError, ValueError) as error:
             unknown = _UNKNOWN.search(str(error))
             names = _PARAMETER.findall(str(error))
