@@ -9,7 +9,7 @@ __version__ = "0.1.0"
 if TYPE_CHECKING:
     from nlosrender.api.configuration import Configuration, Validation, load, plan, validate
     from nlosrender.api.opened_capture import Capture
-    from nlosrender.api.opened_capture import open_file as open
+    from nlosrender.api.opened_capture import Capture as open
     from nlosrender.api.renders import render, render_all
     from nlosrender.api.transient_light import Transient, transient
     from nlosrender.engine.backend.start import start_backend
@@ -47,7 +47,7 @@ def __getattr__(name: str) -> object:
     for place, names in _PLACES.items():
         if name in names:
             module = importlib.import_module(f"nlosrender.{place}")
-            return getattr(module, "open_file" if name == "open" else name)
+            return getattr(module, "Capture" if name == "open" else name)
     raise AttributeError(f"module 'nlosrender' has no attribute {name!r}")
 
 

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nlosrender.errors import FileError
+from nlosrender.files.layout import STOKES
 from nlosrender.files.reading.reader import BAND_BYTES, StoredCapture
 from nlosrender.files.reading.scan import moved, wall_frame
 from nlosrender.files.reading.stored_header import intensity
@@ -94,6 +95,22 @@ def point_histograms(capture: StoredCapture, laser: tuple[int, int], pixel: tupl
     """
     block = capture.read_block(lasers=laser, sensors=pixel)
     return intensity(capture.header, block[:, :, 0, 0, 0, 0].astype(np.float64))
+
+
+def laser_energies(capture: StoredCapture, laser: tuple[int, ...]) -> Float64:
+    """Return the sums over the samples of one laser point (bounce,); colours add up, of Stokes components the first.
+
+    Raises
+    ------
+    FileError
+        The file is damaged.
+    """
+    header = capture.header
+    channels = 1 if header.attributes.get("channels") == STOKES else header.sizes["channel"]
+    total = np.zeros(len(header.bounce_indices))
+    for _, band in capture.bands((laser[0], laser[1])):
+        total += band[:channels].sum(axis=(0, 2, 3, 4), dtype=np.float64)
+    return total
 
 
 def row_over_time(capture: StoredCapture, laser: tuple[int, int], row: int) -> Float64:

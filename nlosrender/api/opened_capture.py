@@ -6,22 +6,20 @@ import html
 import os
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from nlosrender.analysis.laser_view import point_histograms, wall_frames
+from nlosrender.analysis.laser_view import laser_energies, point_histograms, wall_frames
 from nlosrender.analysis.summary import summarise
+from nlosrender.api.arguments import Point, bounce_indices, check_place, laser_point, nearest_point, sensor_for
 from nlosrender.api.progress_bar import Wanted, reported, warn_caller
-from nlosrender.capture.bounces import LINE_OF_SIGHT
 from nlosrender.config.mapping_load import Changes, change_texts
 from nlosrender.constants import SPEED_OF_LIGHT, opl_to_seconds
 from nlosrender.errors import OptionError
-from nlosrender.files import layout
 from nlosrender.files.attributes import json_object
-from nlosrender.files.reading.reader import Part, StoredCapture, open_capture, read_header
-from nlosrender.files.reading.scan import read_scan
+from nlosrender.files.reading.reader import Part, open_capture, read_header
 from nlosrender.files.reading.stored_header import StoredHeader
 
 if TYPE_CHECKING:
@@ -29,36 +27,29 @@ if TYPE_CHECKING:
 
     from nlosrender.analysis.drawn_picture import Picture
     from nlosrender.analysis.reconstruction.reconstruct import Reconstruction
-    from nlosrender.config.sensor import SensorConfig
     from nlosrender.rendering.render_report import RenderReport
 
-Point = tuple[int, int]  # row, column
 Dataset = Literal["data", "variance"]
 
 
-def open_file(path: str | os.PathLike[str]) -> Capture:
-    """Open a capture file by any writer; its metadata are read, its samples are not.
+class Capture:
+    """A capture file by any writer; ``nlosrender.open(path)`` is ``Capture(path)``, and :func:`render` returns one.
+
+    The file is opened for each call and closed after it, so that a render may replace it meanwhile.
+
+    Parameters
+    ----------
+    path
+        The file; its metadata are read, its samples are not.
+    report
+        What the render reported; None for a file that was opened.
 
     Raises
     ------
     FileError
-        The file is missing, damaged or not a capture.
-    """
-    return Capture(path)
-
-
-class Capture:
-    """A capture file; made by :func:`open` and :func:`render`.
-
-    The file is opened for each call and closed after it, so that a render may replace it meanwhile. Errors of all
-    methods: FileError, where the file cannot be read or is damaged; OptionError, where it has no such part.
-
-    Attributes
-    ----------
-    path
-        The file.
-    report
-        What the render reported; None for a file that was opened.
+        Here and in all methods: the file is missing, damaged or not a capture.
+    OptionError
+        In methods: it has no such part.
     """
 
     def __init__(self, path: str | os.PathLike[str], report: RenderReport | None = None):
@@ -124,7 +115,7 @@ class Capture:
             keeps its axis, and a confocal capture has one laser row and column.
         """
         with open_capture(self.path) as stored:
-            return stored.read_block(lasers, sensors, _bounce_indices(stored.header, bounces), dataset)
+            return stored.read_block(lasers, sensors, bounce_indices(stored.header, bounces), dataset)
 
     def xarray(
         self,
@@ -135,12 +126,12 @@ class Capture:
     ) -> DataArray:
         """Read samples as ``numpy`` does, with named dimensions and coordinates in metres and seconds.
 
-        Needs the optional package ``xarray``. See ``api.named_samples`` for the coordinates.
+        Needs the optional package ``xarray``; ``api.named_samples`` has the coordinates.
         """
         from nlosrender.api.named_samples import named_samples
 
         with open_capture(self.path) as stored:
-            indices = _bounce_indices(stored.header, bounces)
+            indices = bounce_indices(stored.header, bounces)
             return named_samples(stored, lasers, sensors, indices, dataset)
 
     def frame(self, t: float, *, laser: Point | None = None) -> NDArray[np.float64]:
@@ -155,7 +146,7 @@ class Capture:
                 raise OptionError(f"t: got {t!r}, need a time from {start:.6g} to below {end:.6g} s")
             position = (t * SPEED_OF_LIGHT - header.start_opl) / header.bin_width_opl
             index = min(max(int(position), 0), header.n_bins - 1)
-            return wall_frames(stored, _laser(header, laser), [slice(index, index + 1)])[0]
+            return wall_frames(stored, laser_point(header, laser), [slice(index, index + 1)])[0]
 
     def histogram(
         self, x: float | None = None, y: float | None = None, *, pixel: Point | None = None, laser: Point | None = None
@@ -173,9 +164,9 @@ class Capture:
         """
         with open_capture(self.path) as stored:
             header = stored.header
-            chosen = _nearest(stored, x, y) if pixel is None else pixel
-            _check("pixel", chosen, header.sensor_grid)
-            return point_histograms(stored, _laser(header, laser), chosen)
+            chosen = nearest_point(stored, x, y) if pixel is None else pixel
+            check_place("pixel", chosen, header.sensor_grid)
+            return point_histograms(stored, laser_point(header, laser), chosen)
 
     def energy(self) -> dict[str, float]:
         """Return the sum of all samples by bounce, such as ``{"3": 0.36}``; colours add up, of Stokes vectors I.
@@ -187,19 +178,23 @@ class Capture:
             known = json_object(header.attributes.get("energy"))
             if known and all(isinstance(value, (int, float)) for value in known.values()):
                 return {name: float(value) for name, value in known.items()}
-            channels = 1 if header.attributes.get("channels") == layout.STOKES else header.sizes["channel"]
-            total = np.zeros(len(header.bounce_indices))
-            for laser in np.ndindex(header.sizes["laser_y"], header.sizes["laser_x"]):
-                for _, band in stored.bands((laser[0], laser[1])):
-                    total += band[:channels].sum(axis=(0, 2, 3, 4), dtype=np.float64)
-            return {
-                header.bounce_name(index): float(sum_) for index, sum_ in zip(header.bounce_indices, total, strict=True)
-            }
+            sums = [
+                laser_energies(stored, laser) for laser in np.ndindex(header.sizes["laser_y"], header.sizes["laser_x"])
+            ]
+            return dict(zip(map(header.bounce_name, header.bounce_indices), np.sum(sums, axis=0).tolist(), strict=True))
 
     # --- what the commands of these names do ---
 
     def plot(
-        self, laser: Point | None = None, pixel: Point | None = None, ideal: str | os.PathLike[str] | None = None
+        self,
+        laser: Point | None = None,
+        pixel: Point | None = None,
+        ideal: str | os.PathLike[str] | None = None,
+        *,
+        theme: str = "dark",
+        size: tuple[float, float] = (14.0, 7.6),
+        dpi: float = 130.0,
+        shared_scale: bool = False,
     ) -> Picture:
         """Draw the wall over time, one histogram, the light of each bounce, one row over time.
 
@@ -211,10 +206,16 @@ class Capture:
             (row, column) of the sensor point whose histogram is drawn; None: the brightest.
         ideal
             Of counts: the capture that they were measured from.
+        theme, size, dpi
+            ``dark`` or ``light``; width and height in inches; pixels per inch where the picture is saved.
+        shared_scale
+            Draw the wall's frames on one colour scale; else each has its own.
         """
+        from nlosrender.analysis.picture_style import PictureStyle
         from nlosrender.analysis.plots import capture_picture
 
-        return capture_picture(self.path, laser, pixel, None if ideal is None else Path(ideal))
+        look = PictureStyle(theme, size, dpi, shared_scale)
+        return capture_picture(self.path, laser, pixel, None if ideal is None else Path(ideal), look)
 
     def measure(
         self,
@@ -246,10 +247,8 @@ class Capture:
 
         Raises
         ------
-        ConfigError
-            The sensor has mistakes or does not fit the capture.
-        FileError
-            The file cannot be measured, or ``out`` not be written.
+        ConfigError, FileError
+            The sensor has mistakes or does not fit the capture; the file cannot be measured, or ``out`` not be written.
         """
         from nlosrender.files.measured import CORRECTABLE, measure_capture
 
@@ -262,14 +261,32 @@ class Capture:
             )
         return Capture(target)
 
-    def reconstruct(self, method: str = "phasor", *, progress: Wanted = False, **settings: Any) -> Reconstruction:
-        """Reconstruct the hidden scene: ``phasor`` fields, or ``backprojection``.
+    def reconstruct(
+        self,
+        method: str = "phasor",
+        *,
+        wavelength: float | None = None,
+        cycles: float = 5.0,
+        volume_center: tuple[float, float, float] | None = None,
+        volume_size: tuple[float, ...] | None = None,
+        voxels: int | None = None,
+        voxel_size: float | None = None,
+        bounces: int | str | None = None,
+        progress: Wanted = False,
+    ) -> Reconstruction:
+        """Reconstruct the hidden scene by ``method``: ``phasor`` fields, or ``backprojection``.
 
         Parameters
         ----------
-        method, settings
-            Fields of ``ReconstructionSettings``: ``wavelength``, ``volume_center``, ``volume_size`` and ``voxel_size``
-            in m, ``cycles``, ``voxels``, ``bounces``.
+        wavelength, cycles
+            Of the virtual wave [m] and in its pulse; None: the shortest without aliasing.
+        volume_center, volume_size
+            Middle and edges of the volume [m]: along the wall, up, away from it; one edge counts for all. None: where
+            the file says that the hidden scene is.
+        voxels, voxel_size
+            Along the longest edge, or the edge of one [m]; None: 128.
+        bounces
+            3 or ``all``; None: 3 where the file has it apart.
         progress
             As of :func:`render`.
 
@@ -280,66 +297,9 @@ class Capture:
         """
         from nlosrender.analysis.reconstruction.reconstruct import ReconstructionSettings, reconstruct_capture
 
-        chosen = ReconstructionSettings(method, **settings)
+        light = None if bounces is None else str(bounces)
+        chosen = ReconstructionSettings(
+            method, wavelength, cycles, volume_center, volume_size, voxels, voxel_size, light
+        )
         with reported(progress, "reconstruct") as told:
             return reconstruct_capture(self.path, chosen, told, warn_caller)
-
-
-def sensor_for(
-    path: Path, sensor: str | os.PathLike[str] | Mapping[str, object] | None, changes: Sequence[str]
-) -> SensorConfig | None:
-    """Return the sensor that is described; None: that of the capture file, as it is. Errors as of ``load_sensor``."""
-    from nlosrender.config.sensor_load import load_sensor
-    from nlosrender.files.measured import sensor_of
-
-    if sensor is None and not changes:
-        return None
-    known = sensor_of(read_header(path)) if sensor is None else None
-    return load_sensor(os.fspath(sensor) if isinstance(sensor, os.PathLike) else sensor, known, changes)
-
-
-def _bounce_indices(header: StoredHeader, bounces: int | Sequence[int] | None) -> tuple[int, ...] | None:
-    """Return the indices of bounce numbers on the file's bounce axis; None: all that hold light."""
-    if bounces is None:
-        return None
-    wanted = [bounces] if isinstance(bounces, int) else list(bounces)
-    if header.split_bounces is False:
-        raise OptionError(f"bounces: got {wanted}, but {header.path} holds the sum of all; leave it away")
-    known = [index + header.first_bounce for index in header.bounce_indices]
-    if not wanted or (missing := [bounce for bounce in wanted if bounce not in known]):
-        raise OptionError(f"bounces: got {missing if wanted else wanted}, need some of {', '.join(map(str, known))}")
-    return tuple(bounce - header.first_bounce for bounce in wanted)
-
-
-def _laser(header: StoredHeader, laser: Point | None) -> Point:
-    """Return a laser point as ``plot`` chooses it."""
-    grid = header.sizes["laser_y"], header.sizes["laser_x"]
-    chosen = (grid[0] // 2, grid[1] // 2) if laser is None else laser
-    _check("laser", chosen, grid)
-    return chosen
-
-
-def _check(name: str, point: Point, grid: Point) -> None:
-    if not all(0 <= index < length for index, length in zip(point, grid, strict=True)):
-        need = f"a row from 0 to {grid[0] - 1} and a column from 0 to {grid[1] - 1}"
-        raise OptionError(f"{name}: got {point[0]},{point[1]}, need {need}")
-
-
-def _nearest(stored: StoredCapture, x: float | None, y: float | None) -> Point:
-    """Return row and column of the sensor point nearest to a place on a flat wall [m]."""
-    if x is None or y is None:
-        raise OptionError("histogram: need x and y [m], or pixel=(row, column)")
-    scan = read_scan(stored) if stored.header.scan_type != LINE_OF_SIGHT else None
-    if scan is None or not scan.planar:
-        what = "a camera" if scan is None else "a curved wall"
-        raise OptionError(f"x, y: {what} has no such coordinates; give pixel=(row, column)")
-    points = scan.sensors[..., :2]
-    rows, columns = points.shape[:2]
-    size = stored.header.sensor_grid_size or tuple(np.ptp(points, axis=(0, 1)))
-    half = np.array(size) / (2 * np.array([columns, rows]))  # of the cell around a point
-    low, high = points.min(axis=(0, 1)) - half, points.max(axis=(0, 1)) + half
-    if not (low[0] <= x <= high[0] and low[1] <= y <= high[1]):
-        need = f"x from {low[0]:.6g} to {high[0]:.6g} and y from {low[1]:.6g} to {high[1]:.6g} m"
-        raise OptionError(f"x, y: got {x:g}, {y:g}, off the sensor grid; need {need}")
-    row, column = np.unravel_index(int(((points - (x, y)) ** 2).sum(axis=-1).argmin()), (rows, columns))
-    return int(row), int(column)

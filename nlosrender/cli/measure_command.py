@@ -55,7 +55,7 @@ def measure(
     if output is None:
         raise typer.BadParameter("missing, the file to write", param_hint="--output")
 
-    from nlosrender.api.opened_capture import sensor_for
+    from nlosrender.api.arguments import sensor_for
     from nlosrender.files.measured import CORRECTABLE, measure_capture
 
     refuse_folder(output, "counts.hdf5")

@@ -45,7 +45,7 @@ def change_texts(changes: Changes | Iterable[str]) -> tuple[str, ...]:
         A value is none that a YAML holds; its key is named.
     """
     if not isinstance(changes, Mapping):
-        return tuple(changes)
+        return (changes,) if isinstance(changes, str) else tuple(changes)
     document = Document("changes", Path.cwd(), "", places={(): Place("changes", "changes")})
     values = {str(key): _plain(value, tuple(str(key).split(".")), document) for key, value in changes.items()}
     if document.issues:
@@ -69,7 +69,7 @@ def _plain(value: object, path: KeyPath, document: Document) -> Any:
         return _unread(f"got {value}, need a finite number.", path, document)
     if value is None or isinstance(value, (bool, int, float, str)):
         return value
-    return _unread(f"got a {type(value).__name__}, need numbers, text, lists and mappings.", path, document)
+    return _unread(f"got {type(value).__name__}, need numbers, text, lists and mappings.", path, document)
 
 
 def _mapping(values: Mapping[Any, object], path: KeyPath, document: Document) -> dict[str, Any]:

@@ -22,6 +22,7 @@ from nlosrender.errors import ConfigError, FileError, OptionError
 Z = {"type": "letters", "text": "Z", "height": 0.8, "center": [0, 0, 1], "normal": [0, 0, -1]}
 SCENE = flat_wall(Z, scan="exhaustive", lasers=(2, 4), bins=(1.5, 0.02, 150), engine="auto", spp=None, max_bounces=4)
 SCENE["render"] |= {"target_error": 0.1}
+NX = "capture.laser_grid.nx"
 SWEEP = flat_wall(Z, sensors=(2, 3), spp=16) | {"sweep": {"keys": {"capture.laser_point": [[0.1, 0.0], [0.3, -0.2]]}}}
 
 
@@ -98,7 +99,7 @@ def test_changes_are_those_of_set(changes: Any, tmp_path: Path) -> None:
     ("changed", "message"),
     [
         ({"render": {"spp": float("nan")}}, r"dict: render\.spp: got nan, need a finite number"),
-        ({"time_axis": {"n_bins": object()}}, r"dict: time_axis\.n_bins: got a object, need numbers"),
+        ({"time_axis": {"n_bins": object()}}, r"dict: time_axis\.n_bins: got object, need numbers"),
         ({"time_axis": {3: 4}}, r"dict: time_axis: got 3 as a key, need text"),
         ({"capture": {"sensor_gird": {}}}, r"dict: capture\.sensor_gird: unknown key\. Did you mean sensor_grid"),
         ({"scene": {"relay_wall": {"type": "rectangle", "width": 0}}}, r"dict: scene\.relay_wall\.width: got 0"),
@@ -273,6 +274,8 @@ def test_listed_points_have_places_of_their_own(tmp_path: Path) -> None:
         (lambda capture: capture.histogram(float("nan"), 0), "off the sensor grid"),
         (lambda capture: capture.histogram(pixel=(-1, 0)), "pixel: got -1,0"),
         (lambda capture: capture.plot(laser=(0, 2)), "--laser: got 0,2"),
+        (lambda capture: capture.plot(theme="lite"), "--theme: got 'lite'"),
+        (lambda capture: capture.reconstruct(bounces=5), "--bounces: got '5'"),
         (lambda capture: capture.measure("m.hdf5", "spad-532", correct=["noise"]), "correct: got 'noise'"),
         (lambda capture: capture.reconstruct("fk"), "--method: got 'fk'"),
     ],

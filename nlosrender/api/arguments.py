@@ -1,0 +1,82 @@
+"""What callers of a capture's methods name: bounces, points, a sensor."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from nlosrender.capture.bounces import LINE_OF_SIGHT
+from nlosrender.errors import OptionError
+from nlosrender.files.reading.reader import StoredCapture, read_header
+from nlosrender.files.reading.scan import read_scan
+from nlosrender.files.reading.stored_header import StoredHeader
+
+if TYPE_CHECKING:
+    from nlosrender.config.sensor import SensorConfig
+
+Point = tuple[int, int]  # row, column
+
+
+def sensor_for(
+    path: Path, sensor: str | os.PathLike[str] | Mapping[str, object] | None, changes: Sequence[str]
+) -> SensorConfig | None:
+    """Return the sensor that is described; None: that of the capture file, as it is. Errors as of ``load_sensor``."""
+    from nlosrender.config.sensor_load import load_sensor
+    from nlosrender.files.measured import sensor_of
+
+    if sensor is None and not changes:
+        return None
+    known = sensor_of(read_header(path)) if sensor is None else None
+    return load_sensor(os.fspath(sensor) if isinstance(sensor, os.PathLike) else sensor, known, changes)
+
+
+def bounce_indices(header: StoredHeader, bounces: int | Sequence[int] | None) -> tuple[int, ...] | None:
+    """Return the indices of bounce numbers on the file's bounce axis; None: all that hold light."""
+    if bounces is None:
+        return None
+    wanted = [bounces] if isinstance(bounces, int) else list(bounces)
+    if header.split_bounces is False:
+        raise OptionError(f"bounces: got {wanted}, but {header.path} holds the sum of all; leave it away")
+    known = [index + header.first_bounce for index in header.bounce_indices]
+    if not wanted or (missing := [bounce for bounce in wanted if bounce not in known]):
+        raise OptionError(f"bounces: got {missing if wanted else wanted}, need some of {', '.join(map(str, known))}")
+    return tuple(bounce - header.first_bounce for bounce in wanted)
+
+
+def laser_point(header: StoredHeader, laser: Point | None) -> Point:
+    """Return a laser point as ``plot`` chooses it."""
+    grid = header.sizes["laser_y"], header.sizes["laser_x"]
+    chosen = (grid[0] // 2, grid[1] // 2) if laser is None else laser
+    check_place("laser", chosen, grid)
+    return chosen
+
+
+def check_place(name: str, point: Point, grid: Point) -> None:
+    """Raise OptionError for a point that a grid of (rows, columns) does not have."""
+    if not all(0 <= index < length for index, length in zip(point, grid, strict=True)):
+        need = f"a row from 0 to {grid[0] - 1} and a column from 0 to {grid[1] - 1}"
+        raise OptionError(f"{name}: got {point[0]},{point[1]}, need {need}")
+
+
+def nearest_point(stored: StoredCapture, x: float | None, y: float | None) -> Point:
+    """Return row and column of the sensor point nearest to a place on a flat wall [m]."""
+    if x is None or y is None:
+        raise OptionError("histogram: need x and y [m], or pixel=(row, column)")
+    scan = read_scan(stored) if stored.header.scan_type != LINE_OF_SIGHT else None
+    if scan is None or not scan.planar:
+        what = "a camera" if scan is None else "a curved wall"
+        raise OptionError(f"x, y: {what} has no such coordinates; give pixel=(row, column)")
+    points = scan.sensors[..., :2]
+    rows, columns = points.shape[:2]
+    size = stored.header.sensor_grid_size or tuple(np.ptp(points, axis=(0, 1)))
+    half = np.array(size) / (2 * np.array([columns, rows]))  # of the cell around a point
+    low, high = points.min(axis=(0, 1)) - half, points.max(axis=(0, 1)) + half
+    if not (low[0] <= x <= high[0] and low[1] <= y <= high[1]):
+        need = f"x from {low[0]:.6g} to {high[0]:.6g} and y from {low[1]:.6g} to {high[1]:.6g} m"
+        raise OptionError(f"x, y: got {x:g}, {y:g}, off the sensor grid; need {need}")
+    row, column = np.unravel_index(int(((points - (x, y)) ** 2).sum(axis=-1).argmin()), (rows, columns))
+    return int(row), int(column)
