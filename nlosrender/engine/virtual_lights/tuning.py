@@ -44,9 +44,6 @@ class VirtualLightTuning:
     # Height of a box over its edge: a surface at 45 degrees to both sides rises by two. Half: 4 to 7 % more clusters at
     # the same error; twice: 2 % fewer (waves on its side, two sheets).
     cluster_box_height: float = 5.0
-    # Width of the classes of slopes in rough boxes, at scale 1. Crumpled: 7.2 / 7.6 / 7.5 % with 2074 / 964 / 935
-    # clusters at half / as is / twice; waves: no box is rough.
-    slope_class: float = 3.0
     # Variance of the slopes in a box, at scale 1, above which three facets stand for it if laser points lie in several
     # places. Crumpled, confocal, 3 %: energy 0.989 / 0.998 / 0.999 with 4481 / 2301 / 3035 patches at 4 times / as is /
     # a quarter, 0.937 with one facet each.

@@ -49,19 +49,27 @@ class AreaMoments(StructOfArrays):
     facing: Int64  # (n,) twice the axis, + 1 where normals go along it
     in_box: Float64  # (n, 3) centres [engine units]: across the box in two directions, and upright
     places: Float64  # (n, 10) area, area times position, and times the products of its components, as ``PAIRS``
-    slopes: Float64  # (n, 2) mean normals: their components across per that upright
     light: Float64  # (n, 9) area times geometric normal times shading normal, transposed
+    lit_places: Float64  # (n, 15) see ``_lit_places``, or (n, 0)
     boxes: Float64  # (n,) how many boxes of scale 1 they cover
     representative: Int64  # (n,) a member, drawn by area
 
     @classmethod
     def of(
-        cls, elements: Elements, normals: Float64, areas: Float64, allowed: Float64, tuning: VirtualLightTuning
+        cls,
+        elements: Elements,
+        normals: Float64,
+        areas: Float64,
+        allowed: Float64,
+        tuning: VirtualLightTuning,
+        *,
+        with_lit_places: bool,
     ) -> AreaMoments:
         """Return every element as a group of its own; parameters as for ``Merger``."""
         centres, index = centroids(elements.corners), np.arange(len(areas))
         upright = np.abs(normals).argmax(axis=1)
-        light = areas[:, None, None] * normals[:, :, None] * elements.shading_normals[:, None, :]
+        light = (areas[:, None, None] * normals[:, :, None] * elements.shading_normals[:, None, :]).reshape(-1, 9)
+        places = _place_moments(elements.corners, centres, areas)
         return cls(
             shapes=elements.shapes,
             scales=_scales(allowed),
@@ -69,9 +77,9 @@ class AreaMoments(StructOfArrays):
             levels=allowed**2 / elements.distances,
             facing=2 * upright + (normals[index, upright] > 0),
             in_box=_in_box(centres, upright),
-            places=_place_moments(elements.corners, centres, areas),
-            slopes=_slopes(normals, upright),
-            light=light.reshape(-1, 9),
+            places=places,
+            light=light,
+            lit_places=_lit_places(light, places, upright) if with_lit_places else np.empty((len(areas), 0)),
             boxes=covered_boxes(normals, areas, allowed, tuning),
             representative=index,
         )
@@ -90,17 +98,16 @@ class AreaMoments(StructOfArrays):
         """Return one group per box, of the sizes allowed times ``patch_scale``; ``generator`` draws representatives."""
         members = self._members(patch_scale, tuning)
         first = members.indices[members.indptr[:-1]]
-        places, light, upright = members @ self.places, members @ self.light, self.upright[first]
-        normals = light.reshape(-1, 3, 3)[np.arange(len(first)), :, upright]  # weighted by their upright components
+        places = members @ self.places
         return AreaMoments(
             shapes=self.shapes[first],
             scales=self.scales[first],
             levels=self.levels[first],
             facing=self.facing[first],
-            in_box=_in_box(places[:, 1:4] / places[:, :1], upright),
+            in_box=_in_box(places[:, 1:4] / places[:, :1], self.upright[first]),
             places=places,
-            slopes=_slopes(normals, upright),
-            light=light,
+            light=members @ self.light,
+            lit_places=members @ self.lit_places,
             boxes=members @ self.boxes,
             representative=self.representative[_drawn(members, self.areas, generator)],
         )
@@ -111,11 +118,6 @@ class AreaMoments(StructOfArrays):
         height = np.floor(height / tuning.cluster_box_height)
         keys = [np.floor(across), np.floor(other), height, self.shapes, self.scales, self.facing]
         codes, number = _numbered(keys)
-        slope_class = tuning.slope_class * patch_scale
-        is_rough = self._slope_variance(number) > slope_class**2 / 6  # of two axes, uniform in a class
-        if is_rough.any():  # there one normal does for some directions of lasers and sensor points only
-            keys += [np.where(is_rough[number], np.rint(slope / slope_class), 0) for slope in self.slopes.T]
-            codes, number = _numbered(keys)
         off, level = self._off_plane(number), patch_scale * self.levels
         is_uneven = np.bincount(number, self.areas * off**2) > np.bincount(number, self.areas * level**2) / 12
         if is_uneven.any():  # surfaces above one another: between them there is no light, nor at one time for both
@@ -137,12 +139,6 @@ class AreaMoments(StructOfArrays):
         u, v, height = (self.in_box - plane.mean[number]).T
         return height - u * plane.slopes[number, 0] - v * plane.slopes[number, 1]
 
-    def _slope_variance(self, number: Int64) -> Float64:
-        """Return the variance (m,) of the slopes, by area, of the groups in each box that ``number`` (n,) names."""
-        total = np.bincount(number, self.areas)
-        squares = np.bincount(number, self.areas * np.square(self.slopes).sum(axis=1)) / total
-        return squares - sum(np.square(np.bincount(number, self.areas * slope) / total) for slope in self.slopes.T)
-
 
 @dataclass(frozen=True, eq=False)
 class BoxPlane:
@@ -151,6 +147,7 @@ class BoxPlane:
     mean: Float64  # (n, 3) centres: across in two directions, and upright
     slopes: Float64  # (n, 2) along these two directions
     moments: Float64  # (n, 3) about the centres: of the first direction, mixed, of the second
+    thickness: Float64  # (n,) variance of the heights over the plane
 
     @classmethod
     def of(cls, places: Float64, upright: Int64) -> BoxPlane:
@@ -163,11 +160,12 @@ class BoxPlane:
             """Return the second moments along two axes about the centres."""
             return sums[index, 3 + PLACE[axes[one], axes[other]]] - mean[:, one] * mean[:, other]
 
-        uu, uv, vv, uh, vh = moment(0, 0), moment(0, 1), moment(1, 1), moment(0, 2), moment(1, 2)
+        uu, uv, vv, uh, vh, hh = (moment(*pair) for pair in ((0, 0), (0, 1), (1, 1), (0, 2), (1, 2), (2, 2)))
         ridge = RIDGE * (uu + vv) + 1e-100
         determinant = (uu + ridge) * (vv + ridge) - uv**2
         slopes = ((vv + ridge) * uh - uv * vh) / determinant, ((uu + ridge) * vh - uv * uh) / determinant
-        return cls(mean, np.stack(slopes, axis=1), np.stack([uu, uv, vv], axis=1))
+        thickness = np.maximum(hh - slopes[0] * uh - slopes[1] * vh, 0)
+        return cls(mean, np.stack(slopes, axis=1), np.stack([uu, uv, vv], axis=1), thickness)
 
 
 def covered_boxes(normals: Float64, areas: Float64, allowed: Float64, tuning: VirtualLightTuning) -> Float64:
@@ -184,12 +182,6 @@ def _in_box(vectors: Float64, upright: Int64) -> Float64:
     return np.take_along_axis(vectors, (upright[:, None] + np.array([1, 2, 0])) % 3, axis=1)
 
 
-def _slopes(normals: Float64, upright: Int64) -> Float64:
-    """Return the components (n, 2) of normals along the two axes after ``upright``, per that along it."""
-    one, other, along = _in_box(normals, upright).T
-    return np.stack([one, other], axis=1) / np.where(np.abs(along) > 1e-300, along, 1.0)[:, None]
-
-
 def _place_moments(corners: Float64, centres: Float64, areas: Float64) -> Float64:
     """Return area, and area times centre and times second moments, of triangles (n, 10).
 
@@ -202,6 +194,24 @@ def _place_moments(corners: Float64, centres: Float64, areas: Float64) -> Float6
         squares = [corners[:, k, i] * corners[:, k, j] for k in range(3)]
         result[:, column] = areas * (sum(squares) + 9 * centres[:, i] * centres[:, j]) / 12
     return result
+
+
+def light_in_box(light: Float64, upright: Int64) -> Float64:
+    """Return ``AreaMoments.light``, its symmetric part (n, 3, 3) along the two axes after ``upright``, and along it."""
+    axes, index = (upright[:, None] + np.array([1, 2, 0])) % 3, np.arange(len(upright))[:, None, None]
+    matrices = light.reshape(-1, 3, 3)[index, axes[:, :, None], axes[:, None, :]]
+    symmetric: Float64 = (matrices + matrices.swapaxes(1, 2)) / 2
+    return symmetric
+
+
+def _lit_places(light: Float64, places: Float64, upright: Int64) -> Float64:
+    """Return positions, and products of their components, times w (n, 9); and positions times w p (n, 6).
+
+    w is area times the squared upright component of the normal, p are the slopes: see ``clusters.Facets``.
+    """
+    weights, means = light_in_box(light, upright)[:, 2], places[:, 1:] / places[:, :1]
+    by_slopes = [weights[:, axis, None] * means[:, :3] for axis in (0, 1)]
+    return np.concatenate([weights[:, 2, None] * means, *by_slopes], axis=1)
 
 
 def _numbered(keys: list[NDArray[Any]]) -> tuple[UInt64, Int64]:

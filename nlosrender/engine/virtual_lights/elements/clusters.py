@@ -6,8 +6,8 @@ direction s by l^T M s, with M the sum of A_i n_i n_i^T. With u = M r for one di
 u u^T / (r . u) does the same wherever l or s is r, and errs elsewhere by the product of their differences from r
 (Nystrom approximation); so n = u / |u| and A = |u|^2 / (r . u), with r towards the lasers. Half a sphere, lit and seen
 from above, would be 3 times too bright with the sum of the A_i for A, 1.5 times with the length of the sum of the
-A_i n_i: docs/virtual-lights.md, 4.3. Laser points in several places leave no such r: there a rough cluster is three of
-one place, whose normals make up M.
+A_i n_i: docs/virtual-lights.md, 4.3. Laser points in several places leave no such r: there three facets stand for a
+rough cluster, whose normals make up M.
 
 Visibility is that of one member, drawn by area: two sheets in one cluster still hide each other, on average, and the
 difference of two resolutions shows the noise of the draw.
@@ -16,13 +16,13 @@ difference of two resolutions shows the noise of the draw.
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from nlosrender.engine.virtual_lights.elements.area_moments import AreaMoments, BoxPlane
+from nlosrender.engine.virtual_lights.elements.area_moments import PAIRS, PLACE, AreaMoments, BoxPlane, light_in_box
 from nlosrender.engine.virtual_lights.elements.patches import Patches
 from nlosrender.engine.virtual_lights.elements.triangles import centroids, unit_vectors
 from nlosrender.engine.virtual_lights.tuning import VirtualLightTuning
@@ -32,6 +32,8 @@ if TYPE_CHECKING:
     from nlosrender.engine.virtual_lights.elements.subdivision import Elements
 
 MIN_LIT_SHARE = 1e-3  # of a cluster's area: what less of it sends on has no slopes to speak of
+TILTS = math.sqrt(1.5) * np.array([1.0, -1.0, 0.0])  # of facets: none in the mean, variance 1
+MIN_SLOPE_VARIANCE = 1e-12  # float64 rounds covariances by 1e-16 of squared slopes
 
 
 class Merger:
@@ -68,7 +70,9 @@ class Merger:
         self.elements, self.normals, self.light, self.tuning = elements, normals, light, tuning
         self._is_one_point = is_one_point
         self._ratios = ratios
-        self._element_moments = AreaMoments.of(elements, normals, areas, allowed, tuning)
+        self._element_moments = AreaMoments.of(
+            elements, normals, areas, allowed, tuning, with_lit_places=not is_one_point
+        )
         self._moments_at: dict[float, AreaMoments] = {}  # per scale, powers of two
 
     def set_up(self) -> None:
@@ -89,7 +93,7 @@ class Merger:
         areas, normals = self._as_one(merged, self.light - centres)
         barycentric = centroids(self.elements.weights[representative])[:, 1:]
         clusters = Patches(
-            corners=_parallelograms(plane, merged, centres),
+            corners=_parallelograms(plane, merged.upright, centres),
             areas=areas,
             centres=centres,
             normals=normals,
@@ -103,10 +107,12 @@ class Merger:
         )
         if self._is_one_point:
             return clusters
-        areas, normals, roughness = three_facets(merged)
-        is_rough = roughness > self.tuning.facet_roughness * patch_scale**2
+        is_rough = roughness(merged) > self.tuning.facet_roughness * patch_scale**2
+        facets = Facets.of(merged.select(is_rough))
         rough = clusters.select(np.repeat(np.flatnonzero(is_rough), 3))
-        rough = replace(rough, areas=areas[is_rough].ravel(), normals=normals[is_rough].reshape(-1, 3))
+        rough = replace(
+            rough, areas=facets.areas, centres=facets.centres, normals=facets.normals, corners=facets.corners
+        )
         return Patches.joined([clusters.select(~is_rough), rough])
 
     def _moments_of(self, patch_scale: float) -> AreaMoments:
@@ -141,48 +147,102 @@ class Merger:
         return np.minimum(areas, merged.areas), unit_vectors(light)
 
 
-def three_facets(merged: AreaMoments) -> tuple[Float64, Float64, Float64]:
-    """Return areas (n, 3) and normals (n, 3, 3) of three facets that send on what all members do, and the roughness.
+@dataclass(frozen=True, eq=False)
+class Facets:
+    """Three facets per group that send on what all members do, from where they do it, one group after the other.
 
     With slopes p, normals are (p, 1) over its length and M is the sum of w (p, 1) (p, 1)^T: three equal w, their slopes
-    on an ellipse about the mean at 120 degrees, have its sum, mean and covariance. The roughness (n,) is the trace of
-    the latter, 0 where shading normals lie across the triangles.
+    on an ellipse about the mean at 120 degrees, have its sum, mean and covariance. Their centres are the positions that
+    linear regression gives for these slopes, so that the members' covariance of position and slope is theirs, too; what
+    positions vary by besides is the extent of each. docs/virtual-lights.md, 4.3.
     """
-    index, axes = np.arange(len(merged)), (merged.upright[:, None] + np.array([1, 2, 0])) % 3
-    moments = merged.light.reshape(-1, 3, 3)[index[:, None, None], axes[:, :, None], axes[:, None, :]]
-    moments = (moments + moments.swapaxes(1, 2)) / 2
-    is_known = moments[:, 2, 2] > MIN_LIT_SHARE * merged.areas
-    weights = np.where(is_known, moments[:, 2, 2], merged.areas)
-    mean = moments[:, :2, 2] / weights[:, None]
-    covariance = moments[:, :2, :2] / weights[:, None, None] - mean[:, :, None] * mean[:, None, :]
-    values, vectors = np.linalg.eigh(covariance)
-    along = vectors * np.sqrt(2 * np.maximum(values, 0))[:, None, :]
-    turns = 2 * np.pi / 3 * np.arange(3)
-    slopes = mean[:, None] + np.einsum("nij,kj->nki", along, np.stack([np.cos(turns), np.sin(turns)], axis=1))
-    sign = (2 * (merged.facing % 2) - 1)[:, None, None]
-    facets: Float64 = sign * np.concatenate([slopes, np.ones((len(merged), 3, 1))], axis=2)
-    squares = np.square(facets).sum(axis=2)
-    normals = np.stack([_from_box(facets[:, k], merged.upright) for k in range(3)], axis=1)
-    return weights[:, None] / 3 * squares, normals / np.sqrt(squares)[:, :, None], values.sum(axis=1) * is_known
+
+    areas: Float64  # (3 n,)
+    normals: Float64  # (3 n, 3)
+    centres: Float64  # (3 n, 3)
+    corners: Float64  # (3 n, 3, 3) as of ``Patches``
+
+    @classmethod
+    def of(cls, merged: AreaMoments) -> Facets:
+        """Return those of groups whose ``roughness`` is not 0."""
+        slopes = _Slopes.of(merged)
+        values, axes = np.linalg.eigh(slopes.covariance)
+        weights, upright = slopes.weights, merged.upright
+        # where they vary along one line, all of them do
+        deviations = np.sqrt(np.where(values > MIN_SLOPE_VARIANCE, values, np.inf))
+        turns = 2 * np.pi / 3 * np.arange(3)
+        circle = np.sqrt(2) * np.stack([np.cos(turns), np.sin(turns)], axis=1)
+        along = axes * np.sqrt(np.maximum(values, 0))[:, None, :]
+        of_facets = slopes.mean[:, None] + np.einsum("kj,nij->nki", circle, along)
+        sign = (2 * (merged.facing % 2) - 1)[:, None, None]
+        facets = sign * np.concatenate([of_facets, np.ones((len(merged), 3, 1))], axis=2)
+        squares = np.square(facets).sum(axis=2)
+        normals = np.stack([_from_box(facets[:, k], upright) for k in range(3)], axis=1)
+        places, by_slopes = merged.lit_places[:, :9] / weights[:, None], merged.lit_places[:, 9:].reshape(-1, 2, 3)
+        middle = places[:, :3]
+        mixed = by_slopes / weights[:, None, None] - slopes.mean[:, :, None] * middle[:, None, :]
+        steps = np.einsum("nij,nix->njx", axes, mixed) / deviations[:, :, None]  # per deviation of the slope
+        centres = middle[:, None] + np.einsum("kj,njx->nkx", circle, steps)
+        rest = (
+            places[:, 3:][:, PLACE] - middle[:, :, None] * middle[:, None, :] - np.einsum("njx,njy->nxy", steps, steps)
+        )
+        about = np.hstack(
+            [np.ones((len(merged), 1)), np.zeros((len(merged), 3)), *(rest[:, i, j, None] for i, j in PAIRS)]
+        )
+        plane = BoxPlane.of(about, upright)
+        rises = np.sqrt(3 * plane.thickness)[:, None] * TILTS
+        corners = np.stack([_parallelograms(plane, upright, centres[:, k], rises[:, k]) for k in range(3)], axis=1)
+        return cls(
+            areas=(weights[:, None] / 3 * squares).ravel(),
+            normals=(normals / np.sqrt(squares)[:, :, None]).reshape(-1, 3),
+            centres=centres.reshape(-1, 3),
+            corners=corners.reshape(-1, 3, 3),
+        )
 
 
-def _parallelograms(plane: BoxPlane, merged: AreaMoments, centres: Float64) -> Float64:
+@dataclass(frozen=True, eq=False)
+class _Slopes:
+    """Slopes of the members of groups, weighted by w."""
+
+    weights: Float64  # (n,) sums of w; 0 and less where shading normals lie across the triangles
+    mean: Float64  # (n, 2)
+    covariance: Float64  # (n, 2, 2)
+
+    @classmethod
+    def of(cls, merged: AreaMoments) -> _Slopes:
+        matrices = light_in_box(merged.light, merged.upright)
+        weights = matrices[:, 2, 2]
+        means = matrices / np.where(weights == 0, 1.0, weights)[:, None, None]
+        mean = means[:, :2, 2]
+        return cls(weights, mean, means[:, :2, :2] - mean[:, :, None] * mean[:, None, :])
+
+
+def roughness(merged: AreaMoments) -> Float64:
+    """Return the variance (n,) of the slopes in groups; 0 where what their members send on has none to speak of."""
+    slopes = _Slopes.of(merged)
+    variance: Float64 = np.trace(slopes.covariance, axis1=1, axis2=2)
+    return np.where(slopes.weights > MIN_LIT_SHARE * merged.areas, variance, 0.0)
+
+
+def _parallelograms(
+    plane: BoxPlane, upright: NDArray[np.int64], centres: Float64, rises: Float64 | float = 0.0
+) -> Float64:
     """Return three successive corners (n, 3, 3) of the parallelograms on planes that have their members' moments.
 
     The moments of one spanned by 2 p and 2 q are (p p^T + q q^T) / 3, so p and q are the columns of a Cholesky factor
-    of 3 times the moments: a rectangle stays that rectangle.
+    of 3 times the moments: a rectangle stays that rectangle. ``rises`` are added to p, along the upright axis.
     """
 
-    def on_plane(one: Float64, other: Float64) -> Float64:
+    def on_plane(one: Float64, other: Float64, rises: Float64 | float) -> Float64:
         """Return steps (n, 3) in the planes, of given components along the two axes after the upright one."""
-        up = one * plane.slopes[:, 0] + other * plane.slopes[:, 1]
-        return _from_box(np.stack([one, other, up], axis=1), merged.upright)
+        up = one * plane.slopes[:, 0] + other * plane.slopes[:, 1] + rises
+        return _from_box(np.stack([one, other, up], axis=1), upright)
 
     uu, uv, vv = 3 * plane.moments.T
     first = np.sqrt(np.maximum(uu, 0))
     shear = uv / np.maximum(first, 1e-300)
     second = np.sqrt(np.maximum(vv - shear**2, 0))
-    p, q = on_plane(first, shear), on_plane(np.zeros_like(second), second)
+    p, q = on_plane(first, shear, rises), on_plane(np.zeros_like(second), second, 0.0)
     return np.stack([centres - p - q, centres + p - q, centres + p + q], axis=1)
 
 
