@@ -241,6 +241,9 @@ class Config(Section):
         if self.sensor is not None:
             for key, message in misfits(self.sensor, self.capture.scan_type):
                 yield ValidationIssue(("sensor", key), message)
+            if self.sensor.zones is not None and self.has_pixel_points:
+                message = "add up the cells of a grid on a wall; points that a camera sees have none. Remove it."
+                yield ValidationIssue(("sensor", "zones"), message, "key")
 
     # --- all captures ---
 

@@ -326,8 +326,9 @@ class _Measurement:
                 )
                 raise ConfigError.at("sensor.photons_per_pulse", message + "photons; need a relative scale.")
             area = float(np.prod(header.sensor_grid_size or 0.0)) / math.prod(header.sensor_grid)
-            if config.footprint_area is None and (area <= 0 or header.is_list()):
-                lacks = "points of a list have no cells" if header.is_list() else "the sensor grid has no size"
+            if config.footprint_area is None and (area <= 0 or header.is_list() or header.has_pixels):
+                whose = "a list" if header.is_list() else "a camera" if header.has_pixels else ""
+                lacks = f"points of {whose} have no cells" if whose else "the sensor grid has no size"
                 raise ConfigError.at("sensor.footprint_area", f"missing: {lacks}, so give the area that is seen [m^2].")
             return physical_scale(config, area)
         sums = in_order(lambda block: self.light(block).sum(axis=0, dtype=np.float64), self.blocks, threads)
@@ -385,8 +386,9 @@ def _refuse(header: StoredHeader, config: SensorConfig, corrections: tuple[str, 
         )
     for key, message in () if counts else misfits(config, header.scan_type):
         raise ConfigError.at(f"sensor.{key}", message)
-    if config.zones is not None and not counts and header.is_list():
-        message = "add up the cells of a grid, and points of a list have none; need capture.sensor_grid, or no zones."
+    if config.zones is not None and not counts and (header.is_list() or header.has_pixels):
+        whose = "a list" if header.is_list() else "a camera"
+        message = f"add up the cells of a grid, and points of {whose} have none; need capture.sensor_grid, or no zones."
         raise ConfigError.at("sensor.zones", message)
 
 
@@ -417,6 +419,11 @@ def _counts_header(
         sensors = (share @ sensors.reshape(-1, 3)).reshape(shape)
         normals = (share @ normals.reshape(-1, 3)).reshape(shape)
         normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
+    empty = empty_lasers = None
+    if layout.EMPTY_POINTS in header.attributes:
+        empty, empty_lasers = (np.asarray(~each.any(axis=-1)) for each in (normals, laser_normals))
+        normals[empty] = laser_normals[empty_lasers] = (0.0, 0.0, 1.0)  # written as zeros again
+    n_unlit = header.attributes.get(layout.UNLIT_POINTS, 0)
     laser_size = header.laser_grid_size or (0.0, 0.0)
     limit = header.attributes.get("max_bounces")
     frame = str(header.attributes.get("frame", "znlos"))
@@ -444,6 +451,9 @@ def _counts_header(
             n_channels=1,
             bounce_indices=(layout.SUMMED_INDEX,),
             split_bounces=False,
+            empty_sensors=empty,
+            empty_lasers=empty_lasers,
+            n_unlit_lasers=n_unlit if isinstance(n_unlit, int) else 0,
             point_lists=tuple(name for name in ("sensor", "laser") if header.is_list(name)),
             # a chunk is counted at once: of few bins as few points as of the many they are made of
             chunk_samples=max(layout.CHUNK_SAMPLES * bins.count // max(bins.count, header.n_bins), bins.count),

@@ -20,7 +20,7 @@ class FirstHits:
 
     origin: Float64  # (3,) of all rays [m, frame of the scene that they were traced in]
     directions: Float64  # (..., 3) unit
-    positions: Float64  # (..., 3) m; where nothing is met, those of another ray
+    positions: Float64  # (..., 3) m; where nothing is met, these and the normals are those of another ray
     normals: Float64  # (..., 3) unit, on the side that is seen
     is_front: NDArray[np.bool_]  # the ray arrives on the side that the surface's own normal looks to
     shapes: NDArray[np.int64]  # number in the scene; NO_SHAPE: nothing is met

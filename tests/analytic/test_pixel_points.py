@@ -8,14 +8,19 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
+import h5py
 import numpy as np
 import pytest
 from support.agreement import assert_agrees, relative_l2
 from support.quadrature import Frame, Setup, rectangle_cells, third_bounces
 from support.rendering import Rendering, configured, flat_wall, render
 
+from nlosrender.config.sensor import SensorConfig
 from nlosrender.engine.backend.start import start_backend
 from nlosrender.errors import ConfigError
+from nlosrender.files.measured import measure_capture
+from nlosrender.files.validation import check_file
+from nlosrender.pipeline import render_capture
 from nlosrender.rendering import stages
 
 NONE: Mapping[str, Any] = MappingProxyType({})
@@ -192,6 +197,29 @@ def test_pixels_that_see_nothing_are_empty() -> None:
     assert not result.total[0, 0][is_empty].any()
     points = _frame_of_corner(result)[~is_empty]
     assert (np.isclose(points[:, 0], 1, atol=1e-6) | np.isclose(points[:, 2], 0, atol=1e-6)).all()
+
+
+def test_a_file_of_pixels_keeps_which_are_empty(tmp_path: Path) -> None:
+    """Position, normal and light of empty pixels are zeros, counted in an attribute, in the file of counts as well."""
+    items = [{**item, "bsdf": {"type": "diffuse", "reflectance": 0.5}} for item in CORNER]
+    aim = {"laser_position": [-0.7, 0, 1.2], "laser_target": [0.3, -0.2, 0]}
+    config = seen("single", *items, wall=NO_WALL, camera={**EYE, "fov_deg": 100}, capture=aim, spp=16)
+    validated = configured({**config, "output": {"path": str(tmp_path / "c.hdf5")}})
+    warned: list[str] = []
+    render_capture(validated, warn=warned.append)
+    counts = tmp_path / "counts.hdf5"
+    sensor = SensorConfig.model_validate({"photons_per_pulse": {"mean": 0.1}, "pulses": 1000})
+    measure_capture(tmp_path / "c.hdf5", counts, sensor)
+    for name in ("c.hdf5", "counts.hdf5"):
+        assert not check_file(tmp_path / name).violations
+        with h5py.File(tmp_path / name) as file:
+            is_empty = ~file["cameraGridNormals"][...].any(axis=0)
+            assert file.attrs["empty_sensor_points"] == is_empty.sum() > 0
+            assert not file["cameraGridPositions"][...][:, is_empty].any()
+            light = file["data"][...].sum(axis=(0, 1, 2, 5, 6))  # channel, bin, bounce, lasers
+            assert not light[is_empty].any()
+            assert light.any()
+    assert f"{is_empty.sum()} of 12 pixels see no surface" in " ".join(warned)
 
 
 def test_the_laser_lights_what_it_meets_first() -> None:

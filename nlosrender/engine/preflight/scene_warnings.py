@@ -29,6 +29,7 @@ POINTS_PER_SURFACE = 64  # a visible share of a surface below about 1/64 may be 
 MAX_RAYS = 1_000_000  # of all surfaces together: a fraction of a second, less than a small render takes
 RAY_MARGIN = 2e-5  # share of a ray's length left out at its end; chosen, not measured
 GRAZING = 1e-2  # cosine below which a ray may slip past the limb of a round shape within its margin
+TWO_SIDED = mi.BSDFFlags.BackSide | mi.BSDFFlags.Transmission
 MIN_BIN = 2e-6  # engine units; float32 path lengths of a scene of size 1 are good to about 5e-7
 
 
@@ -60,7 +61,7 @@ def scene_warnings(engine: Engine) -> tuple[str, ...]:
         *_pixel_warnings(built),
         *(dark_surface_warnings(built, capture, max_bounces) if has_wall else ()),
         *window,
-        *near_wall_warnings(built, capture),
+        *(near_wall_warnings(built, capture) if has_wall else ()),
         *_bin_warnings(built, time_axis),
         *engine.warnings(),
     )
@@ -75,7 +76,13 @@ def _pixel_warnings(built: BuiltScene) -> Iterator[str]:
     """Yield how many pixels of a camera see nothing, and how many of their points the laser does not light."""
     if built.pixels is None:
         return
-    is_empty, is_lit = built.pixels.sensors.is_empty, built.pixels.lasers.is_reached
+    sensors, is_lit = built.pixels.sensors, built.pixels.lasers.is_reached
+    is_empty = sensors.is_empty
+    shapes = built.scene.shapes() if isinstance(built, SceneWithoutWall) else []
+    one_sided = [not shape.bsdf().flags() & TWO_SIDED for shape in shapes] or [False]
+    from_behind = int((np.array(one_sided)[sensors.shapes if shapes else 0] & ~is_empty & ~sensors.is_front).sum())
+    if from_behind:
+        yield f"{from_behind} of {is_empty.size} pixels see a surface from behind, where its BSDF is black."
     if is_empty.any():
         yield f"{int(is_empty.sum())} of {is_empty.size} pixels see no surface: they stay empty, H is zero there."
     unlit = int((~is_lit & ~built.pixels.lasers.is_empty).sum())

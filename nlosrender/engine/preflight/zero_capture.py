@@ -80,7 +80,8 @@ def _black_surfaces(engine: Engine, built: BuiltScene) -> Iterator[str]:
         draw = np.random.default_rng(0).random((6, len(index))).astype(np.float32)
         direction = start.to_world(mi.warp.square_to_cosine_hemisphere(mi.Point2f(draw[0], draw[1])))
         if not dr.any(_is_bright(built.bsdf_at(start).eval(context, start, start.to_local(direction)))):
-            yield f"the relay wall reflects nothing at the {name} points"
+            where = "what the camera sees" if isinstance(built, SceneWithoutWall) else "the relay wall"
+            yield f"{where} reflects nothing at the {name} points"
         si = built.scene.ray_intersect(mi.Ray3f(offset_origin(built, start, direction), direction))
         on_hidden = si.is_valid() & ~built.is_wall(si.shape)
         _, weight = si.bsdf().sample(context, si, mi.Float(draw[2]), mi.Point2f(draw[3], draw[4]), on_hidden)

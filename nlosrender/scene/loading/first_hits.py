@@ -75,7 +75,7 @@ def _first_hits(view: BuiltView, origin: Float64, targets: Float64) -> FirstHits
     normals = np.where(is_met[:, None], normals * np.sign(facing + (facing == 0))[:, None], -flat)
     normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
     if is_met.any():
-        positions[~is_met] = positions[is_met][0]
+        positions[~is_met], normals[~is_met] = positions[is_met][0], normals[is_met][0]
     rows = directions.shape[:-1]
     return FirstHits(
         origin=origin,
