@@ -65,7 +65,7 @@ class MeshWall(RelayWall):
         object.__setattr__(self, "is_planar", flat)
         rounded = TriangleMesh(self.mesh.vertices.astype(np.float32), self.mesh.faces).face_normals()
         cosines = np.einsum("nk,nk->n", rounded, self._face_normals)
-        object.__setattr__(self, "_is_lost", ~flat & (cosines <= MIN_SAME_COSINE))
+        object.__setattr__(self, "_is_lost", (cosines <= MIN_SAME_COSINE) & (not flat))
 
     @property
     def area(self) -> float:
