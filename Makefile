@@ -6,7 +6,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
 # Exact versions that passed the test suite; pyproject.toml holds the ranges that are allowed.
 PINS := -c .constraints.txt
 
-.PHONY: help install render test test-slow stress lint format peers bench bench-peers paper paper-quick wheel clean
+.PHONY: help install render test test-slow stress lint format peers bench bench-peers paper paper-quick wheel pythons clean
 .DEFAULT_GOAL := help
 
 help: ## Show this list.
@@ -79,9 +79,19 @@ paper-quick: install ## The same with fewer points and paths, in minutes. FIGURE
 	$(BIN)/nlosrender paper --quick $(foreach name,$(FIGURES),--figure $(name)) -o out/paper
 
 wheel: $(VENV)/.dev ## Build the package: dist/nlosrender-VERSION-py3-none-any.whl.
-	rm -rf build  # modules of an earlier build that are gone would be in the wheel
+	rm -rf build dist  # modules of an earlier build that are gone would be in the wheel
 	$(PIP) wheel --no-deps --no-build-isolation --wheel-dir dist .
 	@ls -s --block-size=KiB dist/*.whl
 
+pythons: wheel ## Install the wheel for every Python from 3.11 to 3.13 that is here, and test it: unit tests, commands from Python, docs.
+	@for version in 3.11 3.12 3.13; do \
+		python$$version -c '' 2>/dev/null || { echo "python$$version is not here: left out"; continue; }; \
+		rm -rf .venv-$$version && python$$version -m venv .venv-$$version \
+		&& .venv-$$version/bin/python -m pip --disable-pip-version-check --quiet install $(PINS) \
+			"$$(ls dist/*.whl)[llvm,xarray]" pytest hypothesis 'setuptools>=77' \
+		&& echo "python$$version" && .venv-$$version/bin/pytest -q -p no:cacheprovider tests/unit tests/cli/test_python_api.py tests/paths \
+		|| exit 1; \
+	done
+
 clean: ## Remove what make made, but not out/.
-	rm -rf $(VENV) .venv-peers .venv-peers-mitransient build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache
+	rm -rf $(VENV) .venv-* build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache
