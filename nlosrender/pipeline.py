@@ -126,6 +126,7 @@ def render_capture(
             warnings.emit(partial.damage)
             earlier = len(partial.finished.items)
             items = remaining_items(plan, header.confocal, partial.finished.items)
+            partial.begin_run(earlier + len(items))
             shown = (lambda standing: watch(replace(standing, error=None))) if unsampled else watch
             monitor = Monitor(stopwatch, progress, lambda text: warnings.emit([text]), shown)
             if cluster is None:

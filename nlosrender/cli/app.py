@@ -33,6 +33,7 @@ from nlosrender.cli.plan_command import plan
 from nlosrender.cli.reconstruct_command import reconstruct
 from nlosrender.cli.render_command import render
 from nlosrender.cli.report_command import report
+from nlosrender.cli.status_command import status
 from nlosrender.cli.streams import give_up_stderr, open_closed_streams, print_any_name
 from nlosrender.errors import EXIT_FAILURE, EXIT_INTERRUPTED, ConfigError, NlosError, ValidationIssue
 
@@ -55,8 +56,8 @@ def _add(command: Callable[..., Any], to: typer.Typer = app) -> None:
 
 
 _COMMANDS: tuple[Callable[..., Any], ...] = (
-    *(render, measure, merge, plan, new, import_, validate, schema, info, plot, frames, reconstruct, export, doctor),
-    *(report, compare, check, check_engines, bench, paper, sheet),
+    *(render, status, measure, merge, plan, new, import_, validate, schema, info, plot, frames, reconstruct, export),
+    *(doctor, report, compare, check, check_engines, bench, paper, sheet),
 )
 for _command in _COMMANDS:
     _add(_command)

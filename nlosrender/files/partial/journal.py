@@ -13,6 +13,7 @@ import fcntl
 import json
 import os
 import stat
+import time
 import zlib
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
@@ -25,6 +26,7 @@ from nlosrender.files.deferred_error_file import write_all
 from nlosrender.files.reading.locking import locked
 
 JOURNAL = "journal"
+LOOKED_AT = 3  # attempts to lock a journal that is only being looked at
 MAX_ATTEMPTS = 10  # attempts to open a folder that another render is just removing
 
 
@@ -116,6 +118,23 @@ def read_records(path: Path) -> Iterator[dict[str, Any]]:
             yield record
 
 
+def is_in_use(path: Path) -> bool | None:
+    """Return whether a process has a journal open; None: its file system has no locks, so nobody knows.
+
+    Raises
+    ------
+    OSError
+        It cannot be read.
+    """
+    descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW)
+    try:
+        return False if locked(descriptor, fcntl.LOCK_SH) else None
+    except BlockingIOError:
+        return True
+    finally:
+        os.close(descriptor)  # gives the lock back
+
+
 def line_of(record: Mapping[str, Any]) -> bytes:
     """Return a record as a line."""
     text = json.dumps(record, separators=(",", ":"), allow_nan=False).encode()
@@ -156,6 +175,9 @@ def claimed_journal(path: Path, target: Path) -> Journal:
             try:
                 return Journal(folder / JOURNAL)
             except JournalInUseError as error:
+                if attempt < LOOKED_AT:  # `nlosrender status` holds the lock for microseconds
+                    time.sleep(0.02)
+                    continue
                 message = f"{path}: another render is writing it now. Wait for it, or name another output."
                 raise FileError(message) from error
             except FileNotFoundError:

@@ -15,9 +15,7 @@ from another file: all samples would be written, and lie on the disk, twice by t
 from __future__ import annotations
 
 import functools
-import os
 import shutil
-import socket
 import time
 import zlib
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -49,6 +47,7 @@ from nlosrender.files.partial.work_item_log import (
     closing_record,
     item_record,
     items_of,
+    run_record,
     stored_chunks,
 )
 from nlosrender.files.partial.work_item_state import NEW, STATE_FORMAT, ItemState, states_in
@@ -148,11 +147,14 @@ class PartialCapture:
         elif self.finished.items:
             self._rebuild(create)
         else:
-            begun_by = {"process": os.getpid(), "machine": socket.gethostname()}
-            self._note({"identity": self._identity, "overwrite": self._overwrites, **begun_by})
+            self._note({"identity": self._identity, "overwrite": self._overwrites})
             with explained_write(self.path):  # a file without a finished work item holds nothing of use
                 self._samples().unlink(missing_ok=True)
             self._open_samples(create)
+
+    def begin_run(self, units: int) -> None:
+        """Note who renders now, and of how many work items in all: for those who look at the journal (FileError)."""
+        self._note(run_record(units))
 
     def store(self, item: WorkItemKey, chunks: Iterable[PackedChunk], sums: Sums) -> tuple[float, float]:
         """Write the chunks of a work item, dark ones left out, and note that it is finished.

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import socket
+import time
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import astuple, dataclass, field
@@ -68,6 +70,8 @@ class JournalState:
     newest: int = 0  # generation that was ever begun
     closed: Closing | None = None  # that file as HDF5 has closed it; None: it has not
     finished: RenderState = field(default_factory=RenderState)
+    run: Record = field(default_factory=dict)  # of ``run_record``, the newest; renders by earlier versions note none
+    n_in_run: int = 0  # work items finished since
 
     @classmethod
     def from_records(cls, records: Iterable[Record]) -> JournalState:
@@ -86,10 +90,12 @@ class JournalState:
                 state.closed = Closing(*closed) if isinstance(closed, list) else None
                 if "identity" in record:
                     state.first = record
+                if "run" in record:
+                    state.run, state.n_in_run = record["run"], 0
                 if "switched_to" in record:
                     state.generation = record["switched_to"]
                 if "unit" in record:
-                    state.newest = max(state.newest, record["generation"])
+                    state.newest, state.n_in_run = max(state.newest, record["generation"]), state.n_in_run + 1
                     generations.setdefault(record["generation"], RenderState()).add(*item_of(record))
             state.newest = max(state.newest, state.generation)
         except (KeyError, TypeError, AttributeError, RecursionError) as error:
@@ -101,6 +107,12 @@ class JournalState:
 def closing_record(closing: Closing) -> dict[str, Any]:
     """Return the record that the file of samples is closed."""
     return {"closed": astuple(closing)}
+
+
+def run_record(units: int) -> dict[str, Any]:
+    """Return the record that this process begins to render what is left of ``units`` work items."""
+    by = {"process": os.getpid(), "machine": socket.gethostname()}
+    return {"run": {"units": units, "begun": time.time(), **by}}
 
 
 def item_record(generation: int, item: WorkItemKey, chunks: Iterable[StoredChunk], sums: Sums) -> dict[str, Any]:
