@@ -51,6 +51,7 @@ def summarise(path: str | Path) -> dict[str, object]:
         "laser_grid": list(header.laser_grid[::-1]),
         "laser_grid_size": _listed(header.laser_grid_size),
         "point_lists": [name for name in ("sensor", "laser") if header.is_list(name)],
+        "footprint": None if header.footprint is None else header.footprint[0],
         "sensor_position": _listed(header.sensor_position),
         "laser_position": _listed(header.laser_position),
         "n_bins": header.n_bins,

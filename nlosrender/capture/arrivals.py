@@ -39,7 +39,7 @@ def earliest_arrival(capture: Capture, wall: RelayWall, hidden_bounds: Bounds | 
         laser_opl = laser_opl + distance_to_box(_points(capture.laser_grid), hidden_bounds)
         sensor_opl = sensor_opl + distance_to_box(_points(capture.sensor_grid), hidden_bounds)
     opl = laser_opl + sensor_opl if capture.scan_type == "confocal" else laser_opl.min() + sensor_opl.min()
-    return float(np.min(opl)) - 2 * capture.laser_spot_radius
+    return float(np.min(opl)) - 2 * capture.blur
 
 
 def latest_arrival(capture: Capture, wall: RelayWall, hidden_bounds: Bounds | None, max_bounces: int | None) -> float:
@@ -53,7 +53,7 @@ def latest_arrival(capture: Capture, wall: RelayWall, hidden_bounds: Bounds | No
         return _latest_view(capture, hidden_bounds, min(_or_inf(max_bounces), MAX_VIEW_INTERACTIONS))
     wall_box = wall.bounds()
     reflecting = hidden_bounds if wall.is_planar else joined_bounds([hidden_bounds, wall_box])
-    spot = 2 * capture.laser_spot_radius  # a point of the spot is up to one radius farther from both of its neighbours
+    spot = 2 * capture.blur  # places in a spot or footprint are up to their radius farther from both neighbours
     if reflecting is None:
         return float(capture.laser_legs.max() + capture.sensor_legs.max()) + spot
     corners = box_corners(reflecting)

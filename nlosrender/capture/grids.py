@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from nlosrender.capture.bounces import LINE_OF_SIGHT
+from nlosrender.capture.footprint import Footprint
 from nlosrender.errors import ConfigError
 from nlosrender.scene.pose import Float64
 from nlosrender.scene.walls.wall import EDGE_TOLERANCE, RectangleWall, RelayWall
@@ -93,6 +94,7 @@ class Capture:
     laser_energy: float  # J per pulse
     laser_spot_radius: float  # m; 0 = a point
     n_unlit_lasers: int = 0  # laser points that a camera sees and the laser does not light
+    footprint: Footprint | None = None  # around each sensor point; None: a point
 
     def __post_init__(self) -> None:
         if self.scan_type not in SCAN_TYPES:
@@ -131,6 +133,11 @@ class Capture:
     def is_line_of_sight(self) -> bool:
         """Whether a camera sees the scene itself."""
         return self.scan_type == LINE_OF_SIGHT
+
+    @property
+    def blur(self) -> float:
+        """Distance by which a leg, and the way next to it, may differ from those of laser and sensor point [m]."""
+        return self.laser_spot_radius + (0.0 if self.footprint is None else self.footprint.reach)
 
     @property
     def laser_legs(self) -> Float64:
@@ -246,6 +253,7 @@ def _extent(xy: Float64) -> tuple[float, float]:
 def _capture(
     capture_config: CaptureConfig, sensor_grid: PointGrid, laser_grid: PointGrid, laser: Float64, sensor: Float64
 ) -> Capture:
+    seen = capture_config.footprint
     return Capture(
         scan_type=capture_config.scan_type,
         sensor_grid=sensor_grid,
@@ -255,6 +263,7 @@ def _capture(
         account_first_and_last_bounces=bool(capture_config.account_first_and_last_bounces),
         laser_energy=float(capture_config.laser_energy),
         laser_spot_radius=float(capture_config.laser_spot_radius),
+        footprint=None if seen is None else Footprint(*seen.extent, is_disc=seen.box is None),
     )
 
 

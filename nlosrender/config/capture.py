@@ -18,6 +18,7 @@ from nlosrender.config.fields import (
     LengthOrZero,
     Point2,
     Point3,
+    Sizes2,
 )
 from nlosrender.config.point_list import PointList, WallPoints, point_list
 from nlosrender.config.section import LIST, ONE_OF, Section
@@ -42,6 +43,25 @@ class GridConfig(Section):
     def n_points(self) -> int:
         """Number of points."""
         return self.nx * self.ny
+
+
+class FootprintConfig(Section):
+    """The area of the wall that each sensor point stands for: H is its mean, as of a detector that sees an area."""
+
+    radius: Length | None = None
+    """m, of a disc around the point"""
+    box: Sizes2 | None = None
+    """m, [width, height] of a rectangle around it along the wall's axes, instead of radius"""
+
+    def rule_one_shape(self) -> Iterator[ValidationIssue]:
+        """A disc or a rectangle."""
+        if (self.radius is None) == (self.box is None):
+            yield ValidationIssue((), "need one of radius and box, such as {radius: 0.02} or {box: [0.04, 0.03]}.")
+
+    @property
+    def extent(self) -> tuple[float, float]:
+        """Width and height [m]."""
+        return (2 * self.radius, 2 * self.radius) if self.box is None and self.radius else self.box or (0.0, 0.0)
 
 
 class CaptureConfig(Section):
@@ -78,6 +98,8 @@ class CaptureConfig(Section):
     """J per pulse"""
     laser_spot_radius: LengthOrZero = 0.0
     """m, radius of the lit disc on the wall; 0: a point"""
+    footprint: FootprintConfig | None = None
+    """the area around each sensor point that H is the mean over; null: the point"""
     account_first_and_last_bounces: Flag = True
     """count the legs laser to wall and wall to sensor in the path length; line_of_sight: the leg to the camera"""
 

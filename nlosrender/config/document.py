@@ -133,6 +133,8 @@ class Config(Section):
         if capture.laser_spot_radius > 0:
             message = f"got {shown(capture.laser_spot_radius)}, and {needs.replace('need', 'need 0, or')}"
             yield ValidationIssue(("capture", "laser_spot_radius"), message)
+        if capture.footprint is not None:
+            yield ValidationIssue(("capture", "footprint"), f"got one, and {needs}")
         if self.render.polarized:
             yield ValidationIssue(("render", "polarized"), f"got true, and {needs}")
 
@@ -227,6 +229,39 @@ class Config(Section):
         if radius > 0 and wall and wall.type != "rectangle":
             message = f"got {shown(radius)} on a {wall.type} wall; need 0 there, or a rectangle wall."
             yield ValidationIssue(("capture", "laser_spot_radius"), message)
+
+    def rule_footprint_on_the_wall(self) -> Iterator[ValidationIssue]:
+        """Footprints lie on a rectangle wall, whole."""
+        footprint, wall = self.capture.footprint, self.scene.relay_wall
+        if footprint is None or wall is None or self.capture.is_line_of_sight or self.has_pixel_points:
+            return
+        path: KeyPath = ("capture", "footprint")
+        if wall.type != "rectangle":
+            yield ValidationIssue(path, f"got one on a {wall.type} wall; need none there, or a rectangle wall.")
+            return
+        if self.render.polarized:
+            yield ValidationIssue(path, "got one with render.polarized, whose sensors are points; need one of them.")
+        for axis, (name, reach) in enumerate(
+            zip(("width", "height"), self._reach_of_sensors(wall.extent), strict=True)
+        ):
+            size, left = footprint.extent[axis], wall.extent[axis] - 2 * reach
+            if size > left + wall.extent[axis] * EDGE_TOLERANCE:
+                message = f"got a {name} of {size:.6g} m, which leaves the wall: the outermost sensor points are "
+                message += (
+                    f"{left / 2:.6g} m from its edge; need at most {max(left, 0.0):.6g} m, or points farther inside."
+                )
+                yield ValidationIssue(path, message)
+
+    def _reach_of_sensors(self, extent: tuple[float, float]) -> tuple[float, float]:
+        """Return how far the sensor points are from the wall's centre along its axes [m]."""
+        grid, listed = self.capture.sensor_grid, self.capture.sensor_list
+        if listed is not None:
+            across, up = abs(listed.xy).max(axis=0).tolist()
+            return across, up
+        if grid is None:
+            return 0.0, 0.0
+        sizes = (grid.width or extent[0]) / 2, (grid.height or extent[1]) / 2
+        return sizes[0] * (1 - 1 / grid.nx), sizes[1] * (1 - 1 / grid.ny)
 
     def rule_laser_can_be_found(self) -> Iterator[ValidationIssue]:
         """Paths find a point by sampling it alone."""

@@ -181,13 +181,16 @@ def _scale(value: object) -> float | tuple[float, ...]:
     return numbers[0] if len(numbers) == 1 else tuple(numbers)
 
 
-def _sizes(value: object) -> tuple[float, ...]:
-    numbers = finite_numbers(value, 3)
-    if numbers is None or min(numbers) <= 0:
-        raise invalid_value(value, "3 numbers > 0 [x, y, z]")
-    if not MIN_LENGTH <= min(numbers) <= max(numbers) <= MAX_LENGTH:
-        raise invalid_value(value, f"{MIN_LENGTH:g} to {MAX_LENGTH:g} m")
-    return tuple(numbers)
+def _sizes(need: str, size: int) -> Checked:
+    def check(value: object) -> tuple[float, ...]:
+        numbers = finite_numbers(value, size)
+        if numbers is None or min(numbers) <= 0:
+            raise invalid_value(value, need)
+        if not MIN_LENGTH <= min(numbers) <= max(numbers) <= MAX_LENGTH:
+            raise invalid_value(value, f"{MIN_LENGTH:g} to {MAX_LENGTH:g} m")
+        return tuple(numbers)
+
+    return Checked(check, _array(size, exclusiveMinimum=0))
 
 
 def _flag(value: object) -> bool:
@@ -285,7 +288,8 @@ Point2 = Annotated[tuple[float, float], _vector("2 finite numbers [x, y]", 2, mo
 Point3 = Annotated[Vector3, _vector(_XYZ, most=MAX_LENGTH)]
 Angles3 = Annotated[Vector3, _vector(_XYZ)]
 Direction = Annotated[Vector3, _vector(f"{_XYZ}, not all zero", allows=_has_direction)]
-Sizes3 = Annotated[Vector3, Checked(_sizes, _array(3, exclusiveMinimum=0))]
+Sizes2 = Annotated[tuple[float, float], _sizes("2 numbers > 0 [width, height]", 2)]
+Sizes3 = Annotated[Vector3, _sizes("3 numbers > 0 [x, y, z]", 3)]
 Flag = Annotated[bool, Checked(_flag, {"type": "boolean"})]
 Text = Annotated[str, Checked(_text, _TEXT)]
 Name = Annotated[str, Checked(_name, _TEXT)]

@@ -33,6 +33,7 @@ LEFT_OUT = (  # of the canonical JSON, if empty
     ("capture", "pixel_point"),
     ("capture", "laser_target"),
     ("capture", "laser_targets"),
+    ("capture", "footprint"),
 )
 MAX_ISSUES = 100  # told at once; nobody reads more
 SectionT = TypeVar("SectionT", bound=Section)

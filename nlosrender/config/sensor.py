@@ -190,7 +190,7 @@ class SensorConfig(Section):
     aperture_solid_angle: SolidAngle | None = None
     """sr, of the detector's aperture seen from the wall"""
     footprint_area: Area | None = None
-    """m^2 seen as one sensor point, projected along the line of sight; null: its cell of the sensor grid"""
+    """m^2 seen as one sensor point, projected along the line of sight; null: capture.footprint, else the grid's cell"""
     transmission: Share = 1.0
     """0..1, of filter and optics"""
     photon_detection_ratio: Share = 1.0

@@ -61,6 +61,7 @@ _DEVICES = """\
   sensor_position: [-0.5, 0, 0.25]    # m, in front of the wall; default null: 1 m in front of its centre
   laser_energy: 1.0              # J per pulse, > 0; default 1
   laser_spot_radius: 0.0         # m, >= 0; default 0: the laser lights a point
+  # footprint: {radius: 0.02}    # m; or box: [0.04, 0.03]: H is the mean over it around each sensor point; default null
 """
 
 _TEMPLATE = """\

@@ -33,6 +33,7 @@ _NEEDED_BY: dict[str, tuple[str, ...]] = {
     "capture.sensor_position": _OF_WALLS,
     "capture.laser_energy": _OF_WALLS,
     "capture.laser_spot_radius": _OF_WALLS,
+    "capture.footprint": _OF_WALLS,
     "render.laser_sampling": _OF_WALLS,
     "render.hidden_geometry_sampling": _OF_WALLS,
 }

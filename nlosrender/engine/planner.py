@@ -14,6 +14,7 @@ from nlosrender.engine.line_of_sight.engine import LineOfSightEngine
 from nlosrender.engine.path.engine import PathEngine
 from nlosrender.engine.virtual_lights.elements.tessellator import can_tessellate, wall_sees_itself
 from nlosrender.engine.virtual_lights.engine import VirtualLightEngine
+from nlosrender.errors import ConfigError
 from nlosrender.scene.build import BuiltScene, SceneWithoutWall
 from nlosrender.scene.view import BuiltView
 
@@ -48,6 +49,13 @@ def choose_engine(
     if reason is None and render.engine == "auto" and wall_sees_itself(built) and built.wall_shape.is_mesh():
         reason = "the relay wall is a mesh that sees itself: the edges between its triangles take very many patches"
     device = DeviceCapture(built, capture, time_axis, options)
+    if capture.footprint is not None and device.mirrors:
+        message = (
+            "the scene has mirrors or smooth coats, whose light is computed from points, not from areas. Remove it, or "
+        )
+        raise ConfigError.at(
+            "capture.footprint", f"{message}make them rough, such as {{type: roughconductor, alpha: 0.02}}."
+        )
     if reason is not None:
         return PathEngine(device, reason=reason)
     further = PathEngine(device, first_bounce=THIRD_BOUNCE + 1)
@@ -71,6 +79,13 @@ def _obstacle_close_by(engine: VirtualLightEngine, capture: Capture) -> str | No
     Paths from the sensor points find what is close to these, but not what is close to a laser point elsewhere.
     """
     tessellator = engine.tessellator
+    if capture.footprint is not None:
+        reach = capture.footprint.reach / engine.built.metres_per_engine_unit
+        return (
+            "hidden geometry touches the footprint of a sensor point"
+            if tessellator.nearest < reach + TOUCHING
+            else None
+        )
     if tessellator.nearest >= TOUCHING:
         return None
     if capture.scan_type == "confocal":
@@ -97,6 +112,8 @@ def _obstacle(render: RenderConfig, capture: Capture, built: BuiltScene) -> str 
         return "a technique of the path engine is switched off"
     if capture.laser_spot_radius > 0:
         return "the laser has a spot"
+    if capture.footprint is not None and capture.scan_type == "confocal":
+        return "the sensor points of a confocal scan have footprints, and its laser points have none"
     if built.hidden_bounds is None and not wall_sees_itself(built):
         return "there is no hidden geometry"
     if not can_tessellate(built):

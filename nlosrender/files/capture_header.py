@@ -52,6 +52,7 @@ class CaptureHeader:
     n_unlit_lasers: int = 0  # that are hidden from the laser
     shared_samples: str = ""  # which samples have errors in common, in words: their variances may not be summed
     point_lists: tuple[str, ...] = ()  # which of "sensor" and "laser" points are a list, see ``layout.POINT_LISTS``
+    footprint: tuple[str, float] | None = None  # what H is the mean over, in words, and its area [m^2]; None: points
     chunk_samples: int = CHUNK_SAMPLES  # of a chunk of the file at most
 
     def __post_init__(self) -> None:

@@ -179,6 +179,8 @@ def root_attributes(header: CaptureHeader) -> dict[str, object]:
             layout.EMPTY_POINTS: int(header.empty_sensors.sum()),
             layout.UNLIT_POINTS: header.n_unlit_lasers,
         }
+    if header.footprint is not None:
+        attributes[layout.FOOTPRINT], attributes[layout.FOOTPRINT_AREA] = header.footprint
     if header.n_channels in layout.CHANNELS:
         attributes["channels"] = layout.CHANNELS[header.n_channels]
     if attributes.get("channels") == layout.STOKES:

@@ -97,6 +97,8 @@ POINT_LISTS = "point_lists"
 # Attributes of captures whose points a camera sees: how many of its pixels see nothing, and how many laser points are
 # hidden from the laser. Empty points have zeros as position and normal.
 EMPTY_POINTS, UNLIT_POINTS = "empty_sensor_points", "unlit_laser_points"
+# Attributes of captures whose sensor points stand for an area of the wall: in words, and how large it is [m^2].
+FOOTPRINT, FOOTPRINT_AREA = "footprint", "footprint_area"
 CHANNELS = {3: "rgb", 4: STOKES}  # grey: files without the attribute
 DATA_UNIT = "J m^-2 sr^-1"  # radiance leaving a sensor point, integrated over the bin, for one pulse
 VIEW_UNIT = "W m^-2 sr^-1"  # line_of_sight: of a pixel's steady radiance the share that arrives in the bin

@@ -326,7 +326,10 @@ class _Measurement:
                 )
                 raise ConfigError.at("sensor.photons_per_pulse", message + "photons; need a relative scale.")
             area = float(np.prod(header.sensor_grid_size or 0.0)) / math.prod(header.sensor_grid)
-            if config.footprint_area is None and (area <= 0 or header.is_list() or header.has_pixels):
+            seen = header.footprint
+            if seen is not None:
+                area = seen[1]
+            elif config.footprint_area is None and (area <= 0 or header.is_list() or header.has_pixels):
                 whose = "a list" if header.is_list() else "a camera" if header.has_pixels else ""
                 lacks = f"points of {whose} have no cells" if whose else "the sensor grid has no size"
                 raise ConfigError.at("sensor.footprint_area", f"missing: {lacks}, so give the area that is seen [m^2].")
@@ -454,6 +457,7 @@ def _counts_header(
             empty_sensors=empty,
             empty_lasers=empty_lasers,
             n_unlit_lasers=n_unlit if isinstance(n_unlit, int) else 0,
+            footprint=header.footprint,
             point_lists=tuple(name for name in ("sensor", "laser") if header.is_list(name)),
             # a chunk is counted at once: of few bins as few points as of the many they are made of
             chunk_samples=max(layout.CHUNK_SAMPLES * bins.count // max(bins.count, header.n_bins), bins.count),

@@ -198,4 +198,5 @@ def describe_file(
         n_unlit_lasers=capture.n_unlit_lasers,
         shared_samples=shared,
         point_lists=capture.point_lists,
+        footprint=None if capture.footprint is None else (capture.footprint.in_words, capture.footprint.area),
     )

@@ -27,6 +27,7 @@ def capture(wall=WALL, **changes):
         "laser_grid": grid(7, 2, 1.4, 0.4),
         "sensor_list": None,
         "laser_list": None,
+        "footprint": None,
         "laser_point": None,
         "laser_position": [6.0, -2.0, 1.5],
         "sensor_position": None,

@@ -27,6 +27,7 @@ def capture(wall=WALL, scan_type="exhaustive", **changes):
         "laser_grid": SimpleNamespace(nx=7, ny=2, width=1.4, height=0.4),
         "sensor_list": None,
         "laser_list": None,
+        "footprint": None,
         "laser_point": (0.3, -0.2),
         "laser_position": [-0.5, 0.1, 0.25],
         "sensor_position": [0.2, 0.3, 0.4],

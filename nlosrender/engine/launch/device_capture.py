@@ -23,6 +23,7 @@ from nlosrender.engine.launch.mirror_index import lit_sphere
 from nlosrender.engine.launch.morton import morton_order
 from nlosrender.engine.launch.schedule import DEFAULT_SCHEDULE, ScheduleTuning
 from nlosrender.engine.launch.second_bounce import deposit_second_bounce
+from nlosrender.engine.launch.sensor_footprint import SensorFootprint
 from nlosrender.engine.launch.surface_sampler import SurfaceSampler
 from nlosrender.engine.launch.time_gate import CaptureTimeGate, light_leaves_window
 from nlosrender.engine.launch.wall_points import laser_points, sensor_points
@@ -71,6 +72,13 @@ class DeviceCapture:
         self.sampler = SurfaceSampler(built)
         # Throughput is per (engine unit)^2: H falls with the square of a scene's size.
         self.scale = capture.laser_energy / built.metres_per_engine_unit**2
+
+    @cached_property
+    def footprint(self) -> SensorFootprint | None:
+        """The area that sensor points stand for; None: they are points."""
+        if self.capture.footprint is None:
+            return None
+        return SensorFootprint(self.built, self.capture, self.time_axis, self.options.seed)
 
     @cached_property
     def capture_gate(self) -> CaptureTimeGate | None:
@@ -143,6 +151,7 @@ class DeviceCapture:
             bins_per_unit=dr.opaque(mi.Float, built.metres_per_engine_unit / time_axis.bin_width_opl),
             time_gate=None if gate is None else gate.of_sensors(built, capture, time_axis, index, sensor),
             row_of_lane=row_of_lane,
+            footprint=self.footprint,
         )
 
     @cached_property

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Self
 
 import drjit as dr
 import mitsuba as mi
 
 if TYPE_CHECKING:
+    from nlosrender.engine.launch.sensor_footprint import SensorFootprint
     from nlosrender.engine.launch.surface_sampler import SurfaceSampler
     from nlosrender.engine.launch.time_gate import TimeGate
     from nlosrender.engine.launch.wall_points import WallPoints
@@ -31,8 +32,23 @@ class LaunchParams:
     bins_per_unit: mi.Float  # engine unit / bin width, opaque
     time_gate: TimeGate | None  # None: all light arrives before the end of the window
     row_of_lane: mi.UInt32  # per lane: which lane's rows of the histogram it adds to
+    footprint: SensorFootprint | None  # None: sensor points are points
 
-    def gather_lanes(self, index: mi.UInt32) -> LaunchParams:
+    def in_footprint(self, key: mi.UInt32) -> Self:
+        """Return these with the sensor points of paths, known by their ``key``, at random in the footprint."""
+        if self.footprint is None:
+            return self
+        return replace(self, sensors=self.footprint.at_random(self.sensors, key))
+
+    def at_place(self, place: mi.Point2f) -> Self:
+        """Return these with the sensor points at a place (point of the unit square) in the footprint."""
+        if self.footprint is None:
+            return self
+        moved = self.footprint.moved(self.sensors, place)
+        dr.eval(moved.interaction, moved.delay_bins, moved.delay_fraction)
+        return replace(self, sensors=moved)
+
+    def gather_lanes(self, index: mi.UInt32) -> Self:
         """Return what the lanes at ``index`` read."""
         sensors, first_laser = self.sensors.gather(index), dr.gather(mi.UInt32, self.first_laser, index)
         row_of_lane = dr.gather(mi.UInt32, self.row_of_lane, index)

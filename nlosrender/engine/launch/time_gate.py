@@ -105,7 +105,7 @@ class CaptureTimeGate:
             _box(capture.sensor_grid, built.metres_per_engine_unit),
             _box(capture.laser_grid, built.metres_per_engine_unit),
             survival,
-            float(time_axis.end_opl - legs + capture.laser_spot_radius) / built.metres_per_engine_unit,
+            float(time_axis.end_opl - legs + _slack(capture)) / built.metres_per_engine_unit,
             2 * max(float(lowest), 0.0) / built.metres_per_engine_unit,
         )
 
@@ -127,7 +127,7 @@ class CaptureTimeGate:
         own = capture.scan_type == "confocal"
         sensor_legs, laser_legs = capture.sensor_legs.reshape(-1), capture.laser_legs.reshape(-1)
         legs = sensor_legs[index] + (laser_legs[index] if own else laser_legs.min())
-        latest = (time_axis.end_opl - legs + capture.laser_spot_radius) / built.metres_per_engine_unit
+        latest = (time_axis.end_opl - legs + _slack(capture)) / built.metres_per_engine_unit
         low, high = (_opaque_point(corner) for corner in self.laser_box)
         if own:
             points = mi.Point3f(
@@ -143,6 +143,11 @@ def light_leaves_window(built: BuiltScene, capture: Capture, time_axis: TimeAxis
     """Return whether light may arrive after the time window, as far as boxes can tell."""
     latest = latest_of_bounce(capture, built.wall, built.hidden_bounds, bounces.max_bounces)
     return latest > time_axis.end_opl
+
+
+def _slack(capture: Capture) -> float:
+    """Return by how much light may arrive earlier than from laser and sensor points [m]."""
+    return capture.laser_spot_radius + (0.0 if capture.footprint is None else 2 * capture.footprint.reach)
 
 
 def _box(grid: PointGrid, unit: float) -> Bounds:

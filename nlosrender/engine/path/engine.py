@@ -113,7 +113,11 @@ class PathEngine:
     @cached_property
     def hidden_aabb(self) -> HiddenAabb | None:
         """Box around the hidden geometry; None where few rays from the wall miss it, or all are sent to points."""
-        return None if self.p_hidden_sampling > 0 else box_often_missed(self.device, self.tuning)
+        if (
+            self.p_hidden_sampling > 0 or self.capture.footprint is not None
+        ):  # places that miss it would start more paths
+            return None
+        return box_often_missed(self.device, self.tuning)
 
     @property
     def traces_paths(self) -> bool:

@@ -101,7 +101,7 @@ def trace_paths(
 
     Throughput is in units of radiance per (engine unit)^-2; the caller scales by energy and unit.
     """
-    built, sampler, sensor = params.built, params.sampler, params.sensors.interaction
+    built, sampler = params.built, params.sampler
     q = settings.p_hidden_sampling
     steps = recurrence_steps(2) if 0 < q < 1 else (*recurrence_steps(1), 1)
     stride = systematic.stride
@@ -119,18 +119,20 @@ def trace_paths(
     medium = mi.Float(1)  # refractive index along the ray
     is_past_gate = mi.Bool(False)  # the path can only bring light after the window, and has survived that roulette
     is_specular = mi.Bool(False)  # a delta lobe is on the path
+    place = mi.UInt32(0)  # key of the place in the sensor's footprint that the path started from
 
     # excluded: arrays that the loop reads but does not change
     while dr.hint(
         alive | (starts.count < n_samples),
-        exclude=[settings, params, histogram, built, sampler, sensor, time_gate, n_samples, stride],
+        exclude=[settings, params, histogram, built, sampler, time_gate, n_samples, stride],
     ):
+        placed = params.in_footprint(place)
         # ---- Intersect ----------------------------------------------------------------------------------------------
         there = arrive(settings, params, way, alive)
         opl += medium * there.distance
         hit = mi.Bool(there.is_reached)
         if dr.hint(settings.finds_spot, mode="scalar"):
-            deposit_spot(settings, params, histogram, there, way, bounce, opl, throughput)
+            deposit_spot(settings, placed, histogram, there, way, bounce, opl, throughput)
         throughput = dr.select(hit, throughput * way.value / there.density, 0)
         bounce += 1
         hit &= dr.any(mi.unpolarized_spectrum(throughput) != 0)
@@ -144,14 +146,17 @@ def trace_paths(
             is_deposited = hit & settings.is_deposited(bounce)
             if dr.hint(settings.only_specular, mode="scalar"):
                 is_deposited &= is_specular
-            connect_to_lasers(settings, params, histogram, generator, lit_vertex, is_deposited)
-            connect_by_mirrors(settings, params, histogram, generator, lit_vertex, hit)
+            connect_to_lasers(settings, placed, histogram, generator, lit_vertex, is_deposited)
+            connect_by_mirrors(settings, placed, histogram, generator, lit_vertex, hit)
 
         # ---- Continue, or start the next path -----------------------------------------------------------------------
         go_on = hit & settings.may_go_on(bounce)
         start = ~go_on & (starts.count < n_samples)
         alive = go_on | start
+        place = dr.select(start, starts.seq_v, place)
         starts, numbers, t = starts.begin(stride, steps, start)
+        placed = params.in_footprint(place)
+        sensor = placed.sensors.interaction
         vertex = dr.select(start, sensor, there.si) if settings.goes_on else sensor
         throughput = dr.select(start, _at_sensor(sensor), throughput)
         opl, medium = dr.select(start, 0, opl), dr.select(start, 1, medium)
@@ -170,14 +175,16 @@ def trace_paths(
                 sensor, sensor.p, mi.Vector3f(0), mi.Float(0), mi.Spectrum(1), mi.UInt32(FIRST_BOUNCE)
             )
             in_spot = settings.spot_radius * disk_point(mi.Point2f(unit_interval(numbers.bits_u), numbers.v))
-            connect_by_mirrors(settings, params, histogram, generator, at_sensor, start, in_spot)
+            connect_by_mirrors(settings, placed, histogram, generator, at_sensor, start, in_spot)
         has_target = alive & on_wall & (t < q)
         by_bsdf = alive & ~has_target
         sample = None
         if dr.hint(q > 0, mode="scalar"):
             sample = sampler.sample(numbers.bits_u, numbers.v, has_target)
             dark = has_target & turns_away(params, sample, vertex.p)
-            if dr.hint(q == 1 and sampler.dark_behind and not settings.mirrors_spot, mode="scalar"):
+            # with a footprint they would favour the places that see most dark points
+            may_skip = q == 1 and sampler.dark_behind and not settings.mirrors_spot and params.footprint is None
+            if dr.hint(may_skip, mode="scalar"):
                 starts, sample, dark = _begin_until_lit(
                     params, starts, stride, steps, n_samples, vertex.p, start, sample, dark
                 )

@@ -48,8 +48,7 @@ def trace_third_bounce(
     n_samples: mi.UInt32,
 ) -> tuple[LaneRandomness, SystematicSequence]:
     """Trace ``n_samples`` more paths per lane and deposit what they carry; as ``trace_paths``."""
-    sampler, sensors, stride = params.sampler, params.sensors, systematic.stride
-    sensor, period = sensors.interaction, params.continuation_period
+    sampler, stride, period = params.sampler, systematic.stride, params.continuation_period
     own_laser = params.lasers.gather(params.first_laser).interaction.p
     (step,) = recurrence_steps(1)
 
@@ -60,17 +59,18 @@ def trace_third_bounce(
     phase = mi.UInt32(randomness.phase)  # paths until the next one that continues
     done = mi.UInt32(0)  # paths of this lane
 
-    while dr.hint(done < n_samples, exclude=[settings, params, histogram, sampler, sensors, sensor, own_laser, period]):
+    while dr.hint(done < n_samples, exclude=[settings, params, histogram, sampler, own_laser, period]):
         # ---- Sample a point of the hidden geometry ------------------------------------------------------------------
         sample = sampler.sample(first_coordinate(position), unit_interval(seq_v), mi.Bool(True))
         goes_on = mi.Bool(False)
         if dr.hint(settings.goes_on, mode="scalar"):
             goes_on = phase == 0
             phase = dr.select(goes_on, period, phase) - 1
-        active = ~turns_away(params, sample, sensor.p)
+        placed = params.in_footprint(seq_v)
+        active = ~turns_away(params, sample, placed.sensors.interaction.p)
         if dr.hint(sampler.dark_behind and params.lasers_per_lane == 1, mode="scalar"):
             active &= goes_on | ~turns_away(params, sample, own_laser)
-        generator = _connect_sample(settings, params, histogram, generator, sample, active, goes_on)
+        generator = _connect_sample(settings, placed, histogram, generator, sample, active, goes_on)
 
         # ---- Next path ----------------------------------------------------------------------------------------------
         position += stride

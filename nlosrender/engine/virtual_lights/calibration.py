@@ -16,7 +16,14 @@ import numpy as np
 from nlosrender.engine.interface import Budget
 from nlosrender.engine.launch.pilot_points import SENSORS_PER_AXIS, Pilot, pilot_of
 from nlosrender.engine.launch.schedule import DEFAULT_TARGET
-from nlosrender.engine.virtual_lights.refinement import Gathered, Refined, estimated_error, finer_scale, refined_to
+from nlosrender.engine.virtual_lights.refinement import (
+    Gathered,
+    Refined,
+    estimated_error,
+    finer_scale,
+    footprint_error,
+    refined_to,
+)
 
 if TYPE_CHECKING:
     from nlosrender.engine.virtual_lights.third_bounce import ThirdBounce
@@ -43,9 +50,14 @@ def calibrated_lights(
     few = _pilot_of_patches(third, pilot)
     gather = cache(lambda scale: third.gather(few, scale))  # a smaller share goes on from these
     known_squares = device.exact_squares(few)
+    share_of_places = 0.0
+    if device.footprint is not None:
+        share_of_places = tuning.share_of_places * share
+        places = _places_of_footprint(third, few, share_of_places * target, known_squares)
+        budget, share = replace(budget, footprint_places=places), math.sqrt(share**2 - share_of_places**2)
     refined = refined_to(share * target, third.tessellator, gather, known_squares)
     if further is None:
-        return _with_patches(budget, refined), (refined.error / target) ** 2
+        return _with_patches(budget, refined), (refined.error / target) ** 2 + share_of_places**2
     gathered, more = refined.gathered, pilot.sensors.size / few.sensors.size
     goal, squares = tuning.rest_share_of_many * target, gathered.squares * more
     squares += device.exact_squares(pilot)
@@ -64,10 +76,19 @@ def calibrated_lights(
         share = finer
         refined = refined_to(share * target, third.tessellator, gather, known_squares, refined.patch_scale)
     # patches come in steps: what they leave of their share is spent on rounds
-    third_squares = min(share, refined.error / target) ** 2
+    third_squares = min(share, refined.error / target) ** 2 + share_of_places**2
     rounds = further.rounds_needed(error, done, math.sqrt(share_squares - third_squares) * target)
     used = third_squares + (error / target) ** 2 * done / rounds
     return replace(_with_patches(budget, refined), rounds=rounds), min(used, share_squares)
+
+
+def _places_of_footprint(third: ThirdBounce, few: Pilot, target: float, known_squares: float) -> int:
+    """Return how many places in a footprint bring its error to ``target``, and leave them set for the pilot."""
+    for places in third.tuning.footprint_places:
+        third.footprint_places = places
+        if footprint_error(third.gather(few, third.tuning.coarsest_scale), known_squares) <= target:
+            break
+    return places
 
 
 def _with_patches(budget: Budget, refined: Refined) -> Budget:

@@ -74,8 +74,10 @@ class VirtualLightEngine:
         mirror = device.lone_mirror if has_vpls else None
         bin_width = self.time_axis.bin_width_opl / built.metres_per_engine_unit
         self.tessellator = Tessellator(built, capture, bin_width, mirror=mirror, tuning=tuning)
-        reciprocal = mirror is None and is_reciprocal(
-            built, capture, self.time_axis.n_bins, is_lambertian=all_lambertian, tuning=tuning
+        reciprocal = (
+            mirror is None
+            and device.footprint is None
+            and is_reciprocal(built, capture, self.time_axis.n_bins, is_lambertian=all_lambertian, tuning=tuning)
         )
         self.third = ThirdBounce(device, self.tessellator, self.settings, lanes, reciprocal, mirror)
         self.further: VplBounces | None = None  # where further bounces are asked for
@@ -180,6 +182,7 @@ class VirtualLightEngine:
         budget = self.calibrate(budget)
         scale = budget.patch_scale or self.third.tuning.coarsest_scale
         shared = 0.5 if self.has_further_bounces else 1.0
+        self.third.footprint_places = budget.footprint_places or self.third.tuning.footprint_places[1]
         coarse, fine = self.third.pair(batch, scale, passes.stage("third bounce", 0, shared))
         left = budget.time_limit_s
         if left is not None:
@@ -201,6 +204,10 @@ class VirtualLightEngine:
             result.contrasts[:, :, slot] += contrasts_of_deviation(in_window, places)
             result.variance[:, slot] += np.square(in_window, out=in_window)
             result.outside[:, slot] += third[:, number, ..., -1]
+            if fine.footprint_deviation is not None:
+                in_window = factor * fine.footprint_deviation[:, number, ..., :-1]
+                result.contrasts[:, :, slot] += contrasts_of_deviation(in_window, places)
+                result.variance[:, slot] += np.square(in_window)
         result.refuse_not_finite()
         return result
 

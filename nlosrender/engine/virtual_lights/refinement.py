@@ -26,6 +26,7 @@ class Gathered:
     values: NDArray[np.float64]
     n_patches: int
     patch_scale: float
+    footprint_deviation: NDArray[np.float64] | None = None  # of ``values``: half the difference of two sets of places
 
     @property
     def squares(self) -> float:
@@ -81,6 +82,12 @@ def coarser_scale(tessellator: Tessellator, patch_scale: float) -> float:
     ):
         coarser = min(1.1 * coarser, coarsest)
     return coarser
+
+
+def footprint_error(gathered: Gathered, known_squares: float = 0.0) -> float:
+    """Return the relative L2 error of the mean over a footprint, as the two halves of its places differ."""
+    noise = 0.0 if gathered.footprint_deviation is None else _squares(gathered.footprint_deviation)
+    return _relative(noise, gathered, known_squares)
 
 
 def refined_to(

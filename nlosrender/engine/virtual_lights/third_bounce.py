@@ -36,7 +36,12 @@ from nlosrender.engine.virtual_lights.gather.lighting import (
 )
 from nlosrender.engine.virtual_lights.refinement import Gathered, coarser_scale
 from nlosrender.engine.virtual_lights.tuning import VirtualLightTuning
-from nlosrender.engine.virtual_lights.visibility.masks import VisibilityMasks, WallTiles, count_sensors
+from nlosrender.engine.virtual_lights.visibility.masks import (
+    VisibilityMasks,
+    WallTiles,
+    count_sensors,
+    footprint_margin,
+)
 
 if TYPE_CHECKING:
     from nlosrender.engine.virtual_lights.elements.tessellator import Tessellator
@@ -96,14 +101,25 @@ class ThirdBounce:
         self.device, self.tessellator, self.settings, self.lanes = device, tessellator, settings, lanes
         self.is_reciprocal = is_reciprocal
         self.masks = VisibilityMasks(device.built, tessellator.tuning)
+        self.footprint_places = self.tuning.footprint_places[1]  # as ``Budget.footprint_places``
         self._saved: dict[tuple[float, bool], LitPatches] = {}  # per patch scale, and whether lit by mirror
 
     def gather(self, batch: Batch | Pilot, patch_scale: float, passes: Passes | None = None) -> Gathered:
         """Gather a batch at one resolution."""
         passes = passes or Passes()
         patches = self.tessellator.patches(patch_scale)  # made here once: the tessellator keeps small resolutions only
+        deviation = None
         if (earlier := passes.resumed("values")) is not None:
-            values = earlier.arrays["values"]
+            values, deviation = earlier.arrays["values"], earlier.arrays.get("deviation")
+        elif self.device.footprint is not None:
+            one, other = (
+                self._sums(
+                    batch, patch_scale, patches, passes.stage(f"half {half}", half / 2, (half + 1) / 2), half=half
+                )
+                for half in range(2)
+            )
+            halves = [2 / self.footprint_places * sums.on_host() for sums in (one, other)]
+            values, deviation = (halves[0] + halves[1]) / 2, (halves[0] - halves[1]) / 2
         elif self.is_reciprocal and isinstance(batch, Batch):
             values = self._by_reciprocity(batch, patch_scale, patches, passes)
         else:
@@ -115,9 +131,9 @@ class ThirdBounce:
                 values = np.concatenate([values, *mirrored], axis=1)
                 if not self.device.options.bounces.split:
                     values = values.sum(axis=1, keepdims=True)
-        passes.finish(Snapshot({"values": values}))
+        passes.finish(Snapshot({"values": values} | ({} if deviation is None else {"deviation": deviation})))
         count = len(patches) if self.tessellator.regions is None else self.tessellator.count(patch_scale)
-        return Gathered(values, max(count, 1), patch_scale)  # 1: nothing may face the wall
+        return Gathered(values, max(count, 1), patch_scale, deviation)  # 1: nothing may face the wall
 
     def _mirrored(
         self, batch: Batch | Pilot, patch_scale: float, patches: Patches, passes: Passes
@@ -175,17 +191,40 @@ class ThirdBounce:
         passes: Passes,
         lasers: NDArray[np.int64] | None = None,
         way: tuple[bool, bool] = (False, False),
+        half: int = 0,
     ) -> BlockHistogram:
         """Gather the ``patches`` that all sensor points share, then what regions have of their own.
 
         ``lasers`` (sensors,) tells of how many lasers each sensor point gathers the light, the first ones; None: all.
-        ``way``: whether lasers, and sensor points, see the patches by way of the mirror.
+        ``way``: whether lasers, and sensor points, see the patches by way of the mirror. ``half``: of the places in a
+        footprint the even or the odd ones, whose light is added up.
         """
-        lit_by, seen_by = (self.mirror if by_mirror else None for by_mirror in way)
-        shape = self.shape(batch)
+        shape, footprint = self.shape(batch), self.device.footprint
         lanes = self._lanes(batch, shape, lasers)
         histogram = BlockHistogram(shape, lanes.order)
         work = GatherPasses(self.settings, histogram, passes, self.device.options.schedule.first_gather_pairs)
+        if footprint is None:
+            self._gather_from(lanes, batch, shape, patch_scale, patches, work, way)
+            return histogram
+        places = footprint.turned_places(range(half, self.footprint_places // 4, 2))
+        for some in places.reshape(-1, shape.replicas, 2):
+            x, y = (on_device(mi.Float, np.repeat(column, shape.sensors)) for column in some.T)
+            moved = replace(lanes, params=lanes.params.at_place(mi.Point2f(x, y)))
+            self._gather_from(moved, batch, shape, patch_scale, patches, work, way)
+        return histogram
+
+    def _gather_from(
+        self,
+        lanes: _Lanes,
+        batch: Batch | Pilot,
+        shape: HistogramShape,
+        patch_scale: float,
+        patches: Patches,
+        work: GatherPasses,
+        way: tuple[bool, bool],
+    ) -> None:
+        """Add what the sensor points of ``lanes`` gather; parameters as of ``_sums``."""
+        lit_by, seen_by = (self.mirror if by_mirror else None for by_mirror in way)
         if len(patches):
             wall_tiles = self._wall_tiles(batch)
             packed = self._shared_lights(lanes.params, shape, patch_scale, patches, wall_tiles, lit_by)
@@ -196,14 +235,14 @@ class ThirdBounce:
             if not len(places.numbers):  # nothing is close to the wall there
                 continue
             chosen = np.flatnonzero(np.isin(lanes.regions, labels))
-            slice_index = np.searchsorted(labels, lanes.regions[chosen]) * shape.replicas + chosen // shape.sensors
+            slices = self._slices(shape)
+            slice_index = np.searchsorted(labels, lanes.regions[chosen]) * slices + chosen // shape.sensors % slices
             index = on_device(mi.UInt32, chosen)
             some, wall_tiles = lanes.params.gather_lanes(index), self._wall_tiles(batch, labels)
             lit_patches = self._light_by_lasers(some, shape, Patches.joined(near), places, wall_tiles, lit_by)
-            packed = pack_patches(self.settings, some, lit_patches, shape.replicas, shape.lasers, lit_by)
-            tile = wall_tiles.tile_bit(on_device(mi.UInt32, slice_index // shape.replicas), some.sensors.interaction.p)
+            packed = pack_patches(self.settings, some, lit_patches, slices, shape.lasers, lit_by)
+            tile = wall_tiles.tile_bit(on_device(mi.UInt32, slice_index // slices), some.sensors.interaction.p)
             work.gather(some, packed, index, on_device(mi.UInt32, slice_index), tile, seen_by)
-        return histogram
 
     def shadow_ray_targets(self, batch: Batch | Pilot, patch_scale: float) -> ShadowRayTargets:
         """Return the patches that the gather of a batch goes through, in its order; those all sensor points share."""
@@ -242,7 +281,7 @@ class ThirdBounce:
             # a batch gathers two resolutions
             others = [(other, lit) for other, lit in self._saved.items() if other != key]
             self._saved = dict([*others, (key, lit_patches)][-2 if self.mirror is None else -4 :])
-        return pack_patches(self.settings, params, lit_patches, shape.replicas, shape.lasers, lit_by)
+        return pack_patches(self.settings, params, lit_patches, self._slices(shape), shape.lasers, lit_by)
 
     def _light_by_lasers(
         self,
@@ -267,7 +306,8 @@ class ThirdBounce:
         labels = self.tessellator.regions.labels
         points = capture.sensor_grid.positions.reshape(-1, 3) / built.metres_per_engine_unit
         groups = [points[labels == label] for label in regions]
-        return WallTiles.around(groups, count_sensors(capture, batch) // len(self.tessellator.regions.near))
+        n_points = count_sensors(capture, batch) // len(self.tessellator.regions.near)
+        return WallTiles.around(groups, n_points, footprint_margin(built, capture))
 
     def pair(self, batch: Batch | Pilot, patch_scale: float, passes: Passes | None = None) -> tuple[Gathered, Gathered]:
         """Gather a batch at ``patch_scale`` and at the coarser resolution it is compared with."""
@@ -277,21 +317,29 @@ class ThirdBounce:
         return coarse, self.gather(batch, patch_scale, passes.stage("fine", share, 1))
 
     def shape(self, batch: Batch | Pilot) -> HistogramShape:
-        """Return the histogram's shape; its ``replicas`` are slices: lanes that share the patches of a sensor point.
+        """Return the histogram's shape; its ``replicas`` are slices: lanes that share the patches of a sensor point, or
+        places in its footprint.
 
         As many as the capture needs, not the batch: how a capture is cut must not show in the result. No more than
         the replicas that the plan has counted memory for.
         """
         most = self.device.options.replicas if isinstance(batch, Batch) else self.lanes
         points = self.device.capture.n_sensors if isinstance(batch, Batch) else batch.sensors.size
-        return replace(self.device.shape(batch, 1), replicas=max(1, min(math.ceil(self.lanes / points), most)))
+        replicas = max(1, min(math.ceil(self.lanes / points), most))
+        if self.device.footprint is not None:  # a power of two, as the number of places is
+            replicas = min(1 << (replicas.bit_length() - 1), self.footprint_places // 2)
+        return replace(self.device.shape(batch, 1), replicas=replicas)
+
+    def _slices(self, shape: HistogramShape) -> int:
+        """Return how many lanes share the patches of a sensor point; in a footprint each is at a place of its own."""
+        return shape.replicas if self.device.footprint is None else 1
 
     def _lanes(self, batch: Batch | Pilot, shape: HistogramShape, lasers: NDArray[np.int64] | None = None) -> _Lanes:
         params = self.device.launch_params(batch, replace(shape, replicas=1))
         indices, order = self.device.sensor_indices(batch), self.device.lane_order(batch)
         lane = dr.arange(mi.UInt32, shape.lanes)
         params = params.gather_lanes(dr.gather(mi.UInt32, on_device(mi.UInt32, order), lane % shape.sensors))
-        slice_index = lane // shape.sensors
+        slice_index = lane // shape.sensors % self._slices(shape)
         dr.eval(lane, slice_index)
         if lasers is not None:
             params = replace(params, n_lasers=on_device(mi.UInt32, np.tile(lasers[order], shape.replicas)))

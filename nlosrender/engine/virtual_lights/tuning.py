@@ -61,6 +61,11 @@ class VirtualLightTuning:
     # half, as is and twice (waves, two sheets).
     min_elements_per_moment: int = 4
 
+    # ---- Footprints of sensor points (docs/scans.md) ---------------------------------------------------------------
+    # Places tried until their halves agree; the second without a target. Powers of two: halves of whole quarter turns.
+    footprint_places: tuple[int, ...] = (8, 16, 32, 64, 128, 256, 512)
+    share_of_places: float = 0.6  # of the error that the third bounce may have
+
     # ---- Elements: regions of the sensor grid (3.4) ----------------------------------------------------------------
     # Regions along each side, the first with at least ``min_region_sensors`` each. A room before 64 x 64 points: 2081 /
     # 2867 / 6613 patches a point and 0.31 / 0.28 / 0.38 s CPU at 64 / 256 / 512, the error 3.2 to 3.3 %.

@@ -138,6 +138,8 @@ def _general_losses(capture: StoredCapture, indices: tuple[int, ...]) -> list[st
         stokes = header.attributes.get("channels") == STOKES
         kept = "of the Stokes components the intensity alone is kept"
         losses.append(kept if stokes else f"the {header.sizes['channel']} channels are averaged")
+    if header.footprint is not None:
+        losses.append(f"{header.footprint[0]}: the format takes it for the light of the point")
     if header.has_variance:
         losses.append("the variance is left out")
     return losses

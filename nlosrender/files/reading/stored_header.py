@@ -105,6 +105,12 @@ class StoredHeader:
         return self.scan_type == LINE_OF_SIGHT or layout.EMPTY_POINTS in self.attributes
 
     @property
+    def footprint(self) -> tuple[str, float] | None:
+        """What each histogram is the mean over, in words, and its area [m^2]; None: sensor points are points."""
+        words, area = (self.attributes.get(name) for name in (layout.FOOTPRINT, layout.FOOTPRINT_AREA))
+        return (words, float(area)) if isinstance(words, str) and isinstance(area, (int, float)) else None
+
+    @property
     def is_measured(self) -> bool:
         """Whether the samples are a detector's counts."""
         return self.data_attributes.get("unit") == layout.COUNTS_UNIT

@@ -58,9 +58,10 @@ class WallTiles:
     n_points: int  # sensor points that share a mask
 
     @classmethod
-    def around(cls, groups: Sequence[Float64], n_points: int) -> WallTiles:
-        """Return the rectangles around groups of wall points (n, 3) [engine units]."""
+    def around(cls, groups: Sequence[Float64], n_points: int, margin: Float64 | float = 0.0) -> WallTiles:
+        """Return the rectangles, wider by ``margin`` (2,) on each side, around wall points (n, 3) [engine units]."""
         low, high = (np.array([end(points[:, :2], axis=0) for points in groups]) for end in (np.min, np.max))
+        low, high = low - margin, high + margin
         sizes = (high - low + 2 * MARGIN) / TILES
         return cls(on_device(mi.Float, np.concatenate([low - MARGIN, sizes], axis=1).ravel()), n_points)
 
@@ -69,7 +70,7 @@ class WallTiles:
         """Return the rectangle around all sensor points, and all laser points if asked for."""
         grids = [capture.sensor_grid, *([capture.laser_grid] if with_lasers else [])]
         points = np.concatenate([grid.positions.reshape(-1, 3) / built.metres_per_engine_unit for grid in grids])
-        return cls.around([points], count_sensors(capture, batch))
+        return cls.around([points], count_sensors(capture, batch), footprint_margin(built, capture))
 
     def tiles(self, index: mi.UInt32) -> mi.Vector4f:
         """Return lowest x and y of a rectangle, and width and height of its tiles."""
@@ -81,6 +82,12 @@ class WallTiles:
         places = (point.x - left) / width, (point.y - bottom) / height
         column, row = (mi.UInt32(dr.clip(place, 0, TILES - 1)) for place in places)
         return mi.UInt64(1) << mi.UInt64(row * TILES + column)
+
+
+def footprint_margin(built: BuiltScene, capture: Capture) -> Float64:
+    """Return how far the footprints of sensor points reach along the wall's axes (2,) [engine units]."""
+    seen = capture.footprint
+    return np.zeros(2) if seen is None else np.array([seen.width, seen.height]) / (2 * built.metres_per_engine_unit)
 
 
 def count_sensors(capture: Capture, batch: Batch | Pilot) -> int:

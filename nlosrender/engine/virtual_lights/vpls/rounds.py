@@ -275,7 +275,7 @@ class VplBounces:
         state = np.random.SeedSequence([self.options.seed, number]).generate_state(2)
         generator = np.random.default_rng(state[0])
         vpls = Vpls.joined([self.sampler.sample(plan.vpls, generator) for _ in range(plan.replicas)])
-        params = self.device.launch_params(batch, shape)
+        params = self._placed(self.device.launch_params(batch, shape), shape, number)
         mirror = self.device.lone_mirror
         contributions = vpl_contributions(plan, params, vpls, self.proposal_lasers, int(state[1]), mirror)
         if not contributions.count:
@@ -308,6 +308,15 @@ class VplBounces:
             done += steps
             if done < longest:
                 report_progress(done)
+
+    def _placed(self, params: LaunchParams, shape: HistogramShape, number: int) -> LaunchParams:
+        """Return these with the sensor points at places in their footprints, another one per round and replica."""
+        if params.footprint is None:
+            return params
+        places = params.footprint.places(number * shape.replicas + np.arange(shape.replicas))
+        replica = dr.arange(mi.UInt32, shape.lanes) // shape.sensors
+        x, y = (dr.gather(mi.Float, on_device(mi.Float, column), replica) for column in places.T)
+        return params.at_place(mi.Point2f(x, y))
 
     def _add_shared(
         self,
@@ -351,7 +360,7 @@ class VplBounces:
         Whole windows: another start of the window need not be another kernel.
         """
         capture, time_axis = self.device.capture, self.device.time_axis
-        legs = capture.sensor_legs.min() + capture.laser_legs.min()
+        legs = capture.sensor_legs.min() + capture.laser_legs.min() - capture.blur
         before = math.ceil((time_axis.start_opl - legs) / time_axis.bin_width_opl) + 2
         return max(1, 1 + math.ceil(before / time_axis.n_bins)) * time_axis.n_bins
 
