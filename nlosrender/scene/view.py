@@ -18,15 +18,17 @@ from nlosrender.scene.build import EngineScene, count_triangles
 from nlosrender.scene.loading.loaded_surfaces import with_vertices
 from nlosrender.scene.loading.materials import check_surface, medium_warnings, mitsuba_spectrum
 from nlosrender.scene.loading.mitsuba_shapes import load_surface, shape_bounds
+from nlosrender.scene.loading.separation import load_separated
 from nlosrender.scene.loading.xml_loading import WHERE, load_xml_scene
 from nlosrender.scene.meshes.mesh_report import MeshReport
+from nlosrender.scene.meshes.primitives import rectangle_mesh
 from nlosrender.scene.meshes.triangle_mesh import TriangleMesh
-from nlosrender.scene.picture_orientation import upright_bsdf
+from nlosrender.scene.picture_orientation import has_picture, readable, upright_bsdf
 from nlosrender.scene.pose import Float64, Pose
 from nlosrender.scene.read_surfaces import read_surfaces
 from nlosrender.scene.surfaces import ShapeDescription, Surface, all_surfaces
 from nlosrender.scene.walls.image_plane import ImagePlane, image_plane
-from nlosrender.scene.walls.wall import RelayWall
+from nlosrender.scene.walls.wall import RectangleWall, RelayWall
 from nlosrender.scene.walls.wall_from_config import relay_wall_from_config
 
 if TYPE_CHECKING:
@@ -79,13 +81,18 @@ def build_view(scene_config: SceneConfig, capture_config: CaptureConfig) -> Buil
     frame = _engine_frame(scene_config, wall, plane)
     surfaces = all_surfaces(scene_config, frame)
     if wall is not None:
-        surfaces = (_wall_surface(wall, scene_config.wall.bsdf, frame), *surfaces)
+        as_mesh = isinstance(wall, RectangleWall) and not capture_config.is_line_of_sight
+        surfaces = (_wall_surface(wall, scene_config.wall.bsdf, frame, as_mesh=as_mesh), *surfaces)
     read = read_surfaces(surfaces)
     lamps = [item for item in scene_config.emitters if isinstance(item, (PointLamp, SpotLamp))]
     points = [frame.to_local(lamp.position) for lamp in lamps]
     camera = frame.to_local(plane.pose.to_scene(plane.default_device_position))
     unit = 1.0 if whole is not None else _unit_length([shape.bounds() for shape in read.shapes], [*points, camera])
-    shapes = [load_surface(surface, shape, unit) for surface, shape in zip(surfaces, read.shapes, strict=True)]
+    if capture_config.is_line_of_sight:
+        shapes = [load_surface(surface, shape, unit) for surface, shape in zip(surfaces, read.shapes, strict=True)]
+        coincident: tuple[str, ...] = ()
+    else:
+        _, shapes, coincident = load_separated(surfaces, read.shapes, None, unit)
     contents: dict[str, object] = {f"lamp_{index}": _lamp(lamp, frame, unit) for index, lamp in enumerate(lamps)}
     if whole is not None:
         is_view = capture_config.is_line_of_sight
@@ -107,15 +114,18 @@ def build_view(scene_config: SceneConfig, capture_config: CaptureConfig) -> Buil
         frame=frame,
         metres_per_engine_unit=unit,
         n_triangles=count_triangles(shapes),
-        warnings=left_out + read.warnings + medium_warnings(zip(keys, shapes, strict=True)),
+        warnings=left_out + read.warnings + coincident + medium_warnings(zip(keys, shapes, strict=True)),
         meshes=read.meshes + of_whole,
     )
 
 
-def _wall_surface(wall: RelayWall, bsdf: Mapping[str, object], frame: Pose) -> Surface:
-    """Return a relay wall as any other surface, in the engine's frame."""
-    description = wall.shape_description()
+def _wall_surface(wall: RelayWall, bsdf: Mapping[str, object], frame: Pose, *, as_mesh: bool) -> Surface:
+    """Return a relay wall as any other surface, in the engine's frame; ``as_mesh``: of a rectangle, with vertices."""
     to_frame = frame.inverse_matrix() @ wall.pose.matrix()
+    if as_mesh:
+        mesh = rectangle_mesh(wall.width, wall.height, None).transformed(to_frame)
+        return Surface("relay_wall", "scene.relay_wall", readable(mesh) if has_picture(bsdf) else mesh, bsdf)
+    description = wall.shape_description()
     item = description if isinstance(description, TriangleMesh) else ShapeDescription(description)
     shape = item.transformed(to_frame)
     return Surface("relay_wall", "scene.relay_wall", shape, upright_bsdf(description, bsdf))

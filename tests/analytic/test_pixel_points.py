@@ -222,6 +222,17 @@ def test_a_file_of_pixels_keeps_which_are_empty(tmp_path: Path) -> None:
     assert f"{is_empty.sum()} of 12 pixels see no surface" in " ".join(warned)
 
 
+def test_coincident_surfaces_are_told_apart() -> None:
+    """Of two surfaces in one place every pixel sees the later one, with its BSDF, and a warning says so."""
+    poster = {"width": 0.4, "height": 0.4, "center": [1, 0.3, 0.9], "bsdf": {"type": "diffuse", "reflectance": 0.6}}
+    aim = {"laser_target": [0.3, -0.2, 0.0]}
+    plain, covered = corner("single", aim), corner("single", aim, {**CORNER[1], **poster})
+    ratio = covered.bounce(2).sum(axis=-1) / plain.bounce(2).sum(axis=-1)
+    on_it = (np.abs(_frame_of_corner(plain)[..., 1:] - [0.3, 0.9]) < 0.2).all(axis=-1)
+    assert 0 < on_it.sum() < on_it.size
+    np.testing.assert_allclose(ratio[0, 0], np.where(on_it, 0.6 / RHO[1], 1), rtol=1e-4)  # moved by some 1e-5 m
+
+
 def test_the_laser_lights_what_it_meets_first() -> None:
     """A target behind a surface lights the surface; the spot is the same for each target along the beam."""
     place, target = np.array([-0.7, 0, 1.2]), np.array([0.3, -0.2, 0.0])

@@ -71,13 +71,13 @@ def curvature(shape: mi.Shape) -> float:
     return 1 / RoundSurface.of(shape).radius if shape.class_name() in ROUND_PLUGINS else 0.0
 
 
-def nested_surfaces(shapes: Sequence[mi.Shape], wall: mi.Shape) -> list[Nested]:
+def nested_surfaces(shapes: Sequence[mi.Shape], wall: mi.Shape | None) -> list[Nested]:
     """Return which spheres and cylinders get another radius: of those too near to a concentric one for rays.
 
     Of surfaces with one radius the later one is in front: outermost where they are seen from outside, innermost where
     they are seen from within, and these lie inside the former. Before a round relay wall hidden surfaces are in front.
     """
-    everything = dict(enumerate([wall, *shapes], WALL))
+    everything = dict(enumerate(shapes)) if wall is None else dict(enumerate([wall, *shapes], WALL))
     surfaces = {n: RoundSurface.of(shape) for n, shape in everything.items() if shape.class_name() in ROUND_PLUGINS}
     groups = [{number} for number in surfaces]
     for i, j in itertools.combinations(surfaces, 2):

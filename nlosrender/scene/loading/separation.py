@@ -25,9 +25,12 @@ MIN_WARNED_SHARE = 1e-3  # of an item's area that coincides with other surfaces;
 
 
 def load_separated(
-    surfaces: Sequence[Surface], read: Sequence[TriangleMesh | ShapeDescription], wall_shape: mi.Shape, unit: float
+    surfaces: Sequence[Surface],
+    read: Sequence[TriangleMesh | ShapeDescription],
+    wall_shape: mi.Shape | None,
+    unit: float,
 ) -> tuple[mi.Scene, list[mi.Shape], tuple[str, ...]]:
-    """Load surfaces, whose shapes have been ``read``, and the scene of them and the wall.
+    """Load surfaces, whose shapes have been ``read``, and the scene of them and the wall, if there is one.
 
     Returns
     -------
@@ -57,9 +60,9 @@ def load_separated(
             description = _resized(shape.description, one.factor)
             shapes[one.moved] = load_plugin(description, surfaces[one.moved], bsdfs[one.moved], unit)
     warned: dict[int, Overlap] = {}
+    own: dict[str, object] = {"type": "scene"} | ({} if wall_shape is None else {WALL_ID: wall_shape})
     for seed in range(MAX_LAYERS):
-        contents: dict[str, object] = {"type": "scene", WALL_ID: wall_shape}
-        scene = mi.load_dict(contents | {f"hidden_{index}": shape for index, shape in enumerate(shapes)})
+        scene = mi.load_dict(own | {f"hidden_{index}": shape for index, shape in enumerate(shapes)})
         found = overlaps(scene, shapes, meshes, seed)
         for overlap in found:
             index = overlap.mesh
