@@ -18,7 +18,15 @@ from nlosrender.files.reading.reader import read_header
 _ATTRIBUTES = {"engine": "render_engine", "engine_reason": "engine_reason", "written_by": "engine"} | {
     name: name
     for name in (
-        *("samples", "seed", "error_estimate", "error_estimate_per_bounce", "energy", "energy_error_per_bounce"),
+        *(
+            "samples",
+            "seed",
+            "target_missed",
+            "error_estimate",
+            "error_estimate_per_bounce",
+            "energy",
+            "energy_error_per_bounce",
+        ),
         *("energy_error", "out_of_window_energy", "seconds", "created", "config_hash", "part", "meshes", "versions"),
         *("sensor", "measurement", "corrections", "measured_from", "ideal_error_estimate"),
     )

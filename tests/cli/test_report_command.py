@@ -163,7 +163,7 @@ def test_outliers_are_pictured_first(dataset: Path) -> None:
 def test_page_of_a_folder_without_an_index(tmp_path: Path) -> None:
     """Every capture below it is looked at; one that cannot be read is a failure."""
     write(tmp_path / "some" / "deep" / "a.hdf5", **STATED)
-    write(tmp_path / "some" / "b.hdf5")
+    write(tmp_path / "some" / "b.hdf5", **STATED, target_missed="0.01 was asked for")
     (tmp_path / "some" / "c.hdf5").write_text("no capture")
     _, _, text = report(tmp_path, "some")
     flat = " ".join(re.sub(r"<[^>]*>", " ", text).split())
@@ -171,6 +171,7 @@ def test_page_of_a_folder_without_an_index(tmp_path: Path) -> None:
     assert "1 failed" in flat
     assert "c.hdf5: is not an HDF5 file" in flat
     assert "deep/a.hdf5 done 1 0.023 2.5" in flat
+    assert "b.hdf5 stated error 0.023 target missed" in flat
 
 
 @pytest.mark.parametrize(

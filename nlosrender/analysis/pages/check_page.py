@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from nlosrender import __version__
-from nlosrender.analysis.comparison.dataset import CheckedFile, DatasetCheck
+from nlosrender.analysis.comparison.dataset import DatasetCheck
 from nlosrender.analysis.comparison.difference_view import DifferenceView, difference_view
 from nlosrender.analysis.laser_view import dotted, lit_window
 from nlosrender.analysis.pages.html_page import colored, curve, write_page
@@ -35,9 +35,11 @@ def write_check_page(path: Path, check: DatasetCheck, folder: Path, reference: P
         shown = file.report is not None and not file.report.get("identical")
         entry: dict[str, Any] = {"file": file, "number": number, "report": file.report}
         entries.append(entry | {"compared": compared, "shown": shown, "pictures": None, "unread": ""})
-        if file in pictured:
+        if file.report is not None and file in pictured:
             try:
-                entries[-1]["pictures"] = _pictures(file, folder, reference)
+                laser = file.report["worst"]["laser"]
+                view = difference_view(folder / file.name, reference / file.name, (laser[0], laser[1]))
+                entries[-1]["pictures"] = _pictures(view)
             except FileError as error:  # gone or changed since it was checked
                 entries[-1]["unread"] = str(error)
     write_page(
@@ -55,10 +57,7 @@ def write_check_page(path: Path, check: DatasetCheck, folder: Path, reference: P
     )
 
 
-def _pictures(file: CheckedFile, folder: Path, reference: Path) -> dict[str, Any]:
-    assert file.report is not None
-    row, column = file.report["worst"]["laser"]
-    view = difference_view(folder / file.name, reference / file.name, (row, column))
+def _pictures(view: DifferenceView) -> dict[str, Any]:
     first, last = lit_window(view.histogram + view.reference_histogram)
     histograms = [values[first : last + 1] for values in (view.histogram, view.reference_histogram)]
     top = max(float(values.max()) for values in histograms)

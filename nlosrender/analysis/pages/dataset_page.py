@@ -70,7 +70,7 @@ def _rows(folder: Path) -> tuple[list[dict[str, Any]], int]:
         return [_row(number, _looked_at(folder, name), folder) for number, name in enumerate(names)], 0
     entries = read_index(folder)["captures"]
     listed = {entry["file"] for entry in entries}
-    rows = [_row(number, entry, folder) for number, entry in enumerate(entries)]
+    rows = [_row(number, _still_there(folder, entry), folder) for number, entry in enumerate(entries)]
     return rows, sum(name not in listed for name in names)
 
 
@@ -89,7 +89,18 @@ def _looked_at(folder: Path, name: str) -> dict[str, Any]:
         "error_estimate": stated if isinstance(stated, (int, float)) else None,
         "seconds": seconds.get("total"),
         "unsampled_paths": summary["unsampled_paths"],
+        "target_missed": summary["target_missed"] is not None,
     }
+
+
+def _still_there(folder: Path, entry: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Return an entry of an index, as a failure where its file is damaged or gone since it was rendered."""
+    try:
+        if entry["status"] == "done":
+            read_header(folder / entry["file"])
+    except FileError as error:
+        return {**entry, "status": "failed", "message": str(error)}
+    return entry
 
 
 def _row(number: int, entry: Mapping[str, Any], folder: Path) -> dict[str, Any]:
@@ -100,11 +111,6 @@ def _row(number: int, entry: Mapping[str, Any], folder: Path) -> dict[str, Any]:
     row["energy"] = sum(entry["energy"].values()) if entry.get("energy") else None
     row["bytes"] = path.stat().st_size if path.is_file() else None
     row["shown"] = {key: shown_value(value) for key, value in row["values"].items()}
-    if row["status"] == "done":
-        try:
-            read_header(path)
-        except FileError as error:  # damaged or gone since it was rendered
-            row |= {"status": "failed", "message": str(error)}
     return row
 
 
