@@ -136,6 +136,33 @@ def test_third_bounce_of_a_tilted_surface() -> None:
     assert_agrees(result.bounce(3), result.bounce_variance(3), expected, replicas=result.plan.replicas, floor=0.01)
 
 
+def test_a_camera_in_a_sphere_gives_the_listed_points() -> None:
+    """What a camera sees of a round relay wall is the list of these points on it, to both engines."""
+    wall = {"type": "sphere", "center": [0, 0, 0], "radius": 1.5, "inside": True, "width": None, "height": None}
+    camera = {"position": [0.2, 0.1, -0.6], "look_at": [0, 0, -1.5], "fov_deg": 50}
+    aim = {"laser_target": [0.3, -0.2, -1.45], "laser_position": camera["position"]}
+    keys = {"spp": None, "target_error": 0.05, "max_bounces": 3}
+    for engine in ("virtual_lights", "path"):
+        config = seen("single", BALL, wall=wall, camera=camera, capture=aim, engine=engine, **keys)
+        result = render(config)
+        lasers, sensors = (
+            np.stack(
+                [1.5 * np.arctan2(grid.positions[..., 0], grid.positions[..., 2]), grid.positions[..., 1]], axis=-1
+            )
+            for grid in (result.capture.laser_grid, result.capture.sensor_grid)
+        )
+        listed = flat_wall(BALL, wall=wall, capture=DEVICES, engine=engine, **keys)
+        del listed["capture"]["sensor_grid"]
+        listed["capture"] |= {"sensor_points": sensors.reshape(-1, 2).tolist(), "laser_point": lasers[0, 0].tolist()}
+        listed["capture"] |= dict.fromkeys(("laser_position", "sensor_position"), camera["position"])
+        expected = render(listed)
+        assert (result.samples == 0) == (engine == "virtual_lights")
+        second = [each.bounce(2).sum(axis=-1).ravel() for each in (result, expected)]
+        np.testing.assert_allclose(*second, rtol=2e-5)  # points of float32
+        third = [each.bounce(3).sum(axis=-1).ravel() for each in (result, expected)]
+        assert relative_l2(third[0] - third[1], third[1]) < 0.05
+
+
 CORNER = (  # a floor and a wall that meet at x = 1, and nothing else
     {"type": "rectangle", "width": 2.0, "height": 2.0, "center": [0, 0, 0], "normal": [0, 0, 1]},
     {"type": "rectangle", "width": 2.0, "height": 2.0, "center": [1, 0, 1], "normal": [-1, 0, 0], "up": [0, 0, 1]},

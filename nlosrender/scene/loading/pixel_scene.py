@@ -1,4 +1,4 @@
-"""Scene of a scan whose points a camera sees: with a relay wall where they lie on one rectangle, else without."""
+"""Scene of a scan whose points a camera sees: with a relay wall where all of them lie on one, else without."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import mitsuba as mi
 import numpy as np
 
 from nlosrender.config.hidden_geometry import RectangleConfig
-from nlosrender.config.relay_wall import RectangleWallConfig
+from nlosrender.config.relay_wall import CylinderWallConfig, RectangleWallConfig, SphereWallConfig
 from nlosrender.errors import ConfigError
 from nlosrender.scene.bounding_box import box_corners, joined_bounds
 from nlosrender.scene.build import BuiltScene, SceneWithoutWall, build_scene
@@ -25,7 +25,8 @@ from nlosrender.scene.pose import Float64, Pose
 from nlosrender.scene.surfaces import Surface, all_surfaces
 from nlosrender.scene.view import BuiltView, build_view
 from nlosrender.scene.walls.any_surface import AnySurface
-from nlosrender.scene.walls.wall import RectangleWall
+from nlosrender.scene.walls.wall import RectangleWall, RelayWall
+from nlosrender.scene.walls.wall_from_config import relay_wall_from_config
 
 if TYPE_CHECKING:
     from nlosrender.config.capture import CaptureConfig
@@ -78,7 +79,7 @@ def _scene_without_wall(view: BuiltView, pixels: PixelPoints, reason: str) -> Sc
 
 
 def _scene_with_wall(view: BuiltView, scene_config: SceneConfig, pixels: PixelPoints) -> BuiltScene:
-    """Build the scene before the rectangle that all points lie on; _NoWallError where there is none."""
+    """Build the scene before the relay wall that all points lie on; _NoWallError where there is none."""
     both = pixels.sensors, pixels.lasers
     numbers = {int(number) for hits in both for number in np.unique(hits.shapes[~hits.is_empty])}
     if len(numbers) > 1:
@@ -122,9 +123,11 @@ def _lit_side(bsdf: Mapping[str, object], is_front: bool) -> Mapping[str, object
     return nested[0 if is_front else -1] if bsdf.get("type") == "twosided" and nested else bsdf
 
 
-def _configured_wall(scene_config: SceneConfig, surface: Surface | None, is_front: bool) -> RectangleWall | None:
-    """Return the wall of a rectangle as configured, with its pose; None for other surfaces."""
+def _configured_wall(scene_config: SceneConfig, surface: Surface | None, is_front: bool) -> RelayWall | None:
+    """Return the wall of a rectangle, or a round relay wall, as configured, with its pose; None for other surfaces."""
     item: object = scene_config.relay_wall
+    if isinstance(item, (SphereWallConfig, CylinderWallConfig)) and is_front:
+        return relay_wall_from_config(item)
     if surface is not None and surface.key.startswith("scene.hidden_geometry."):
         item = scene_config.hidden_geometry[int(surface.key.rsplit(".", 1)[1])]
     if not isinstance(item, (RectangleConfig, RectangleWallConfig)) or surface is None:
