@@ -239,12 +239,29 @@ def test_a_camera_before_a_hidden_scene(tmp_path: Path, scan: str) -> None:
     assert capture.n_lasers == (12 if scan == "exhaustive" else 1)
 
 
+SCANNED = '<integer name="laser_scan_width" value="3"/><integer name="laser_scan_height" value="2"/>'
+
+
+def test_a_fan_of_rays(tmp_path: Path) -> None:
+    """The laser's targets lie on the rays of a projector of its own field of view, from the upper left, at i / N."""
+    fan = '<boolean name="force_equal_illumination_scanning" value="false"/>'
+    fan += '<float name="illumination_scan_fov" value="90"/></integrator>'
+    text = PIXELS.replace("SCAN", "exhaustive").replace("</integrator>", fan).replace("</film>", f"{SCANNED}</film>")
+    place = '<transform name="to_world"><lookat origin="0, 0, 2" target="0, 0, 0" up="0, 1, 0"/></transform>'
+    config = config_of(tmp_path, re.sub(r"<transform.*?</transform>", place, text, count=1, flags=re.DOTALL))
+    # looking along -z with +y up, right is +x: u = 0, 1/3, 2/3 from the left edge, v = 0, 1/2 from the top
+    expected = [[x, y, 1] for y in (1, 0) for x in (-1, -1 / 3, 1 / 3)]
+    assert np.array(config.capture.laser_targets) == pytest.approx(np.array(expected))
+    assert config.capture.n_lasers == 6
+    assert config.capture.pixel_point is None
+
+
 def test_what_a_camera_before_a_hidden_scene_cannot_have(tmp_path: Path) -> None:
-    """A laser point of a wall, a fan of rays, another lamp: refused with the reason."""
+    """A laser point of a wall, a laser grid of another size, another lamp: refused with the reason."""
     _refused(tmp_path, PIXELS.replace("SCAN", "single"), "is a point of a relay wall", laser=(0.0, 0.0))
-    fan = '<boolean name="force_equal_illumination_scanning" value="false"/></integrator>'
     exhaustive = PIXELS.replace("SCAN", "exhaustive")
-    _refused(tmp_path, exhaustive.replace("</integrator>", fan), "a fan of rays meets the scene")
+    wider = exhaustive.replace("</film>", f"{SCANNED}</film>")
+    _refused(tmp_path, wider, "need film.width (4): laser points are the pixels' points")
     _refused(tmp_path, exhaustive.replace("projector", "point"), "is lit by one <emitter type='projector'>")
 
 

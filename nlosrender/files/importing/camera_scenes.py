@@ -6,8 +6,12 @@ prepare and emitter_laser_sample of mitransient's transientnlospath.
 
 from __future__ import annotations
 
+import math
 from xml.etree.ElementTree import Element
 
+import numpy as np
+
+from nlosrender.config.mitsuba_xml import DEFAULT_FILM
 from nlosrender.config.xml_shapes import placement
 from nlosrender.files.importing.light_transport import (
     drop_noise,
@@ -19,6 +23,7 @@ from nlosrender.files.importing.light_transport import (
 from nlosrender.files.importing.scan_geometry import matrix_of
 from nlosrender.files.importing.translation import Keys, Translation, plain, rounded
 from nlosrender.files.importing.xml_plugins import found_keys, place_in
+from nlosrender.scene.pose import Float64
 
 _SCANS = {1: "single", 2: "confocal", 3: "exhaustive"}
 OF_PROJECTORS = {
@@ -34,10 +39,6 @@ _PIXELS = (
 _CORNERS = (
     "the laser lights the upper left corners of the pixels there, and so does it here (capture.pixel_point: [0, 1]), "
     "with the sensor point in the same place; there a pixel's light is the mean over its area"
-)
-_FAN = (
-    "the points are where a fan of rays meets the scene; say them as capture.laser_targets, or make it true: then they "
-    "are the pixels' points"
 )
 
 
@@ -80,29 +81,49 @@ def translate_pixels(
     translation.put("scene.mitsuba", translation.file_name(path.resolve(), is_absolute=False), str(path))
     scan = scan_type(keys)
     keys.take("integrator.capture_type", "capture.scan_type", scan)
-    if scan == "exhaustive" and not keys.value("integrator.force_equal_illumination_scanning", True, bool):
-        keys.refuse("integrator.force_equal_illumination_scanning", _FAN)
-    keys.drop("integrator.force_equal_illumination_scanning", "laser points are the pixels' points")
-    keys.drop("integrator.illumination_scan_fov", "of a fan of rays that is not used")
-    matrix = matrix_of(placement(emitters[0])) if emitters else None
-    if matrix is not None:
-        position, target = rounded(matrix[:3, 3]), rounded(matrix[:3, 3] + matrix[:3, 2])
-        place = keys.place("emitter.to_world" if "emitter.to_world" in keys else "emitter.type")
-        translation.put("capture.laser_position", position, place)
-        aim = ""
-        if scan == "single":
-            translation.put("capture.laser_target", target, place)
-            aim = f", capture.laser_target: {plain(target)}, on its axis"
-        keys.keep("emitter.to_world", f"capture.laser_position: {plain(position)}{aim}")
+    is_aimed = _aim(keys, scan, matrix_of(placement(emitters[0]))) if emitters else True
     if laser is not None:
         translation.refuse("--laser", "", list(laser), "is a point of a relay wall; set capture.laser_target instead")
     keys.drop_all(OF_PROJECTORS)
-    if scan != "single":
+    if not is_aimed:
         translation.put("capture.pixel_point", [0.0, 1.0], str(path))
-    translation.note(_PIXELS if scan == "single" else _CORNERS)
+    translation.note(_PIXELS if is_aimed else _CORNERS)
     translate_bounces(keys, of_ytal=False)
     _translate_picture(keys)
     translation.note(f"shapes and camera: read by scene.mitsuba, {path.name}, every time the capture is rendered")
+
+
+def _aim(keys: Keys, scan: str, to_world: Float64) -> bool:
+    """Judge where the projector stands and looks; return whether its points are other ones than the pixels'."""
+    translation, equal = keys.translation, "integrator.force_equal_illumination_scanning"
+    position = rounded(to_world[:3, 3])
+    place = keys.place("emitter.to_world" if "emitter.to_world" in keys else "emitter.type")
+    translation.put("capture.laser_position", position, place)
+    sides = ("film.laser_scan_width", "film.laser_scan_height")
+    is_fan = scan == "exhaustive" and not keys.value(equal, True, bool)
+    aim = ""
+    if scan == "single":
+        target = rounded(to_world[:3, 3] + to_world[:3, 2])
+        translation.put("capture.laser_target", target, place)
+        aim = f", capture.laser_target: {plain(target)}, on its axis"
+    elif is_fan:
+        columns, rows = (keys.value(name, 0, int) for name in sides)
+        opening = math.tan(math.radians(keys.value("integrator.illumination_scan_fov", 20.0, float)) / 2)
+        u, v = np.meshgrid(np.arange(columns) / max(columns, 1), np.arange(rows) / max(rows, 1))
+        rays = np.stack([(1 - 2 * u) * opening, (1 - 2 * v) * opening, np.ones_like(u)], axis=-1).reshape(-1, 3)
+        targets = rounded(to_world[:3, 3] + rays @ to_world[:3, :3].T)
+        translation.put("capture.laser_targets", targets, keys.place(equal))
+        for name in (equal, "integrator.illumination_scan_fov", *sides):
+            keys.change(name, f"capture.laser_targets: {len(targets)} rays of a fan, row by row from its upper left")
+    elif scan == "exhaustive":
+        for name, pixels, size in zip(sides, ("film.width", "film.height"), DEFAULT_FILM, strict=True):
+            count = keys.value(pixels, size, int)
+            if keys.value(name, count, int) != count:
+                keys.refuse(name, f"need {pixels} ({count}): laser points are the pixels' points")
+    keys.drop_all(dict.fromkeys((equal, *sides), "laser points are the pixels' points"))
+    keys.drop("integrator.illumination_scan_fov", "of a fan of rays that is not used")
+    keys.keep("emitter.to_world", f"capture.laser_position: {plain(position)}{aim}")
+    return scan == "single" or is_fan
 
 
 def _translate_picture(keys: Keys) -> None:
