@@ -8,8 +8,11 @@ import math
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
+
+from pydantic import TypeAdapter
 
 from nlosrender.errors import FileError
 from nlosrender.files.atomic_write import replacing
@@ -194,13 +197,24 @@ def read_index(folder: str | Path) -> dict[str, Any]:
     for path in paths:
         try:
             contents.append(json.loads(path.read_text(encoding="utf-8")))
-            contents[-1]["captures"] = [asdict(IndexEntry(**entry)) for entry in contents[-1]["captures"]]
+            contents[-1]["captures"] = [asdict(_checked(IndexEntry(**entry))) for entry in contents[-1]["captures"]]
         except (OSError, ValueError, KeyError, TypeError) as error:
-            raise FileError(f"{path}: is no index of captures: {error}") from error
+            reason = "; ".join(str(error).splitlines()[:3])  # pydantic's own text runs over several
+            raise FileError(f"{path}: is no index of captures: {reason}") from error
     captures = sorted(
         (entry for content in contents for entry in content["captures"]), key=lambda entry: entry["index"]
     )
     return {**contents[0], "captures": captures}
+
+
+def _checked(entry: IndexEntry) -> IndexEntry:
+    """Return an entry of a file as it is; ValueError where a value is of another type."""
+    return _adapter().validate_python(asdict(entry))
+
+
+@cache
+def _adapter() -> TypeAdapter[IndexEntry]:
+    return TypeAdapter(IndexEntry)
 
 
 def _cell(value: Any) -> Any:

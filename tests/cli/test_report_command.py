@@ -201,3 +201,19 @@ def test_a_page_replaces_only_pages(tmp_path: Path) -> None:
     assert "is not a page by nlosrender" in done.stderr
     assert commands.run(tmp_path, "report", "a.hdf5", "-o", "a.hdf5").returncode == EXIT_BAD_INPUT
     assert h5py.is_hdf5(tmp_path / "a.hdf5")
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [("energy", [1]), ("file", 3), ("index", None), ("values", 7), ("seconds", "x"), ("status", "odd")],
+)
+def test_an_index_with_values_of_other_types_is_refused(dataset: Path, key: str, value: object) -> None:
+    """By ``report`` and every other command that reads it: an error that names the file, no traceback."""
+    path = dataset / "set" / "index.json"
+    index = json.loads(path.read_text())
+    index["captures"][2][key] = value
+    path.write_text(json.dumps(index))
+    for command in (("report", "set", "-o", "page.html"), ("dataset", "info", "set"), ("status", "set")):
+        done = commands.run(dataset, *command)
+        assert done.returncode == EXIT_BAD_INPUT
+        assert f"index.json: is no index of captures: 1 validation error for IndexEntry; {key}" in done.stderr

@@ -91,7 +91,7 @@ class JournalState:
                 if "identity" in record:
                     state.first = record
                 if "run" in record:
-                    state.run, state.n_in_run = record["run"], 0
+                    state.run, state.n_in_run = {**record["run"]}, 0
                 if "switched_to" in record:
                     state.generation = record["switched_to"]
                 if "unit" in record:
