@@ -151,6 +151,8 @@ def _subtitle(header: StoredHeader, view: LaserView) -> str:
     width = header.bin_width_opl
     parts.append(f"{header.n_bins} bins of {1000 * width:.4g} mm ({opl_to_seconds(width) * 1e12:.3g} ps)")
     engine, error = header.attributes.get("render_engine"), header.attributes.get("error_estimate")
+    if header.is_multiplexed:
+        parts.append("several laser spots at once")
     if header.is_measured:
         parts.append("counts")
     if isinstance(engine, str):

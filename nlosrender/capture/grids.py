@@ -95,13 +95,15 @@ class Capture:
     laser_spot_radius: float  # m; 0 = a point
     n_unlit_lasers: int = 0  # laser points that a camera sees and the laser does not light
     footprint: Footprint | None = None  # around each sensor point; None: a point
+    # (lasers,) of the laser points of a single capture that one pulse lights at once, sum 1; None: one at a time
+    laser_weights: Float64 | None = None
 
     def __post_init__(self) -> None:
         if self.scan_type not in SCAN_TYPES:
             raise ValueError(f"scan_type {self.scan_type!r}: need one of {', '.join(SCAN_TYPES)}")
         if self.scan_type == "confocal" and self.laser_grid is not self.sensor_grid:
             raise ValueError("a confocal capture has one grid: laser_grid must be sensor_grid")
-        if self.scan_type in ("single", LINE_OF_SIGHT) and self.n_lasers != 1:
+        if self.scan_type in ("single", LINE_OF_SIGHT) and self.n_lasers != 1 and self.laser_weights is None:
             raise ValueError(f"a {self.scan_type} capture has one laser point, got {self.n_lasers}")
         if not (np.isfinite(self.laser_energy) and self.laser_energy > 0):
             raise ValueError(f"laser_energy: got {self.laser_energy!r}, need a finite number > 0 [J]")
@@ -127,7 +129,14 @@ class Capture:
     def point_lists(self) -> tuple[str, ...]:
         """Which of "sensor" and "laser" points are a list."""
         grids = {"sensor": self.sensor_grid, "laser": self.laser_grid}
-        return tuple(name for name, grid in grids.items() if grid.is_list)
+        return tuple(
+            name for name, grid in grids.items() if grid.is_list and (name == "sensor" or self.laser_weights is None)
+        )
+
+    @property
+    def middle_of_spots(self) -> Float64:
+        """The weighted middle of laser spots that are lit at once, (1, 1, 3) [m]."""
+        return np.average(self.laser_grid.positions, axis=1, weights=self.laser_weights)[:, None]
 
     @property
     def is_line_of_sight(self) -> bool:
@@ -217,6 +226,8 @@ def build_capture(capture_config: CaptureConfig, wall: RelayWall, pixels: PixelP
         laser_grid = sensor_grid
     elif capture_config.scan_type == "exhaustive":
         laser_grid = _configured_points(capture_config, "laser", wall)
+    elif capture_config.spot_list is not None:
+        laser_grid = _configured_points(capture_config, "spot", wall)
     else:
         laser_point = capture_config.laser_point
         laser_grid = single_point(wall, (0.0, 0.0) if laser_point is None else laser_point)
@@ -253,7 +264,8 @@ def _extent(xy: Float64) -> tuple[float, float]:
 def _capture(
     capture_config: CaptureConfig, sensor_grid: PointGrid, laser_grid: PointGrid, laser: Float64, sensor: Float64
 ) -> Capture:
-    seen = capture_config.footprint
+    seen, shares, spots = capture_config.footprint, capture_config.laser_spot_weights, capture_config.spot_list
+    weights: Float64 | None = None if spots is None else np.array(shares or [1.0] * len(spots), dtype=np.float64)
     return Capture(
         scan_type=capture_config.scan_type,
         sensor_grid=sensor_grid,
@@ -264,6 +276,7 @@ def _capture(
         laser_energy=float(capture_config.laser_energy),
         laser_spot_radius=float(capture_config.laser_spot_radius),
         footprint=None if seen is None else Footprint(*seen.extent, is_disc=seen.box is None),
+        laser_weights=None if weights is None else weights / weights.sum(),
     )
 
 
@@ -273,8 +286,8 @@ def _cell_centres(count: int) -> Float64:
 
 
 def _configured_points(capture_config: CaptureConfig, name: str, wall: RelayWall) -> PointGrid:
-    """Return the grid or the list of sensor or laser points."""
-    grid: GridConfig | None = getattr(capture_config, f"{name}_grid")
+    """Return the grid or the list of sensor or laser points, or of the ``spot`` points that are lit at once."""
+    grid: GridConfig | None = getattr(capture_config, f"{name}_grid", None)
     points: PointList | None = getattr(capture_config, f"{name}_list")
     try:
         if points is not None:
@@ -283,7 +296,8 @@ def _configured_points(capture_config: CaptureConfig, name: str, wall: RelayWall
             raise ValueError(f"a capture of scan_type {capture_config.scan_type} needs a {name}_grid or {name}_points")
         return point_grid(wall, grid.nx, grid.ny, grid.width, grid.height)
     except ValueError as error:
-        raise ConfigError.at(f"capture.{name}_{'grid' if points is None else 'points'}", f"{error}.") from error
+        key = "laser_spots" if name == "spot" else f"{name}_{'grid' if points is None else 'points'}"
+        raise ConfigError.at(f"capture.{key}", f"{error}.") from error
 
 
 def _is_even(ascending: Float64) -> bool:

@@ -19,7 +19,9 @@ from nlosrender.config.fields import (
     Point2,
     Point3,
     Sizes2,
+    Weights,
 )
+from nlosrender.config.issues import mismatch
 from nlosrender.config.point_list import PointList, WallPoints, point_list
 from nlosrender.config.section import LIST, ONE_OF, Section
 from nlosrender.errors import ValidationIssue
@@ -83,6 +85,12 @@ class CaptureConfig(Section):
     """the lit points of an exhaustive scan"""
     laser_points: WallPoints | None = None
     """instead of laser_grid, as sensor_points"""
+    laser_spots: WallPoints | None = None
+    """instead of laser_point, as sensor_points: spots that one pulse lights at once, into one histogram"""
+    laser_spot_weights: Weights | None = None
+    """of laser_spots: how the pulse's energy is shared, in any unit; null: equally"""
+    multiplex: Flag = False
+    """true with laser_spots: all at once"""
     laser_point: Point2 | None = None
     """m, wall coordinates (x, y) from the wall's centre; the lit point of a single scan, default [0, 0]"""
     laser_target: Point3 | None = None
@@ -107,7 +115,8 @@ class CaptureConfig(Section):
     def with_defaults(cls, raw: dict[str, Any], validation: ValidationInfo) -> dict[str, Any]:
         """Light the wall's centre, or make the camera's pixels the sensor grid."""
         scan = raw.get("scan_type")
-        if scan == "single" and raw.get("laser_point") is None and raw.get("laser_target") is None:
+        has_laser = any(raw.get(key) is not None for key in ("laser_point", "laser_target", "laser_spots"))
+        if scan == "single" and not has_laser:
             raw["laser_point"] = [0.0, 0.0]
         if (scan == "line_of_sight" or raw.get("camera") is not None) and "sensor_grid" not in raw:
             pixels = {"nx": 1, "ny": 1}  # what the camera lacks is its own mistake
@@ -126,6 +135,26 @@ class CaptureConfig(Section):
         elif grid is not None and points is not None:
             message = f"stands beside {name}_grid: the points are a grid or a list; remove one of them."
             yield ValidationIssue((f"{name}_points",), message, "key")
+
+    def rule_laser_spots(self) -> Iterator[ValidationIssue]:
+        """Spots are lit at once, and share one pulse."""
+        if self.laser_spots is None:
+            for key in ("multiplex", "laser_spot_weights"):
+                if getattr(self, key):
+                    yield ValidationIssue((key,), "is for laser_spots, which are missing: a list [[x, y], ...].", "key")
+            return
+        if not self.multiplex:
+            message = "are lit at once, into one histogram: set multiplex: true. One after the other they are the "
+            yield ValidationIssue(("laser_spots",), f"{message}laser_points of scan_type: exhaustive.", "key")
+        if self.laser_point is not None:
+            yield ValidationIssue(("laser_point",), "stands beside laser_spots; remove one of them.", "key")
+        if self.laser_spot_radius > 0:
+            message = mismatch(self.laser_spot_radius, "0 with laser_spots, which are points")
+            yield ValidationIssue(("laser_spot_radius",), message)
+        spots, weights = self.spot_list, self.laser_spot_weights
+        if spots is not None and weights is not None and len(weights) != len(spots):
+            message = f"got {len(weights)} weights of {len(spots)} laser_spots, need one of each."
+            yield ValidationIssue(("laser_spot_weights",), message)
 
     def rule_pixels(self) -> Iterator[ValidationIssue]:
         """The grid of a camera is its pixels."""
@@ -151,6 +180,11 @@ class CaptureConfig(Section):
     def laser_list(self) -> PointList | None:
         """The points of ``laser_points``; None: a grid, or a single point."""
         return None if self.laser_points is None else point_list(self.laser_points)
+
+    @property
+    def spot_list(self) -> PointList | None:
+        """The points of ``laser_spots``; None: the laser lights one point at a time."""
+        return None if self.laser_spots is None else point_list(self.laser_spots)
 
     @property
     def sensor_key(self) -> str:

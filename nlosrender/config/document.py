@@ -135,6 +135,8 @@ class Config(Section):
             yield ValidationIssue(("capture", "laser_spot_radius"), message)
         if capture.footprint is not None:
             yield ValidationIssue(("capture", "footprint"), f"got one, and {needs}")
+        if capture.laser_spots is not None:
+            yield ValidationIssue(("capture", "laser_spots"), f"got some, and {needs}")
         if self.render.polarized:
             yield ValidationIssue(("render", "polarized"), f"got true, and {needs}")
 
@@ -203,11 +205,11 @@ class Config(Section):
         """Points of lists are on the wall."""
         if (wall := self.scene.relay_wall) is None or self.capture.is_line_of_sight:
             return
-        for name in ("sensor", "laser"):
+        for name, key in (("sensor", "sensor_points"), ("laser", "laser_points"), ("spot", "laser_spots")):
             with suppress(WrongValueRead):
                 points = getattr(self.capture, f"{name}_list")
                 for issue in () if points is None else off_the_wall(points, wall.extent, EDGE_TOLERANCE):
-                    yield issue.below(("capture", f"{name}_points"))
+                    yield issue.below(("capture", key))
 
     def rule_devices_before_the_wall(self) -> Iterator[ValidationIssue]:
         """Laser and sensor stand on the lit side of a flat wall."""

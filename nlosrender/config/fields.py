@@ -181,6 +181,13 @@ def _scale(value: object) -> float | tuple[float, ...]:
     return numbers[0] if len(numbers) == 1 else tuple(numbers)
 
 
+def _weights(value: object) -> tuple[float, ...]:
+    numbers = finite_numbers(value, len(value)) if isinstance(value, (list, tuple)) else None
+    if not numbers or not 0 <= min(numbers) <= max(numbers) <= _MAX_JOULES or max(numbers) == 0:
+        raise invalid_value(value, "a list of numbers >= 0, not all 0")
+    return tuple(numbers)
+
+
 def _sizes(need: str, size: int) -> Checked:
     def check(value: object) -> tuple[float, ...]:
         numbers = finite_numbers(value, size)
@@ -250,6 +257,7 @@ NonNegative = Annotated[float, _number("a number >= 0", (1e-12, 1e6, ""), minimu
 Wavelength = Annotated[float, _number("a number > 0", (1.0, 1e6, "nm"), exclusiveMinimum=0)]
 SolidAngle = Annotated[float, _number("a number > 0", (1e-15, 4 * math.pi, "sr"), exclusiveMinimum=0)]
 Area = Annotated[float, _number("a number > 0", (1e-15, 1e12, "m^2"), exclusiveMinimum=0)]
+Weights = Annotated[tuple[float, ...], Checked(_weights, {"type": "array", "items": {"type": "number", "minimum": 0}})]
 Photons = Annotated[float, _number("a number > 0", (1e-12, 1e6, "photons"), exclusiveMinimum=0)]
 Delay = Annotated[float, _number("a number > 0", _PICOSECONDS, exclusiveMinimum=0)]
 DelayOrZero = Annotated[float, _number("a number >= 0", _PICOSECONDS, minimum=0)]

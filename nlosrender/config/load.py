@@ -34,6 +34,9 @@ LEFT_OUT = (  # of the canonical JSON, if empty
     ("capture", "laser_target"),
     ("capture", "laser_targets"),
     ("capture", "footprint"),
+    ("capture", "laser_spots"),
+    ("capture", "laser_spot_weights"),
+    ("capture", "multiplex"),
 )
 MAX_ISSUES = 100  # told at once; nobody reads more
 SectionT = TypeVar("SectionT", bound=Section)

@@ -55,6 +55,9 @@ _SENSOR_GRID = """\
     height: 2.0                  # m; default null: the whole wall
   # sensor_points: {file: points.csv}  # instead of sensor_grid: x,y in wall coordinates [m] (.csv, .npy), or a list
   # laser_points: [[0.0, 0.0], [0.1, 0.2]]  # instead of laser_grid, as sensor_points
+  # laser_spots: [[0.0, 0.0], [0.1, 0.2]]  # instead of laser_point: lit by one pulse at once, with multiplex: true
+  # multiplex: true
+  # laser_spot_weights: [1, 2]   # how they share the pulse's energy, any unit; default null: equally
 """
 _DEVICES = """\
   laser_position: [-0.5, 0, 0.25]     # m, in front of the wall; default null: 1 m in front of its centre

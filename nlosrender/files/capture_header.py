@@ -53,6 +53,9 @@ class CaptureHeader:
     shared_samples: str = ""  # which samples have errors in common, in words: their variances may not be summed
     point_lists: tuple[str, ...] = ()  # which of "sensor" and "laser" points are a list, see ``layout.POINT_LISTS``
     footprint: tuple[str, float] | None = None  # what H is the mean over, in words, and its area [m^2]; None: points
+    # (spots, 3) positions [m] and (spots,) shares of the pulse, sum 1, of spots that are lit at once;
+    # ``laser_positions`` is their weighted middle then
+    laser_spots: tuple[Float64, Float64] | None = None
     chunk_samples: int = CHUNK_SAMPLES  # of a chunk of the file at most
 
     def __post_init__(self) -> None:

@@ -112,6 +112,11 @@ def write_header(file: h5py.File, header: CaptureHeader) -> None:
     set_attributes(file["deltaT"], {"exact": np.float64(header.bin_width_opl)})
     set_attributes(file["t0"], {"exact": np.float64(header.start_opl)})
     set_attributes(file["hiddenVolumeSize"], {"exact": _hidden_volume(header)[2]})
+    if header.laser_spots is not None:
+        spots, shares = header.laser_spots
+        points = layout.axes_first(layout.file_frame(header.frame, header.pose).to_scene(spots[None]))
+        file.create_dataset(layout.SPOT_POSITIONS, data=points.astype(layout.FLOAT))
+        file.create_dataset(layout.SPOT_SHARES, data=shares.astype(layout.FLOAT))
     set_attributes(file, root_attributes(header))
 
 
@@ -179,6 +184,11 @@ def root_attributes(header: CaptureHeader) -> dict[str, object]:
             layout.EMPTY_POINTS: int(header.empty_sensors.sum()),
             layout.UNLIT_POINTS: header.n_unlit_lasers,
         }
+    if header.laser_spots is not None:
+        attributes[layout.MULTIPLEXED] = (
+            f"{len(header.laser_spots[1])} spots, lit at once by one pulse, share its energy ({layout.SPOT_SHARES}); "
+            "laserGridPositions is their weighted middle, where no light need be"
+        )
     if header.footprint is not None:
         attributes[layout.FOOTPRINT], attributes[layout.FOOTPRINT_AREA] = header.footprint
     if header.n_channels in layout.CHANNELS:

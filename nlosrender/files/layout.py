@@ -99,6 +99,10 @@ POINT_LISTS = "point_lists"
 EMPTY_POINTS, UNLIT_POINTS = "empty_sensor_points", "unlit_laser_points"
 # Attributes of captures whose sensor points stand for an area of the wall: in words, and how large it is [m^2].
 FOOTPRINT, FOOTPRINT_AREA = "footprint", "footprint_area"
+# Of captures whose laser spots are lit at once: an attribute that says so, and the datasets of the spots, (3, 1, spots)
+# in the file's frame [m] and (spots,), their shares of the pulse. laserGridPositions holds their weighted middle.
+MULTIPLEXED = "laser_spots"
+SPOT_POSITIONS, SPOT_SHARES = "laserSpotPositions", "laserSpotShares"
 CHANNELS = {3: "rgb", 4: STOKES}  # grey: files without the attribute
 DATA_UNIT = "J m^-2 sr^-1"  # radiance leaving a sensor point, integrated over the bin, for one pulse
 VIEW_UNIT = "W m^-2 sr^-1"  # line_of_sight: of a pixel's steady radiance the share that arrives in the bin

@@ -430,6 +430,7 @@ def _counts_header(
     laser_size = header.laser_grid_size or (0.0, 0.0)
     limit = header.attributes.get("max_bounces")
     frame = str(header.attributes.get("frame", "znlos"))
+    spots = capture.laser_spots
     bins = detector.bins
     try:
         return CaptureHeader(
@@ -458,6 +459,7 @@ def _counts_header(
             empty_lasers=empty_lasers,
             n_unlit_lasers=n_unlit if isinstance(n_unlit, int) else 0,
             footprint=header.footprint,
+            laser_spots=None if spots is None else (moved(spots[0], to_wall), spots[1]),
             point_lists=tuple(name for name in ("sensor", "laser") if header.is_list(name)),
             # a chunk is counted at once: of few bins as few points as of the many they are made of
             chunk_samples=max(layout.CHUNK_SAMPLES * bins.count // max(bins.count, header.n_bins), bins.count),

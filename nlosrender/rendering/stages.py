@@ -171,12 +171,14 @@ def describe_file(
 ) -> CaptureHeader:
     """Stage 6: what the file says beside its samples."""
     bounces = bounce_axis(config)
+    weights = capture.laser_weights
+    spots = None if weights is None else (capture.laser_grid.positions[0], weights)
     return CaptureHeader(
         scan_type=capture.scan_type,
         sensor_positions=capture.sensor_grid.positions,
         sensor_normals=capture.sensor_grid.normals,
-        laser_positions=capture.laser_grid.positions,
-        laser_normals=capture.laser_grid.normals,
+        laser_positions=capture.laser_grid.positions if spots is None else capture.middle_of_spots,
+        laser_normals=capture.laser_grid.normals if spots is None else capture.laser_grid.normals[:, :1],
         sensor_position=capture.sensor_position,
         laser_position=capture.laser_position,
         sensor_grid_size=capture.sensor_grid.size,
@@ -198,5 +200,6 @@ def describe_file(
         n_unlit_lasers=capture.n_unlit_lasers,
         shared_samples=shared,
         point_lists=capture.point_lists,
+        laser_spots=spots,
         footprint=None if capture.footprint is None else (capture.footprint.in_words, capture.footprint.area),
     )

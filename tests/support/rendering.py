@@ -140,7 +140,7 @@ def render(
             capture, rows_per_pair=rows, n_bins=time_axis.n_bins, lanes=backend.lanes, memory_limit=batch_bytes
         )
     confocal = capture.scan_type == "confocal"
-    lasers = (1, 1) if confocal else (capture.laser_grid.ny, capture.laser_grid.nx)
+    lasers = (1, 1) if confocal or capture.laser_weights is not None else (capture.laser_grid.ny, capture.laser_grid.nx)
     points = (*lasers, capture.sensor_grid.ny, capture.sensor_grid.nx)
     mean = np.full((channels, bounces.n_slots, *points, time_axis.n_bins), np.nan)
     variance, outside = np.full_like(mean, np.nan), np.full(mean.shape[:-1], np.nan)

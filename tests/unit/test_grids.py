@@ -28,6 +28,8 @@ def capture(wall=WALL, **changes):
         "sensor_list": None,
         "laser_list": None,
         "footprint": None,
+        "spot_list": None,
+        "laser_spot_weights": None,
         "laser_point": None,
         "laser_position": [6.0, -2.0, 1.5],
         "sensor_position": None,

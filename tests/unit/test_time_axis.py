@@ -28,6 +28,8 @@ def capture(wall=WALL, scan_type="exhaustive", **changes):
         "sensor_list": None,
         "laser_list": None,
         "footprint": None,
+        "spot_list": None,
+        "laser_spot_weights": None,
         "laser_point": (0.3, -0.2),
         "laser_position": [-0.5, 0.1, 0.25],
         "sensor_position": [0.2, 0.3, 0.4],

@@ -161,6 +161,7 @@ def reconstruct_capture(
     begun = time.perf_counter()
     warnings = Warnings(warn)
     with open_capture(path) as capture:
+        capture.header.refuse_spots("reconstruction")
         scan = read_scan(capture)
         warnings.emit(few_counts(capture.header))
         phasor = settings.method == "phasor"

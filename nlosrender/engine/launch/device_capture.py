@@ -106,7 +106,9 @@ class DeviceCapture:
         return np.array(batch.sensors.flat_indices(self.capture.sensor_grid.nx), dtype=np.uint32)
 
     def laser_indices(self, batch: Batch | Pilot) -> NDArray[np.uint32]:
-        """Return the flat indices of a batch's laser points."""
+        """Return the flat indices of a batch's laser points; of spots that are lit at once all of them."""
+        if self.capture.laser_weights is not None:
+            return np.arange(self.capture.n_lasers, dtype=np.uint32)
         return np.array(batch.lasers.flat_indices(self.capture.laser_grid.nx), dtype=np.uint32)
 
     def lane_order(self, batch: Batch | Pilot) -> NDArray[np.int64]:
@@ -140,14 +142,15 @@ class DeviceCapture:
         per_lane = sensors.gather(sensor)
         dr.eval(per_lane.interaction, per_lane.delay_bins, per_lane.delay_fraction, first_laser, row_of_lane)
         gate = self.capture_gate
+        per_lane_lasers = shape.lasers if capture.laser_weights is None else capture.n_lasers
         return LaunchParams(
             built=built,
             sampler=self.sampler,
             sensors=per_lane,
             lasers=lasers,
             first_laser=first_laser,
-            lasers_per_lane=shape.lasers,
-            n_lasers=dr.opaque(mi.UInt32, shape.lasers),
+            lasers_per_lane=per_lane_lasers,
+            n_lasers=dr.opaque(mi.UInt32, per_lane_lasers),
             bins_per_unit=dr.opaque(mi.Float, built.metres_per_engine_unit / time_axis.bin_width_opl),
             time_gate=None if gate is None else gate.of_sensors(built, capture, time_axis, index, sensor),
             row_of_lane=row_of_lane,

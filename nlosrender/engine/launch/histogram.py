@@ -91,7 +91,7 @@ class DeviceHistogram:
         shape = self.shape
         inside = (bins >= 0) & (bins < shape.n_bins)
         entry = dr.select(inside, mi.UInt32(bins), mi.UInt32(shape.n_bins))
-        row = laser * shape.slots + slot
+        row = slot if shape.lasers == 1 else laser * shape.slots + slot  # one row: of spots that are lit at once, too
         for channel in range(shape.channels):
             # a Mueller matrix meets unpolarised light: its first column is a Stokes vector
             carried = mi.Float64(value[channel, 0][0] if mi.is_polarized else value[channel])

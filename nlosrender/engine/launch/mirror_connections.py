@@ -92,8 +92,9 @@ def _connect(
         context = mi.BSDFContext()
         scattered = si.bsdf().eval(context, si, si.to_local(found.direction), found.active)
         scattered *= built.bsdf_at(lit).eval(context, lit, lit.to_local(found.from_lit), found.active)
-        bins = params.delay_bin(params.lasers.gather(params.first_laser + laser), vertex.opl + found.distance)
-        value = vertex.throughput * scattered * found.value
+        points = params.lasers.gather(params.first_laser + laser)
+        bins = params.delay_bin(points, vertex.opl + found.distance)
+        value = points.shared(vertex.throughput * scattered * found.value)
         histogram.deposit(params.row_of_lane, laser, vertex.slot, bins, value, found.active)
 
 

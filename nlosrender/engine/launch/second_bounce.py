@@ -34,7 +34,7 @@ def deposit_second_bounce(params: LaunchParams, histogram: DeviceHistogram) -> N
         direction = to_laser / dr.maximum(distance, COINCIDENT)
         received = built.bsdf_at(sensor).eval(context, sensor, sensor.to_local(direction), apart)
         emitted = built.bsdf_at(lit).eval(context, lit, lit.to_local(-direction), apart)
-        value = received * emitted / dr.square(dr.maximum(distance, COINCIDENT))
+        value = points.shared(received * emitted) / dr.square(dr.maximum(distance, COINCIDENT))
         active = apart & dr.any(value > 0)
         active &= ~built.scene.ray_test(
             connection_segment(built, sensor, direction, lit), coherent=False, active=active

@@ -5,7 +5,7 @@ Positions and grids are data, never constants of a kernel: one compiled kernel s
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
@@ -36,6 +36,7 @@ class WallPoints:
     interaction: mi.SurfaceInteraction3f  # on the wall; wi points to the device
     delay_bins: mi.Int32
     delay_fraction: mi.Float  # in [0, 1)
+    share: mi.Float | None = None  # of the pulse's energy that a laser point gets; None: all of it
 
     def gather(self, index: mi.UInt32) -> WallPoints:
         """Return the points at ``index``, one per lane."""
@@ -43,7 +44,12 @@ class WallPoints:
             dr.gather(mi.SurfaceInteraction3f, self.interaction, index),
             dr.gather(mi.Int32, self.delay_bins, index),
             dr.gather(mi.Float, self.delay_fraction, index),
+            None if self.share is None else dr.gather(mi.Float, self.share, index),
         )
+
+    def shared(self, light: mi.Spectrum) -> mi.Spectrum:
+        """Return the light of a whole pulse as that of the laser points' shares of it."""
+        return light if self.share is None else light * self.share
 
 
 def sensor_points(built: BuiltScene, capture: Capture, time_axis: TimeAxis, index: NDArray[np.integer]) -> WallPoints:
@@ -57,7 +63,9 @@ def laser_points(built: BuiltScene, capture: Capture, time_axis: TimeAxis, index
     """Return the laser points with flat indices ``index``, their legs as delay."""
     delay = capture.laser_legs.reshape(-1)[index] / time_axis.bin_width_opl
     grid, hits = capture.laser_grid, None if built.pixels is None else built.pixels.lasers
-    return _wall_points(built, grid, hits, index, capture.laser_position, delay)
+    points = _wall_points(built, grid, hits, index, capture.laser_position, delay)
+    weights = capture.laser_weights
+    return points if weights is None else replace(points, share=on_device(mi.Float, weights[index]))
 
 
 def _wall_points(

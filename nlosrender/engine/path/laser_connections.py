@@ -121,7 +121,7 @@ def _connect(
     from_laser = mi.BSDFContext(mi.TransportMode.Importance) if mi.is_polarized else context
     emitted = built.bsdf_at(lit).eval(from_laser, lit, towards, active)  # includes the laser point's cosine
     emitted = lit.to_world_mueller(emitted, -lit.wi, towards)
-    value = vertex.throughput * reflected * emitted / distance2
+    value = points.shared(vertex.throughput * reflected * emitted / distance2)
     if settings.finds_spot:
         # balance heuristic against finding the same point of the spot by the next ray
         share = dr.select(si.shape == mi.ShapePtr(built.wall_shape), 1 - settings.p_hidden_sampling, 1.0)

@@ -67,6 +67,7 @@ class VirtualLightEngine:
             is_diffuse=all(is_lambertian(shape.bsdf()) for shape in shapes if not is_mirror(shape.bsdf())),
             needs_visibility=not nothing_occludes(built),
             has_one_laser=capture.n_lasers == 1,
+            is_multiplexed=capture.laser_weights is not None,
             laser_rays=tuning.laser_rays,
         )
         all_lambertian = self.settings.is_diffuse and is_lambertian(built.wall_shape.bsdf())

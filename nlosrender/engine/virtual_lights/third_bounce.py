@@ -240,7 +240,7 @@ class ThirdBounce:
             index = on_device(mi.UInt32, chosen)
             some, wall_tiles = lanes.params.gather_lanes(index), self._wall_tiles(batch, labels)
             lit_patches = self._light_by_lasers(some, shape, Patches.joined(near), places, wall_tiles, lit_by)
-            packed = pack_patches(self.settings, some, lit_patches, slices, shape.lasers, lit_by)
+            packed = pack_patches(self.settings, some, lit_patches, slices, some.lasers_per_lane, lit_by)
             tile = wall_tiles.tile_bit(on_device(mi.UInt32, slice_index // slices), some.sensors.interaction.p)
             work.gather(some, packed, index, on_device(mi.UInt32, slice_index), tile, seen_by)
 
@@ -281,7 +281,7 @@ class ThirdBounce:
             # a batch gathers two resolutions
             others = [(other, lit) for other, lit in self._saved.items() if other != key]
             self._saved = dict([*others, (key, lit_patches)][-2 if self.mirror is None else -4 :])
-        return pack_patches(self.settings, params, lit_patches, self._slices(shape), shape.lasers, lit_by)
+        return pack_patches(self.settings, params, lit_patches, self._slices(shape), params.lasers_per_lane, lit_by)
 
     def _light_by_lasers(
         self,
@@ -296,7 +296,9 @@ class ThirdBounce:
         on_device = upload_patches(
             self.device.built, patches, places, self.device.options.seed, is_near, self.settings.is_diffuse, self.tuning
         )
-        return light_patches(self.settings, params, on_device, MaskQuery(self.masks, wall_tiles), shape.lasers, lit_by)
+        return light_patches(
+            self.settings, params, on_device, MaskQuery(self.masks, wall_tiles), params.lasers_per_lane, lit_by
+        )
 
     def _wall_tiles(self, batch: Batch | Pilot, regions: list[int] | None = None) -> WallTiles:
         """Return what patches are seen from: all points, or the sensor points of some regions."""

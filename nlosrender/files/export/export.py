@@ -98,6 +98,7 @@ def export_capture(
     program = PROGRAMS[file_format]
     order = {"x_descends": program.x_descends, "y_descends": program.y_descends}
     with open_capture(path) as capture, replacing(output, program.kind, [path]) as partial:
+        capture.header.refuse_spots(f"the format {file_format}")
         indices = chosen_bounces(capture.header, bounces)
         ordered = ordered_capture(capture, read_scan(capture), indices, **order)
         losses = _general_losses(capture, indices) + program.write(partial, ordered, *option)

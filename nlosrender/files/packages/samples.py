@@ -42,6 +42,7 @@ def wall_sample(path: Path) -> WallSample:
         It is neither confocal nor of one laser point, no square grid on a plane, or damaged.
     """
     with open_capture(path) as capture:
+        capture.header.refuse_spots("this format")
         bounces = chosen_bounces(capture.header, "all")
         ordered = ordered_capture(capture, read_scan(capture), bounces, x_descends=True, y_descends=True)
         scan = ordered.scan

@@ -90,6 +90,24 @@ class StoredCapture:
                     self._file.copy(spec.name, target)
 
     @property
+    def laser_spots(self) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
+        """Positions (spots, 3) in the file's frame [m] and shares (spots,) of spots lit at once; None: there are none.
+
+        Raises
+        ------
+        FileError
+            The file says that there are, and does not have them.
+        """
+        if not self.header.is_multiplexed:
+            return None
+        with explained_read(self.path):
+            found = [dataset_in(self._file, self.path, name) for name in (layout.SPOT_POSITIONS, layout.SPOT_SHARES)]
+            points, shares = (None if each is None else np.asarray(each[()], dtype=np.float64) for each in found)
+        if points is None or shares is None or points.shape != (layout.THREE, 1, shares.size) or shares.ndim != 1:
+            raise FileError(f"{self.path}: has no usable {layout.SPOT_POSITIONS} and {layout.SPOT_SHARES} of its spots")
+        return points[:, 0].T, shares
+
+    @property
     def positions(self) -> StoredPositions:
         """Points and normals of both grids.
 

@@ -105,6 +105,19 @@ class StoredHeader:
         return self.scan_type == LINE_OF_SIGHT or layout.EMPTY_POINTS in self.attributes
 
     @property
+    def is_multiplexed(self) -> bool:
+        """Whether several laser spots were lit at once."""
+        return layout.MULTIPLEXED in self.attributes
+
+    def refuse_spots(self, what: str) -> None:
+        """Raise FileError where several laser spots were lit at once, for ``what`` is for one laser point."""
+        if self.is_multiplexed:
+            raise FileError(
+                f"{self.path}: its laser spots were lit at once ({layout.SPOT_POSITIONS}), and {what} takes one laser "
+                "point at a time. Render them with capture.scan_type: exhaustive and laser_points."
+            )
+
+    @property
     def footprint(self) -> tuple[str, float] | None:
         """What each histogram is the mean over, in words, and its area [m^2]; None: sensor points are points."""
         words, area = (self.attributes.get(name) for name in (layout.FOOTPRINT, layout.FOOTPRINT_AREA))

@@ -92,4 +92,6 @@ class BlockHistogram:
         return np.asarray(total.numpy()).reshape(shape.channels, 1, shape.lasers, shape.sensors, shape.row)
 
     def _row(self, lane: mi.UInt32, laser: mi.UInt32, channel: mi.UInt32 | int) -> mi.UInt32:
+        if self.shape.lasers == 1:  # of spots that are lit at once, too
+            return lane * self.shape.channels + channel
         return (lane * self.shape.lasers + laser) * self.shape.channels + channel

@@ -33,12 +33,13 @@ class GatherSettings:
     is_diffuse: bool  # every hidden BSDF is Lambertian: reflectance and a cosine are all there is
     needs_visibility: bool  # something may lie between wall and patches
     has_one_laser: bool  # in the whole capture, however it is cut
+    is_multiplexed: bool = False  # all lasers light every batch, at once
     laser_rays: int = DEFAULT_TUNING.laser_rays
 
     @property
     def lights_once(self) -> bool:
         """Whether the patches of all batches send on the same light."""
-        return self.has_one_laser or self.is_confocal
+        return self.has_one_laser or self.is_confocal or self.is_multiplexed
 
 
 @dataclass(frozen=True, eq=False)
@@ -209,14 +210,15 @@ def _light_by_lasers(
     index = dr.arange(mi.UInt32, n_patches * n_lasers)
     divisor = dr.opaque(mi.UInt32, n_patches)
     patch, laser = index % divisor, index // divisor
-    lit = params.lasers.gather(laser).interaction
+    points = params.lasers.gather(laser)
+    lit = points.interaction
     centre = dr.gather(mi.Point3f, patches.interaction.p, patch)
     to_rounded = centre - image_in(mirror, lit.p)
     to_patch = to_rounded + dr.gather(mi.Vector3f, patches.rounding_residual, patch)
     distance2 = dr.squared_norm(to_patch)
     direction = to_patch * dr.rsqrt(distance2)
     sent = lit.to_local(turned_in(mirror, direction))
-    laser_light = built.wall_bsdf.eval(mi.BSDFContext(), lit, sent) / distance2
+    laser_light = points.shared(built.wall_bsdf.eval(mi.BSDFContext(), lit, sent) / distance2)
     cosine = -dr.dot(dr.gather(mi.Normal3f, patches.interaction.sh_frame.n, patch), direction)
     active = dr.any(laser_light > 0)
     if settings.is_diffuse:

@@ -93,7 +93,7 @@ class VplBounces:
             self.proposal_sensors = (
                 capture.sensor_grid.positions.reshape(-1, 3)[list(some)] / built.metres_per_engine_unit
             )
-        lasers = capture.n_lasers if capture.scan_type == "exhaustive" else 1
+        lasers = 1 if capture.scan_type == "confocal" else capture.n_lasers
         pairs = capture.n_sensors * lasers
         self.is_confocal = capture.scan_type == "confocal"
         # every contribution of a confocal capture takes a shadow ray of its own to the laser

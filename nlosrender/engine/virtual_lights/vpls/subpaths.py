@@ -456,7 +456,7 @@ def _connect(
         value = carried * irradiance(built, lasers, si.p, facing)
     else:
         value = carried * reflected_light(built, lasers, si)
-    value *= dr.gather(mi.Float, scale, entry)
+    value = lasers.shared(value * dr.gather(mi.Float, scale, entry))
     active = dr.any(value > 0)
     if mirror is not None:
         active &= ~dr.gather(mi.Bool, ends.by_mirror, end)
@@ -469,7 +469,7 @@ def _connect(
         found = mirror.reflected(built, number, si, lit.p, off_the_wall(built, lit), by_mirror)
         carried *= found.value * (dr.maximum(dr.dot(facing, found.direction), 0) * dr.gather(mi.Float, scale, entry))
         carried *= built.wall_bsdf.eval(mi.BSDFContext(), lit, lit.to_local(found.from_lit))
-        value = dr.select(found.active, carried, value)
+        value = dr.select(found.active, lasers.shared(carried), value)
         distance = dr.select(found.active, found.distance, distance)
         active = dr.any(value > 0)
     delays = (dr.gather(mi.Float, ends.opl, end) + distance) * params.bins_per_unit
