@@ -93,7 +93,9 @@ def light_mirrored_by_wall(
     mirrored = _is_delta(bs) & _carries(weight)
     rays = _Rays(_ray(built, lit, lit.to_world(bs.wo), mirrored), True)
     found = _followed(built, capture, time_axis, rays, max_bounces, 1)
-    return [SpecularLight(WALL_NAME, True, light.first_bounce) for light in found]
+    mirror = next(shape for shape in built.lit_shapes if bool(shape.bsdf().flags() & mi.BSDFFlags.Delta))
+    name = _names(built)[pointer_index(mirror)]
+    return [SpecularLight(name, True, light.first_bounce) for light in found]
 
 
 def light_after_lamps(

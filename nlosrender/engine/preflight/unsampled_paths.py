@@ -31,6 +31,7 @@ from nlosrender.engine.preflight.specular_light import (
     light_after_laser,
     light_mirrored_by_wall,
 )
+from nlosrender.scene.build import SceneWithoutWall
 from nlosrender.scene.view import BuiltView
 
 MAX_NAMED = 3  # items in a sentence
@@ -94,7 +95,8 @@ def unsampled_paths(engine: Engine) -> tuple[UnsampledPaths, ...]:
             of_kind = [light for light in found if light.is_reflected == is_reflected]
             classes += _classes("L D S+ (D|S)* D E", of_kind, f"light of the laser point {how}", advice)
     mirrored = light_mirrored_by_wall(built, capture, time_axis, highest)
-    what = "the laser's beam as mirrored by the relay wall"
+    mirror = "the surface that it hits" if isinstance(built, SceneWithoutWall) else "the relay wall"
+    what = f"the laser's beam as mirrored by {mirror}"
     classes += _classes("L S+ (D|S)* D E", mirrored, what, "Use a wall that is diffuse or rough")
     return tuple(classes)
 
