@@ -38,6 +38,7 @@ def _rows(summary: dict[str, Any]) -> list[tuple[str, str]]:
         ("laser points", "" if is_view else _grid(summary, "laser")),
         ("of a camera", _pixels(summary)),
         ("laser spots", _text(summary["laser_spots"])),
+        ("laser", _text(summary["laser_flash"])),
         ("footprint", _text(summary["footprint"])),
         ("camera at" if is_view else "sensor at", _lengths(summary["sensor_position"])),
         ("laser at", "" if is_view else _lengths(summary["laser_position"])),

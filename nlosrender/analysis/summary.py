@@ -60,6 +60,7 @@ def summarise(path: str | Path) -> dict[str, object]:
         "laser_grid_size": _listed(header.laser_grid_size),
         "point_lists": [name for name in ("sensor", "laser") if header.is_list(name)],
         "laser_spots": header.attributes.get("laser_spots"),
+        "laser_flash": header.attributes.get("laser_flash"),
         "footprint": None if header.footprint is None else header.footprint[0],
         "sensor_position": _listed(header.sensor_position),
         "laser_position": _listed(header.laser_position),

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from nlosrender.capture.bounces import LINE_OF_SIGHT
+from nlosrender.capture.flash import Flash
 from nlosrender.capture.footprint import Footprint
 from nlosrender.errors import ConfigError
 from nlosrender.scene.pose import Float64
@@ -97,6 +98,7 @@ class Capture:
     footprint: Footprint | None = None  # around each sensor point; None: a point
     # (lasers,) of the laser points of a single capture that one pulse lights at once, sum 1; None: one at a time
     laser_weights: Float64 | None = None
+    laser_flash: Flash | None = None  # around the way to the laser point; None: a point or a spot
 
     def __post_init__(self) -> None:
         if self.scan_type not in SCAN_TYPES:
@@ -146,7 +148,8 @@ class Capture:
     @property
     def blur(self) -> float:
         """Distance by which a leg, and the way next to it, may differ from those of laser and sensor point [m]."""
-        return self.laser_spot_radius + (0.0 if self.footprint is None else self.footprint.reach)
+        seen, flash = self.footprint, self.laser_flash
+        return self.laser_spot_radius + (seen.reach if seen else 0.0) + (flash.reach if flash else 0.0)
 
     @property
     def laser_legs(self) -> Float64:
@@ -231,8 +234,13 @@ def build_capture(capture_config: CaptureConfig, wall: RelayWall, pixels: PixelP
     else:
         laser_point = capture_config.laser_point
         laser_grid = single_point(wall, (0.0, 0.0) if laser_point is None else laser_point)
-    devices = (_device_position(at, wall) for at in (capture_config.laser_position, capture_config.sensor_position))
-    return _capture(capture_config, sensor_grid, laser_grid, *devices)
+    positions = capture_config.laser_position, capture_config.sensor_position
+    laser, sensor = (_device_position(at, wall) for at in positions)
+    capture = _capture(capture_config, sensor_grid, laser_grid, laser, sensor)
+    if capture_config.laser_flash is None:
+        return capture
+    angle, size = float(np.radians(capture_config.laser_flash.fov_deg)), (wall.width, wall.height)
+    return replace(capture, laser_flash=Flash.onto(angle, laser, laser_grid.positions[0, 0], size))
 
 
 def _capture_of_pixels(capture_config: CaptureConfig, wall: RelayWall, pixels: PixelPoints) -> Capture:

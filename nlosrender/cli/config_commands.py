@@ -147,6 +147,7 @@ def _summary(config: Config) -> str:
     for name, grid, listed in (
         (points, capture.sensor_grid, capture.sensor_list),
         ("lasers", capture.laser_grid, capture.laser_list),
+        ("laser spots at once", None, capture.spot_list),
     ):
         parts += [f"{grid.nx} x {grid.ny} {name}"] if grid is not None else []
         parts += [f"{len(listed)} listed {name}"] if listed is not None else []

@@ -12,6 +12,7 @@ from nlosrender.config.fields import (
     BinCount,
     Coordinate,
     Energy,
+    FieldOfView,
     Flag,
     GridCount,
     Length,
@@ -66,6 +67,13 @@ class FootprintConfig(Section):
         return (2 * self.radius, 2 * self.radius) if self.box is None and self.radius else self.box or (0.0, 0.0)
 
 
+class FlashConfig(Section):
+    """A cone of light from laser_position around the way to laser_point, with equal energy per solid angle."""
+
+    fov_deg: FieldOfView
+    """degrees, full angle of the cone"""
+
+
 class CaptureConfig(Section):
     """The scan: laser points, sensor points, and where laser and sensor stand."""
 
@@ -91,6 +99,8 @@ class CaptureConfig(Section):
     """of laser_spots: how the pulse's energy is shared, in any unit; null: equally"""
     multiplex: Flag = False
     """true with laser_spots: all at once"""
+    laser_flash: FlashConfig | None = None
+    """instead of a point: a cone of light from laser_position, whose axis goes to laser_point"""
     laser_point: Point2 | None = None
     """m, wall coordinates (x, y) from the wall's centre; the lit point of a single scan, default [0, 0]"""
     laser_target: Point3 | None = None
@@ -155,6 +165,15 @@ class CaptureConfig(Section):
         if spots is not None and weights is not None and len(weights) != len(spots):
             message = f"got {len(weights)} weights of {len(spots)} laser_spots, need one of each."
             yield ValidationIssue(("laser_spot_weights",), message)
+
+    def rule_laser_flash(self) -> Iterator[ValidationIssue]:
+        """A flash is neither spots nor a disc."""
+        if self.laser_flash is None:
+            return
+        if self.laser_spots is not None:
+            yield ValidationIssue(("laser_flash",), "stands beside laser_spots; remove one of them.", "key")
+        if self.laser_spot_radius > 0:
+            yield ValidationIssue(("laser_spot_radius",), mismatch(self.laser_spot_radius, "0 with laser_flash"))
 
     def rule_pixels(self) -> Iterator[ValidationIssue]:
         """The grid of a camera is its pixels."""

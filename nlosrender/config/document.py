@@ -135,8 +135,9 @@ class Config(Section):
             yield ValidationIssue(("capture", "laser_spot_radius"), message)
         if capture.footprint is not None:
             yield ValidationIssue(("capture", "footprint"), f"got one, and {needs}")
-        if capture.laser_spots is not None:
-            yield ValidationIssue(("capture", "laser_spots"), f"got some, and {needs}")
+        for key in ("laser_spots", "laser_flash"):
+            if getattr(capture, key) is not None:
+                yield ValidationIssue(("capture", key), f"got some, and {needs}")
         if self.render.polarized:
             yield ValidationIssue(("render", "polarized"), f"got true, and {needs}")
 
@@ -264,6 +265,18 @@ class Config(Section):
             return 0.0, 0.0
         sizes = (grid.width or extent[0]) / 2, (grid.height or extent[1]) / 2
         return sizes[0] * (1 - 1 / grid.nx), sizes[1] * (1 - 1 / grid.ny)
+
+    def rule_flash_on_the_wall(self) -> Iterator[ValidationIssue]:
+        """A flash lights a rectangle, and has no polarisation."""
+        wall = self.scene.relay_wall
+        if self.capture.laser_flash is None or wall is None:
+            return
+        if wall.type != "rectangle":
+            message = f"got one on a {wall.type} wall; need none there, or a rectangle wall."
+            yield ValidationIssue(("capture", "laser_flash"), message)
+        if self.render.polarized:
+            message = "got one with render.polarized, whose laser is a point; need one of them."
+            yield ValidationIssue(("capture", "laser_flash"), message)
 
     def rule_laser_can_be_found(self) -> Iterator[ValidationIssue]:
         """Paths find a point by sampling it alone."""

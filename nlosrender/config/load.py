@@ -37,6 +37,7 @@ LEFT_OUT = (  # of the canonical JSON, if empty
     ("capture", "laser_spots"),
     ("capture", "laser_spot_weights"),
     ("capture", "multiplex"),
+    ("capture", "laser_flash"),
 )
 MAX_ISSUES = 100  # told at once; nobody reads more
 SectionT = TypeVar("SectionT", bound=Section)

@@ -57,6 +57,7 @@ _SENSOR_GRID = """\
   # laser_points: [[0.0, 0.0], [0.1, 0.2]]  # instead of laser_grid, as sensor_points
   # laser_spots: [[0.0, 0.0], [0.1, 0.2]]  # instead of laser_point: lit by one pulse at once, with multiplex: true
   # multiplex: true
+  # laser_flash: {fov_deg: 40}   # instead: a cone from laser_position around the way to laser_point
   # laser_spot_weights: [1, 2]   # how they share the pulse's energy, any unit; default null: equally
 """
 _DEVICES = """\

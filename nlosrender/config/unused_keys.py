@@ -28,6 +28,7 @@ _NEEDED_BY: dict[str, tuple[str, ...]] = {
     "capture.laser_spots": ("single",),
     "capture.laser_spot_weights": ("single",),
     "capture.multiplex": ("single",),
+    "capture.laser_flash": ("single",),
     "capture.laser_target": ("single",),
     "capture.laser_targets": ("exhaustive",),
     "capture.pixel_point": _OF_WALLS,

@@ -49,13 +49,11 @@ def choose_engine(
     if reason is None and render.engine == "auto" and wall_sees_itself(built) and built.wall_shape.is_mesh():
         reason = "the relay wall is a mesh that sees itself: the edges between its triangles take very many patches"
     device = DeviceCapture(built, capture, time_axis, options)
-    if capture.footprint is not None and device.mirrors:
-        message = (
-            "the scene has mirrors or smooth coats, whose light is computed from points, not from areas. Remove it, or "
-        )
-        raise ConfigError.at(
-            "capture.footprint", f"{message}make them rough, such as {{type: roughconductor, alpha: 0.02}}."
-        )
+    area = "laser_flash" if capture.laser_flash is not None else "footprint" if capture.footprint is not None else None
+    if area is not None and device.mirrors:
+        message = "the scene has mirrors or smooth coats, whose light is computed from points, not from areas. "
+        message += "Remove it, or make them rough, such as {type: roughconductor, alpha: 0.02}."
+        raise ConfigError.at(f"capture.{area}", message)
     if reason is not None:
         return PathEngine(device, reason=reason)
     further = PathEngine(device, first_bounce=THIRD_BOUNCE + 1)
@@ -81,11 +79,8 @@ def _obstacle_close_by(engine: VirtualLightEngine, capture: Capture) -> str | No
     tessellator = engine.tessellator
     if capture.footprint is not None:
         reach = capture.footprint.reach / engine.built.metres_per_engine_unit
-        return (
-            "hidden geometry touches the footprint of a sensor point"
-            if tessellator.nearest < reach + TOUCHING
-            else None
-        )
+        touches = tessellator.nearest < reach + TOUCHING
+        return "hidden geometry touches the footprint of a sensor point" if touches else None
     if tessellator.nearest >= TOUCHING:
         return None
     if capture.scan_type == "confocal":
@@ -110,6 +105,8 @@ def _obstacle(render: RenderConfig, capture: Capture, built: BuiltScene) -> str 
         return "there is no third bounce to compute"
     if not (render.laser_sampling and render.hidden_geometry_sampling):
         return "a technique of the path engine is switched off"
+    if capture.laser_flash is not None:
+        return "the laser flashes an area"
     if capture.laser_spot_radius > 0:
         return "the laser has a spot"
     if capture.footprint is not None and capture.scan_type == "confocal":

@@ -56,6 +56,7 @@ class CaptureHeader:
     # (spots, 3) positions [m] and (spots,) shares of the pulse, sum 1, of spots that are lit at once;
     # ``laser_positions`` is their weighted middle then
     laser_spots: tuple[Float64, Float64] | None = None
+    laser_flash: str = ""  # what the laser lights at once, in words; empty: points
     chunk_samples: int = CHUNK_SAMPLES  # of a chunk of the file at most
 
     def __post_init__(self) -> None:

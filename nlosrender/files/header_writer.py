@@ -189,6 +189,8 @@ def root_attributes(header: CaptureHeader) -> dict[str, object]:
             f"{len(header.laser_spots[1])} spots, lit at once by one pulse, share its energy ({layout.SPOT_SHARES}); "
             "laserGridPositions is their weighted middle, where no light need be"
         )
+    if header.laser_flash:
+        attributes[layout.FLASH] = header.laser_flash
     if header.footprint is not None:
         attributes[layout.FOOTPRINT], attributes[layout.FOOTPRINT_AREA] = header.footprint
     if header.n_channels in layout.CHANNELS:

@@ -102,6 +102,7 @@ FOOTPRINT, FOOTPRINT_AREA = "footprint", "footprint_area"
 # Of captures whose laser spots are lit at once: an attribute that says so, and the datasets of the spots, (3, 1, spots)
 # in the file's frame [m] and (spots,), their shares of the pulse. laserGridPositions holds their weighted middle.
 MULTIPLEXED = "laser_spots"
+FLASH = "laser_flash"  # attribute of captures whose laser lights a part of the wall at once, in words
 SPOT_POSITIONS, SPOT_SHARES = "laserSpotPositions", "laserSpotShares"
 CHANNELS = {3: "rgb", 4: STOKES}  # grey: files without the attribute
 DATA_UNIT = "J m^-2 sr^-1"  # radiance leaving a sensor point, integrated over the bin, for one pulse

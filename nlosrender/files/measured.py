@@ -459,6 +459,7 @@ def _counts_header(
             empty_lasers=empty_lasers,
             n_unlit_lasers=n_unlit if isinstance(n_unlit, int) else 0,
             footprint=header.footprint,
+            laser_flash=str(header.attributes.get(layout.FLASH, "")),
             laser_spots=None if spots is None else (moved(spots[0], to_wall), spots[1]),
             point_lists=tuple(name for name in ("sensor", "laser") if header.is_list(name)),
             # a chunk is counted at once: of few bins as few points as of the many they are made of

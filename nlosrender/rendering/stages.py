@@ -182,7 +182,7 @@ def describe_file(
         sensor_position=capture.sensor_position,
         laser_position=capture.laser_position,
         sensor_grid_size=capture.sensor_grid.size,
-        laser_grid_size=capture.laser_grid.size,
+        laser_grid_size=capture.laser_grid.size if spots is None else (0.0, 0.0),
         n_bins=time_axis.n_bins,
         bin_width_opl=time_axis.bin_width_opl,
         start_opl=time_axis.start_opl,
@@ -201,5 +201,6 @@ def describe_file(
         shared_samples=shared,
         point_lists=capture.point_lists,
         laser_spots=spots,
+        laser_flash="" if capture.laser_flash is None else capture.laser_flash.in_words,
         footprint=None if capture.footprint is None else (capture.footprint.in_words, capture.footprint.area),
     )

@@ -29,6 +29,7 @@ def capture(wall=WALL, **changes):
         "laser_list": None,
         "footprint": None,
         "spot_list": None,
+        "laser_flash": None,
         "laser_spot_weights": None,
         "laser_point": None,
         "laser_position": [6.0, -2.0, 1.5],

@@ -29,6 +29,7 @@ def capture(wall=WALL, scan_type="exhaustive", **changes):
         "laser_list": None,
         "footprint": None,
         "spot_list": None,
+        "laser_flash": None,
         "laser_spot_weights": None,
         "laser_point": (0.3, -0.2),
         "laser_position": [-0.5, 0.1, 0.25],

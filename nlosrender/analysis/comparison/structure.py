@@ -14,7 +14,15 @@ from nlosrender.files.reading.stored_header import StoredHeader
 
 WIDTH_TOLERANCE = 1e-6  # relative; a float32 deltaT is off by 6e-8
 # attributes that change what a sample means; files by other writers may lack them
-MEANINGS = ("frame", "account_first_and_last_bounces", "channels", "split_bounces", "footprint", "laser_spots")
+MEANINGS = (
+    "frame",
+    "account_first_and_last_bounces",
+    "channels",
+    "split_bounces",
+    "footprint",
+    "laser_spots",
+    "laser_flash",
+)
 
 
 @dataclass(frozen=True)

@@ -147,7 +147,8 @@ def light_leaves_window(built: BuiltScene, capture: Capture, time_axis: TimeAxis
 
 def _slack(capture: Capture) -> float:
     """Return by how much light may arrive earlier than from laser and sensor points [m]."""
-    return capture.laser_spot_radius + (0.0 if capture.footprint is None else 2 * capture.footprint.reach)
+    reach = 0.0 if capture.laser_flash is None else 2 * capture.laser_flash.reach
+    return reach + capture.laser_spot_radius + (0.0 if capture.footprint is None else 2 * capture.footprint.reach)
 
 
 def _box(grid: PointGrid, unit: float) -> Bounds:

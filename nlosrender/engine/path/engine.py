@@ -32,6 +32,7 @@ from nlosrender.engine.launch.sequences import SystematicSequence
 from nlosrender.engine.launch.temporal_kernel import TemporalKernel
 from nlosrender.engine.path.continuation_period import best_continuation_period, first_phases
 from nlosrender.engine.path.full_loop import trace_paths
+from nlosrender.engine.path.laser_flash import LaserFlash
 from nlosrender.engine.path.settings import PathParams, PathSettings
 from nlosrender.engine.path.technique_mixture import box_often_missed, choose_p_hidden_sampling, omitted_techniques
 from nlosrender.engine.path.third_bounce_loop import is_third_bounce_loop, trace_third_bounce
@@ -99,6 +100,7 @@ class PathEngine:
             only_specular=self.only_specular,
             delta_share=self.tuning.delta_share if self.only_specular else 0.0,
             has_mirrors=bool(self.mirrors),
+            flashes=self.capture.laser_flash is not None,
             # with a mirrored spot every path adds what its sensor point sees of it
             max_tries=0 if has_spot and self.mirrors else self.tuning.max_tries,
         )
@@ -214,6 +216,7 @@ class PathEngine:
             "hidden_aabb": self.hidden_aabb,
             "continuation_period": dr.opaque(mi.UInt32, period),
             "mirrors": self.mirrors,
+            "flash": None if not self.settings.flashes else LaserFlash(self.built, self.capture, self.time_axis),
             "mirrors_per_vertex": dr.opaque(mi.UInt32, self.tuning.mirrors_per_vertex),
         }
         return PathParams(**vars(params), **own)

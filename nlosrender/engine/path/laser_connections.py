@@ -53,6 +53,8 @@ def connect_to_lasers(
     in_spot = mi.Vector3f(0)
     if dr.hint(settings.finds_spot, mode="scalar"):
         in_spot = _on_disk(generator, active) * settings.spot_radius
+    if dr.hint(settings.flashes, mode="scalar"):
+        in_spot = mi.Vector3f(generator.next_float32(active), generator.next_float32(active), 0)
     if dr.hint(params.lasers_per_lane == 1, mode="scalar"):
         _connect(settings, params, histogram, in_spot, mi.UInt32(0), vertex, active, coherent)
     else:
@@ -105,6 +107,9 @@ def _connect(
 ) -> None:
     built, si, context = params.built, vertex.si, mi.BSDFContext()
     points = params.lasers.gather(params.first_laser + laser)
+    if params.flash is not None:
+        points, is_met = params.flash.placed(points, mi.Point2f(in_spot.x, in_spot.y))
+        active = active & is_met
     lit = points.interaction
     if settings.finds_spot:
         lit.p = lit.p + lit.to_world(in_spot)

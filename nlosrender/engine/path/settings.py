@@ -11,6 +11,7 @@ from nlosrender.capture.bounces import FIRST_BOUNCE, THIRD_BOUNCE, BounceAxis
 from nlosrender.engine.launch.hidden_aabb import HiddenAabb
 from nlosrender.engine.launch.launch_params import LaunchParams
 from nlosrender.engine.launch.mirror_connections import Mirrors
+from nlosrender.engine.path.laser_flash import LaserFlash
 from nlosrender.engine.path.tuning import PathTuning
 
 
@@ -31,6 +32,7 @@ class PathSettings:
     delta_share: float = 0.0  # probability of delta lobes where a path still needs one; 0: that of the BSDF
     has_mirrors: bool = False  # vertices are connected to the lasers by way of mirrors, too
     max_tries: int = PathTuning.max_tries  # see ``PathTuning``
+    flashes: bool = False  # vertices are connected to random places of the laser's flash
 
     @property
     def goes_on(self) -> bool:
@@ -93,4 +95,5 @@ class PathParams(LaunchParams):
     hidden_aabb: HiddenAabb | None  # None: few rays from the wall miss it
     continuation_period: mi.UInt32  # n: one path in n continues after bounce 3; opaque
     mirrors: tuple[Mirrors, ...]  # by way of which vertices are connected
+    flash: LaserFlash | None  # None: the laser lights points or spots
     mirrors_per_vertex: mi.UInt32  # how many of them a vertex is connected by way of, drawn at random; opaque

@@ -34,6 +34,7 @@ from nlosrender.engine.path.vertex_steps import DirectionNumbers, arrive, leave,
 def is_third_bounce_loop(settings: PathSettings, sampler: SurfaceSampler) -> bool:
     """Return whether this loop samples all paths of these settings: hidden geometry sampling of triangles alone."""
     only_hidden = settings.p_hidden_sampling == 1 and settings.laser_sampling and not settings.finds_spot
+    only_hidden &= not settings.flashes
     is_first = settings.first_bounce == THIRD_BOUNCE
     return only_hidden and is_first and not sampler.has_analytic and not mi.is_polarized
 

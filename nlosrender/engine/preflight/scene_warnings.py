@@ -123,6 +123,8 @@ def dark_surface_warnings(built: BuiltScene, capture: Capture, max_bounces: int 
         if built.hidden_shapes and not n_unsampled:
             yield "no hidden surface faces the relay wall: nothing comes back from the hidden scene."
         return
+    if capture.laser_flash is not None:  # what it lights is not what the laser point sees
+        return
     surfaces = [points for _, points in facing]
     lit = _any_visible(built, surfaces, capture.laser_grid)
     seen = lit if capture.scan_type == "confocal" else _any_visible(built, surfaces, capture.sensor_grid)

@@ -110,7 +110,11 @@ class StoredHeader:
         return layout.MULTIPLEXED in self.attributes
 
     def refuse_spots(self, what: str) -> None:
-        """Raise FileError where several laser spots were lit at once, for ``what`` is for one laser point."""
+        """Raise FileError where a flash or several laser spots lit the wall, for ``what`` is for one laser point."""
+        if layout.FLASH in self.attributes:
+            raise FileError(
+                f"{self.path}: its laser is {self.attributes[layout.FLASH]}, and {what} takes a laser point."
+            )
         if self.is_multiplexed:
             raise FileError(
                 f"{self.path}: its laser spots were lit at once ({layout.SPOT_POSITIONS}), and {what} takes one laser "
