@@ -308,14 +308,18 @@ def test_an_exhaustive_scan_of_the_pixels_is_symmetrical() -> None:
 XML = """<scene version="3.0.0"><bsdf type="twosided" id="white"><bsdf type="diffuse">
 <rgb name="reflectance" value="1"/></bsdf></bsdf>
 <shape type="obj"><string name="filename" value="wall.obj"/><ref id="white"/></shape>
-<shape type="rectangle"><transform name="to_world"><scale x="0.3" y="0.25"/><rotate y="1" angle="180"/>
-<translate x="0.1" y="0.05" z="0.8"/></transform><ref id="white"/></shape></scene>"""
+<shape type="rectangle">TURNED<translate x="0.1" y="0.05" z="0.8"/></transform>
+<bsdf type="diffuse"><rgb name="reflectance" value="1"/></bsdf></shape></scene>"""
+SIZED = '<transform name="to_world"><scale x="0.3" y="0.25"/>'
 OBJ = "v -1 -0.8 0\nv 1 -0.8 0\nv 1 0.8 0\nv -1 0.8 0\nf 1 2 3 4\n"
 
 
-def test_a_rectangle_of_a_mitsuba_scene_is_a_wall(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    "turned", [f'{SIZED}<rotate y="1" angle="180"/>', f'<boolean name="flip_normals" value="true"/>{SIZED}']
+)
+def test_a_rectangle_of_a_mitsuba_scene_is_a_wall(tmp_path: Path, turned: str) -> None:
     """Two triangles of a mesh file that all pixels see are the wall of virtual lights, as a rectangle of ours is."""
-    (tmp_path / "room.xml").write_text(XML, encoding="utf-8")
+    (tmp_path / "room.xml").write_text(XML.replace("TURNED", turned), encoding="utf-8")
     (tmp_path / "wall.obj").write_text(OBJ, encoding="utf-8")
     asked = {"engine": "virtual_lights", "spp": None, "target_error": 0.01}
     plate = {**PLATE, "normal": [0, 0, -1], "bsdf": WHITE}
@@ -324,5 +328,9 @@ def test_a_rectangle_of_a_mitsuba_scene_is_a_wall(tmp_path: Path) -> None:
     config["scene"]["mitsuba"] = "room.xml"
     theirs = render(config, folder=tmp_path)
     assert theirs.samples == 0
+    config["scene"]["hidden_geometry"] = [BEHIND]  # and without wall, by paths
+    pathwise = render(config, ["render.target_error=0.05"], folder=tmp_path)
+    assert pathwise.samples > 0
+    assert relative_l2(pathwise.total - own.total, own.total) < 0.1
     np.testing.assert_allclose(theirs.capture.sensor_grid.positions, own.capture.sensor_grid.positions, atol=1e-6)
     assert relative_l2(theirs.total - own.total, own.total) < 0.01

@@ -143,7 +143,6 @@ def test_mistakes_are_told(plates: Any, changed: dict[str, Any], kind: type[Exce
     ("shape", "message"),
     [
         ({"emitter": {"type": "area", "radiance": 1.0}}, "scene: has 1 emitters, and the laser is the only light"),
-        ({"flip_normals": True, "type": "rectangle"}, "scene.x: has flip_normals; turn its faces round"),
         ({"interior": {"type": "homogeneous"}}, "scene.x: is filled with a medium"),
         (
             {"bsdf": {"type": "blendbsdf", "weight": 0.5, "a": {"type": "conductor"}, "b": {"type": "diffuse"}}},

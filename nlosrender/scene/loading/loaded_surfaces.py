@@ -46,12 +46,15 @@ def loaded_surface(shape: mi.Shape, frame: Pose, index: int) -> Surface:
     for obstacle in _obstacles(shape):
         raise ConfigError.at(key, obstacle)
     to_local = frame.inverse_matrix()
-    if shape.class_name() == "Rectangle":  # a mesh, which does not show its vertices
-        uvs = (CORNERS[:, :2] + 1) / 2
-        mesh = TriangleMesh(CORNERS.astype(np.float64), np.array([[0, 1, 2], [0, 2, 3]]), uvs)
-        placed: TriangleMesh | ShapeDescription = mesh.transformed(to_local @ to_world_of_shape(shape))
-    elif shape.is_mesh():
-        placed = triangles_of(shape).transformed(to_local)
+    placed: TriangleMesh | ShapeDescription
+    if shape.is_mesh():
+        if shape.class_name() == "Rectangle":  # does not show its vertices
+            uvs = (CORNERS[:, :2] + 1) / 2
+            mesh = TriangleMesh(CORNERS.astype(np.float64), np.array([[0, 1, 2], [0, 2, 3]]), uvs)
+            mesh = mesh.transformed(to_local @ to_world_of_shape(shape))
+        else:
+            mesh = triangles_of(shape).transformed(to_local)
+        placed = mesh.turned_round() if shape.has_flipped_normals() else mesh
     else:
         description = {"type": ROUND[shape.class_name()], "to_world": to_local @ to_world_of_shape(shape)}
         placed = ShapeDescription(description | {"flip_normals": bool(shape.has_flipped_normals())})
@@ -69,8 +72,6 @@ def _obstacles(shape: mi.Shape) -> Iterator[str]:
         yield f"has the mesh attribute {others[0]}, which is not read; use a bitmap."
     if shape.interior_medium() is not None or shape.exterior_medium() is not None:
         yield "is filled with a medium; light travels straight between surfaces here."
-    if shape.is_mesh() and shape.has_flipped_normals():
-        yield "has flip_normals; turn its faces round instead."
     if "to_world" in parameters and np.linalg.det(to_world_of_shape(shape)[:3, :3]) <= 0:
         yield "is mirrored by its to_world; use a rotation and a scale."
     bsdf = shape.bsdf()
@@ -79,8 +80,11 @@ def _obstacles(shape: mi.Shape) -> Iterator[str]:
 
 
 def with_vertices(shape: mi.Shape, index: int) -> mi.Shape:
-    """Return a shape, but Mitsuba's rectangle, a mesh that does not show its vertices, as a mesh that does."""
-    if shape.class_name() != "Rectangle":
+    """Return a shape, but a mesh that does not show its vertices, or with normals against its faces, as a plain mesh.
+
+    Mitsuba's rectangle is one of the former. Errors as of ``loaded_surfaces``.
+    """
+    if not (shape.is_mesh() and (shape.class_name() == "Rectangle" or shape.has_flipped_normals())):
         return shape
     surface = loaded_surface(shape, Pose.identity(), index)
     assert isinstance(surface.shape, TriangleMesh)
