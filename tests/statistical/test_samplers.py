@@ -12,7 +12,6 @@ from support.agreement import FALSE_ALARM
 from support.rendering import configured, flat_wall
 
 from nlosrender.engine.backend.start import start_backend
-from nlosrender.engine.launch.sequences import recurrence_steps
 from nlosrender.rendering import stages
 
 N = 2**20
@@ -162,6 +161,8 @@ def test_additive_recurrences_cover_boxes_evenly(dimensions: int) -> None:
     """The share of n points in a box differs from its volume by less than for random numbers."""
     n = 4096
     rng = np.random.default_rng(2)
+    from nlosrender.engine.launch.sequences import recurrence_steps
+
     steps = np.array(recurrence_steps(dimensions), dtype=np.uint64)
     start = rng.integers(0, 2**32, dimensions, dtype=np.uint64)
     points = ((start + np.arange(n, dtype=np.uint64)[:, None] * steps) % 2**32) / 2**32

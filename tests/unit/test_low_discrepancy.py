@@ -3,7 +3,14 @@
 import numpy as np
 import pytest
 
-from nlosrender.engine.launch.sequences import recurrence_steps
+pytestmark = pytest.mark.usefixtures("backend")  # Mitsuba starts before an engine module is imported
+
+
+def recurrence_steps(dimensions):
+    """Return the steps of the engine's sequence."""
+    from nlosrender.engine.launch import sequences
+
+    return sequences.recurrence_steps(dimensions)
 
 
 @pytest.mark.parametrize("dimensions", [1, 2, 3])
