@@ -152,7 +152,7 @@ def test_density_is_claimed_for_what_is_sampled_and_nothing_else(sampled: Sample
     for name, direction in directions.items():
         towards = [float(x) for x in np.array(direction) / np.linalg.norm(direction)]
         si = scene.ray_intersect(mi.Ray3f(mi.Point3f(origin.tolist()), mi.Vector3f(towards)))
-        covered[name] = bool(sampled.sampler.covers(si, wall)[0])
+        covered[name] = bool(sampled.sampler.covers(si, si.shape == wall)[0])
     assert covered == {"hidden": True, "wall": False, "void": False}
 
 
