@@ -64,6 +64,9 @@ def choose_engine(
     if engine.tessellator.n_round_elements > engine.tessellator.tuning.max_patches:
         reason = "a round surface is so narrow that it would be cut into millions of patches"
         return PathEngine(device, reason=reason)
+    reach = capture.footprint.reach / built.metres_per_engine_unit if capture.footprint is not None else None
+    if reach is not None and engine.tessellator.nearest < reach + TOUCHING:
+        return PathEngine(device, reason="hidden geometry touches the footprint of a sensor point")
     if render.engine == "virtual_lights":
         engine.reason = "asked for"
     elif (reason := _obstacle_close_by(engine, capture)) is not None:
@@ -77,10 +80,6 @@ def _obstacle_close_by(engine: VirtualLightEngine, capture: Capture) -> str | No
     Paths from the sensor points find what is close to these, but not what is close to a laser point elsewhere.
     """
     tessellator = engine.tessellator
-    if capture.footprint is not None:
-        reach = capture.footprint.reach / engine.built.metres_per_engine_unit
-        touches = tessellator.nearest < reach + TOUCHING
-        return "hidden geometry touches the footprint of a sensor point" if touches else None
     if tessellator.nearest >= TOUCHING:
         return None
     if capture.scan_type == "confocal":

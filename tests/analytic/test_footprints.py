@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from functools import cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 from support.rendering import flat_wall, render
+from support.varied_scenes import Stage
 
 from nlosrender.errors import ConfigError
 
@@ -125,3 +127,13 @@ def test_light_of_mirrors_has_no_footprint() -> None:
     described = flat_wall(mirror, capture={"footprint": {"radius": 0.01}})
     with pytest.raises(ConfigError, match=r"footprint: the scene has mirrors.*roughconductor"):
         render(described)
+
+
+def test_paths_render_footprints_that_hidden_geometry_touches() -> None:
+    """Also where virtual lights are asked for: a few places of a footprint miss what its other places see close up."""
+    touching = {"type": "rectangle", "width": 0.2, "height": 0.2, "center": [0.0, 0.0, 0.1], "normal": [1, 0, 0]}
+    for item, engine in ((touching, "path"), (PLATE, "virtual_lights")):
+        capture = {"sensor_grid": {"nx": NX, "ny": NY, **EXTENT}, "footprint": BOX}
+        assert (
+            Stage.of(flat_wall(item, capture=capture, engine="virtual_lights", spp=None), Path()).engine.name == engine
+        )
