@@ -83,7 +83,7 @@ class CaptureConfig(Section):
     sensor_grid: GridConfig | None = None
     """the measured points; with a camera: its pixels, not set here"""
     sensor_points: WallPoints | None = None
-    """instead of a grid: [[x, y], ...] in wall coordinates [m], or {file: points.csv}, also .npy"""
+    """m, wall coordinates [[x, y], ...] instead of a grid, or {file: points.csv}, also .npy"""
     camera: CameraConfig | None = None
     """line_of_sight: where the scene is seen from; other scans: what each pixel sees first is its sensor point, on
     whatever surface; null: the camera of scene.mitsuba"""
@@ -92,9 +92,9 @@ class CaptureConfig(Section):
     laser_grid: GridConfig | None = None
     """the lit points of an exhaustive scan"""
     laser_points: WallPoints | None = None
-    """instead of laser_grid, as sensor_points"""
+    """m, instead of laser_grid, as sensor_points"""
     laser_spots: WallPoints | None = None
-    """instead of laser_point, as sensor_points: spots that one pulse lights at once, into one histogram"""
+    """m, instead of laser_point, as sensor_points: spots that one pulse lights at once, into one histogram"""
     laser_spot_weights: Weights | None = None
     """of laser_spots: how the pulse's energy is shared, in any unit; null: equally"""
     multiplex: Flag = False

@@ -129,9 +129,9 @@ class RelativeBrightness(Section):
     """Photons that reach the detector per pulse, over all bins of a histogram: the capture is scaled to it."""
 
     brightest: Photons | None = None
-    """of the brightest histogram of the capture"""
+    """photons per pulse, of the brightest histogram of the capture"""
     mean: Photons | None = None
-    """of all histograms of the capture, on average"""
+    """photons per pulse, of all histograms of the capture, on average"""
 
     def rule_one_of_them(self) -> Iterator[ValidationIssue]:
         """There is one scale."""

@@ -10,7 +10,7 @@ import pytest
 
 ROOT = Path(__file__).parents[2]
 PACKAGE = ROOT / "nlosrender"
-PAGES = sorted([*ROOT.glob("docs/*.md"), ROOT / "README.md", ROOT / "CONTRIBUTING.md"])
+PAGES = sorted([*ROOT.glob("docs/*.md"), ROOT / "docs/notebook.ipynb", *ROOT.glob("*.md")])
 OF_CODE = [ROOT / "docs" / name for name in ("virtual-lights.md", "architecture.md")]
 MODULES = {
     path: ast.parse(path.read_text()) for path in (*PACKAGE.rglob("*.py"), ROOT / "tests/support/constant_engine.py")
@@ -107,12 +107,22 @@ def test_a_constant_is_defined_in_a_file_that_its_section_names(page: Path) -> N
     assert not missing
 
 
+def anchors(page: Path) -> set[str]:
+    """Return the anchors that GitHub and the docs site give the headings of a page."""
+    text = re.sub(r"^```.*?^```", "", page.read_text(), flags=re.DOTALL | re.MULTILINE)
+    headings = re.findall(r"^#+ (.+)$", text, flags=re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
+
+
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
-def test_every_path_on_a_page_exists(page: Path) -> None:
-    """Modules, pages, pictures, configurations and folders; links are relative to the page."""
+def test_every_link_and_path_on_a_page_leads_somewhere(page: Path) -> None:
+    """Modules, pages, headings, pictures, configurations and folders; links are relative to the page."""
     text = re.sub(r"```.*?```", "", page.read_text(), flags=re.DOTALL)
-    links = {link.split("#")[0] for link in re.findall(r"\]\(([^)#]+)\)", text)}
-    assert not {link for link in links if not (page.parent / link).exists()}
+    links = [link for link in re.findall(r"\]\(([^)\s]+)\)", text) if not link.startswith("https://")]
+    for path, _, anchor in (link.partition("#") for link in links):
+        target = page.parent / path if path else page
+        assert target.exists(), path
+        assert not anchor or anchor in anchors(target), f"{path}#{anchor}"
     if page in OF_CODE:
         paths = set(re.findall(r"(?<![\w/])[a-z_][\w/-]*\.(?:py|yaml)\b", text))
         paths |= {span for span in code_spans(page) if re.fullmatch(r"[\w/]+/", span)}
