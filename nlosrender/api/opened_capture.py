@@ -187,16 +187,16 @@ class Capture:
 
     def plot(
         self,
+        *,
         laser: Point | None = None,
         pixel: Point | None = None,
         ideal: str | os.PathLike[str] | None = None,
-        *,
         theme: str = "dark",
         size: tuple[float, float] = (14.0, 7.6),
         dpi: float = 130.0,
         shared_scale: bool = False,
     ) -> Picture:
-        """Draw the wall over time, one histogram, the light of each bounce, one row over time.
+        """Draw the wall over time, one histogram, the light of each bounce, one row over time; ``.save(path)`` writes it.
 
         Parameters
         ----------
