@@ -196,7 +196,7 @@ class Capture:
         dpi: float = 130.0,
         shared_scale: bool = False,
     ) -> Picture:
-        """Draw the wall over time, one histogram, the light of each bounce, one row over time; ``.save(path)`` writes it.
+        """Draw the wall over time, one histogram, light per bounce, one row over time; ``save(path)`` writes it.
 
         Parameters
         ----------

@@ -27,7 +27,7 @@ UNPACKED_SPEED = 500e6  # bytes per second, of a disk
 class FileSize:
     """What a capture file takes."""
 
-    logical_bytes: int  # of all datasets, as a reader sees them; exact
+    logical_bytes: int  # of all datasets but ground truth and counts, as a reader sees them; exact
     disk_bytes_estimate: int
     write_seconds: float  # estimate, packing included
     assumption: str  # behind the two estimates

@@ -64,7 +64,7 @@ def expected_file_size(
     filled = filled_shares(engine.capture, wall, bounds, engine.time_axis, engine.options.bounces)
     if lit_shares is not None:
         filled = tuple(most if lit is None else min(most, lit) for most, lit in zip(filled, lit_shares, strict=True))
-    return forecast_size(
+    size = forecast_size(
         header.sizes,
         header.confocal,
         filled,
@@ -72,3 +72,7 @@ def expected_file_size(
         variance=config.output.variance,
         line_of_sight=config.capture.is_line_of_sight,
     )
+    besides = ["the ground truth"] * bool(config.output.ground_truth) + ["the counts"] * (config.sensor is not None)
+    if not besides:
+        return size
+    return replace(size, assumption=f"{size.assumption}; without {' and '.join(besides)}")

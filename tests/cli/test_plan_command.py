@@ -96,6 +96,14 @@ def test_the_plan_agrees_with_the_render(scan, engine):
     assert 0 < plan["seconds_estimate"] < 60
 
 
+def test_what_the_size_of_a_file_leaves_out_is_said() -> None:
+    """Ground truth and counts are written beside the light, and are no part of the size that is told."""
+    assert "without" not in planned(write_config("single"))["file"]["assumption"]
+    sensor = "sensor={profile: spad-532, exposure_time: 1.0, photons_per_pulse: {mean: 0.05}}"
+    both = planned(write_config("single"), "--set", "output.ground_truth=[depth]", "--set", sensor)
+    assert both["file"]["assumption"].endswith("without the ground truth and the counts")
+
+
 def test_the_plan_writes_nothing():
     """The folder is the same afterwards, an earlier capture untouched."""
     config = write_config()
