@@ -22,6 +22,8 @@ smartquotes = False  # options begin with two hyphens
 autodoc_member_order = "bysource"
 autodoc_typehints_format = "short"
 html_theme = "furo"
+html_theme_options = {key: {"code-font-size": "0.75rem"} for key in ("light_css_variables", "dark_css_variables")}
+html_static_path, html_css_files = ["site"], ["wide.css"]
 html_title = f"nlosrender {version}"
 html_copy_source = html_show_sphinx = html_show_copyright = False
 

@@ -206,8 +206,10 @@ class Capture:
             (row, column) of the sensor point whose histogram is drawn; None: the brightest.
         ideal
             Of counts: the capture that they were measured from.
-        theme, size, dpi
-            ``dark`` or ``light``; width and height in inches; pixels per inch where the picture is saved.
+        theme
+            ``dark`` or ``light``.
+        size, dpi
+            Width and height in inches, and pixels per inch where the picture is saved.
         shared_scale
             Draw the wall's frames on one colour scale; else each has its own.
         """
