@@ -33,6 +33,8 @@ if TYPE_CHECKING:
 
 MIN_LIT_SHARE = 1e-3  # of a cluster's area: what less of it sends on has no slopes to speak of
 TILTS = math.sqrt(1.5) * np.array([1.0, -1.0, 0.0])  # of facets: none in the mean, variance 1
+TURNS = 2 * np.pi / 3 * np.arange(3)
+CIRCLE = math.sqrt(2) * np.stack([np.cos(TURNS), np.sin(TURNS)], axis=1)  # none in the mean, the unit matrix squared
 MIN_SLOPE_VARIANCE = 1e-12  # float64 rounds covariances by 1e-16 of squared slopes
 
 
@@ -166,34 +168,16 @@ class Facets:
     def of(cls, merged: AreaMoments) -> Facets:
         """Return those of groups whose ``roughness`` is not 0."""
         slopes = _Slopes.of(merged)
-        values, axes = np.linalg.eigh(slopes.covariance)
-        weights, upright = slopes.weights, merged.upright
-        # where they vary along one line, all of them do
-        deviations = np.sqrt(np.where(values > MIN_SLOPE_VARIANCE, values, np.inf))
-        turns = 2 * np.pi / 3 * np.arange(3)
-        circle = np.sqrt(2) * np.stack([np.cos(turns), np.sin(turns)], axis=1)
-        along = axes * np.sqrt(np.maximum(values, 0))[:, None, :]
-        of_facets = slopes.mean[:, None] + np.einsum("kj,nij->nki", circle, along)
+        variances, axes = np.linalg.eigh(slopes.covariance)
+        along = axes * np.sqrt(np.maximum(variances, 0))[:, None, :]
+        of_facets = slopes.mean[:, None] + np.einsum("kj,nij->nki", CIRCLE, along)
         sign = (2 * (merged.facing % 2) - 1)[:, None, None]
         facets = sign * np.concatenate([of_facets, np.ones((len(merged), 3, 1))], axis=2)
         squares = np.square(facets).sum(axis=2)
-        normals = np.stack([_from_box(facets[:, k], upright) for k in range(3)], axis=1)
-        places, by_slopes = merged.lit_places[:, :9] / weights[:, None], merged.lit_places[:, 9:].reshape(-1, 2, 3)
-        middle = places[:, :3]
-        mixed = by_slopes / weights[:, None, None] - slopes.mean[:, :, None] * middle[:, None, :]
-        steps = np.einsum("nij,nix->njx", axes, mixed) / deviations[:, :, None]  # per deviation of the slope
-        centres = middle[:, None] + np.einsum("kj,njx->nkx", circle, steps)
-        rest = (
-            places[:, 3:][:, PLACE] - middle[:, :, None] * middle[:, None, :] - np.einsum("njx,njy->nxy", steps, steps)
-        )
-        about = np.hstack(
-            [np.ones((len(merged), 1)), np.zeros((len(merged), 3)), *(rest[:, i, j, None] for i, j in PAIRS)]
-        )
-        plane = BoxPlane.of(about, upright)
-        rises = np.sqrt(3 * plane.thickness)[:, None] * TILTS
-        corners = np.stack([_parallelograms(plane, upright, centres[:, k], rises[:, k]) for k in range(3)], axis=1)
+        normals = np.stack([_from_box(facets[:, k], merged.upright) for k in range(3)], axis=1)
+        centres, corners = _placed_by_slope(merged, slopes, variances, axes)
         return cls(
-            areas=(weights[:, None] / 3 * squares).ravel(),
+            areas=(slopes.weights[:, None] / 3 * squares).ravel(),
             normals=(normals / np.sqrt(squares)[:, :, None]).reshape(-1, 3),
             centres=centres.reshape(-1, 3),
             corners=corners.reshape(-1, 3, 3),
@@ -215,6 +199,30 @@ class _Slopes:
         means = matrices / np.where(weights == 0, 1.0, weights)[:, None, None]
         mean = means[:, :2, 2]
         return cls(weights, mean, means[:, :2, :2] - mean[:, :, None] * mean[:, None, :])
+
+
+def _placed_by_slope(
+    merged: AreaMoments, slopes: _Slopes, variances: Float64, axes: Float64
+) -> tuple[Float64, Float64]:
+    """Return centres (n, 3, 3) and corners (n, 3, 3, 3) of three facets whose slopes lie on the ``CIRCLE``.
+
+    ``variances`` (n, 2) of the slopes along orthonormal ``axes`` (n, 2, 2), columns.
+    """
+    # where slopes vary along one line only, positions follow them there
+    deviations = np.sqrt(np.where(variances > MIN_SLOPE_VARIANCE, variances, np.inf))
+    places, by_slopes = (part / slopes.weights[:, None] for part in np.split(merged.lit_places, [9], axis=1))
+    middle = places[:, :3]
+    mixed = by_slopes.reshape(-1, 2, 3) - slopes.mean[:, :, None] * middle[:, None, :]
+    steps = np.einsum("nij,nix->njx", axes, mixed) / deviations[:, :, None]  # per deviation of the slope
+    centres = middle[:, None] + np.einsum("kj,njx->nkx", CIRCLE, steps)
+    covariance = places[:, 3:][:, PLACE] - middle[:, :, None] * middle[:, None, :]
+    rest = covariance - np.einsum("njx,njy->nxy", steps, steps)
+    about_centres = np.zeros((len(merged), 10))
+    about_centres[:, 0], about_centres[:, 4:] = 1, np.stack([rest[:, i, j] for i, j in PAIRS], axis=1)
+    plane = BoxPlane.of(about_centres, merged.upright)
+    rises = np.sqrt(3 * plane.thickness)[:, None] * TILTS
+    corners = [_parallelograms(plane, merged.upright, centres[:, k], rises[:, k]) for k in range(3)]
+    return centres, np.stack(corners, axis=1)
 
 
 def roughness(merged: AreaMoments) -> Float64:
