@@ -29,11 +29,11 @@ from nlosrender.config.bsdf_table import (
 from nlosrender.config.fields import Checked
 from nlosrender.config.issues import InvalidValue, did_you_mean, invalid_value
 from nlosrender.config.plugin_check import config_folder, existing_file, mitsuba_file
-from nlosrender.config.xml_expansion import LEFT_OUT, START, Expansion, prefixed_with_place
+from nlosrender.config.xml_expansion import LEFT_OUT, START, Expansion
 from nlosrender.config.xml_numbers import check_numbers
 from nlosrender.config.xml_shapes import check_xml_bsdf, check_xml_shape
 from nlosrender.config.xml_transforms import check_rotation
-from nlosrender.config.xml_tree import SceneElement, parsed_xml
+from nlosrender.config.xml_tree import SceneElement, parsed_xml, prefixed_with_place
 from nlosrender.errors import ValidationIssue
 
 DEFAULT_FILM = (768, 576)  # Mitsuba's
@@ -169,7 +169,8 @@ def _film_size(sensor: Element) -> tuple[int, int] | None:
     if any(str(name).startswith("crop") for name in size) or any("$" in number for number in numbers):
         return None
     if not all(number.strip().isdecimal() and len(number) < 8 and int(number) > 0 for number in numbers):
-        raise ValueError(f"its film has {numbers[0]} x {numbers[1]} pixels, need two integers >= 1")
+        with prefixed_with_place(sensor if film is None else film):
+            raise ValueError(f"its film has {numbers[0]} x {numbers[1]} pixels, need two integers >= 1")
     return int(numbers[0]), int(numbers[1])
 
 

@@ -9,14 +9,21 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from xml.etree.ElementTree import Element
 
 from nlosrender.config.issues import shown
 from nlosrender.config.plugin_check import existing_file
-from nlosrender.config.xml_tree import MAX_DEPTH, MAX_ELEMENTS, MAX_XML_BYTES, SceneElement, place_of, read_xml
+from nlosrender.config.xml_tree import (
+    MAX_DEPTH,
+    MAX_ELEMENTS,
+    MAX_XML_BYTES,
+    PlacedError,
+    SceneElement,
+    prefixed_with_place,
+    read_xml,
+)
 
 MAX_INCLUDE_DEPTH = 15  # Mitsuba's
 MAX_FILES = 1000  # in one scene
@@ -57,8 +64,9 @@ class Expansion:
         """
         self.folders.append(self.main.parent)
         root = self._file(self.main, 0, 0)
-        if root.tag != "scene":
-            raise ValueError(f"its root is <{root.tag}>, need <scene>")
+        with prefixed_with_place(root):
+            if root.tag != "scene":
+                raise ValueError(f"its root is <{root.tag}>, need <scene>")
         for reference in root.iter("ref"):
             seen = set()
             while (name := reference.get("id", "")) in self._aliases and name not in seen:
@@ -74,7 +82,8 @@ class Expansion:
         self._count += sum(1 for _ in root.iter())
         if self._count > MAX_ELEMENTS:
             raise ValueError(f"it has more than {MAX_ELEMENTS} elements, with those of the files it includes")
-        is_old = _is_old(root)
+        with prefixed_with_place(root):
+            is_old = _is_old(root)
         root.set("version", "3.0.0")
         self._expand(root, path, depth, level, is_read=root.tag not in _UNREAD)
         if is_old:
@@ -84,9 +93,10 @@ class Expansion:
 
     def _expand(self, element: Element, path: Path, depth: int, level: int, *, is_read: bool) -> None:
         """Expand an element that lies in ``level`` others, in a file that lies in ``depth`` others."""
-        if level == MAX_DEPTH:
-            raise ValueError(f"its elements lie in each other more than {MAX_DEPTH} deep")
-        self._fill_in(element, is_read=is_read)
+        with prefixed_with_place(element):
+            if level == MAX_DEPTH:
+                raise ValueError(f"its elements lie in each other more than {MAX_DEPTH} deep")
+            self._fill_in(element, is_read=is_read)
         children = list(element)
         element[:] = []
         for child in children:
@@ -156,21 +166,6 @@ class Expansion:
                 advice = f"write <default name={left[1]!r} value='...'/> at the beginning of the scene"
                 raise ValueError(f"${left[1]} has no <default>; {advice}")
             element.set(key, text.replace(r"\$", "$"))
-
-
-@contextmanager
-def prefixed_with_place(element: Element) -> Iterator[None]:
-    """Put the place of an element before what is raised; the innermost element's place stays the only one."""
-    try:
-        yield
-    except PlacedError:
-        raise
-    except ValueError as error:
-        raise PlacedError(f"{place_of(element)}: {error}") from error
-
-
-class PlacedError(ValueError):
-    """Says where in a scene something is wrong."""
 
 
 def _is_old(root: Element) -> bool:

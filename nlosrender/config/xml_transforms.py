@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 from xml.etree.ElementTree import Element
 
@@ -15,7 +15,7 @@ _AXES = ("x", "y", "z")
 _LAST_ROW = [0.0, 0.0, 0.0, 1.0]
 
 
-def transform_steps(transform: Element) -> list[Any] | None:
+def transform_steps(transform: Iterable[Element]) -> list[Any] | None:
     """Return the steps of a ``<transform>``, the first applied first, each a ``to_world`` of its own.
 
     None for a transform that Mitsuba cannot read either: it says so, with the line.

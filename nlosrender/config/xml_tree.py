@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from typing import NoReturn
 from xml.etree.ElementTree import Element
 from xml.parsers import expat
 from xml.sax.saxutils import quoteattr
@@ -34,6 +37,21 @@ def place_of(element: Element) -> str:
     if not isinstance(element, SceneElement):
         return "line 0"
     return f"{element.file}, line {element.line}" if element.file else f"line {element.line}"
+
+
+@contextmanager
+def prefixed_with_place(element: Element) -> Iterator[None]:
+    """Put the place of an element before what is raised; the innermost element's place stays the only one."""
+    try:
+        yield
+    except PlacedError:
+        raise
+    except ValueError as error:
+        raise PlacedError(f"{place_of(element)}: {error}") from error
+
+
+class PlacedError(ValueError):
+    """Says where in a scene something is wrong."""
 
 
 def read_xml(path: Path, name: str = "") -> Element:
@@ -78,25 +96,31 @@ def parsed_xml(content: bytes, name: str = "") -> Element:
     opened: list[Element] = [Element("document")]
     count = itertools.count(1)
 
+    def refuse(what: str, line: int | None = None) -> NoReturn:
+        place = f"line {parser.CurrentLineNumber if line is None else line}"
+        raise PlacedError(f"{name}, {place}: {what}" if name else f"{place}: {what}")
+
     def start(tag: str, attributes: dict[str, str]) -> None:
         if next(count) > MAX_ELEMENTS:
-            raise ValueError(f"it has more than {MAX_ELEMENTS} elements")
+            refuse(f"it has more than {MAX_ELEMENTS} elements")
         if len(opened) > MAX_DEPTH:
-            raise ValueError(f"its elements lie in each other more than {MAX_DEPTH} deep")
+            refuse(f"its elements lie in each other more than {MAX_DEPTH} deep")
         element = SceneElement(tag, attributes)
         element.line, element.file = parser.CurrentLineNumber, name
         opened[-1].append(element)
         opened.append(element)
 
     def doctype(*_: object) -> None:
-        raise ValueError("it declares a document type or entities, which no Mitsuba scene needs")
+        refuse("it declares a document type or entities, which no Mitsuba scene needs; remove them")
 
     parser.StartElementHandler, parser.EndElementHandler = start, lambda _: opened.pop()
     parser.StartDoctypeDeclHandler = doctype
     try:
         parser.Parse(content, True)
-    except (expat.ExpatError, LookupError) as error:  # LookupError: an encoding nobody knows
-        raise ValueError(f"it is not well-formed XML: {error}") from error
+    except expat.ExpatError as error:
+        refuse(f"it is not well-formed XML: {expat.ErrorString(error.code)}", error.lineno)
+    except LookupError as error:  # an encoding nobody knows
+        refuse(f"it is not well-formed XML: {error}")
     return opened[0][0]  # expat refuses a document without an element
 
 

@@ -272,3 +272,20 @@ def test_a_fine_mesh_of_a_ball_is_the_ball(tmp_path: Path) -> None:
     assert stage.engine.tessellator.patches(0.8).is_cluster.any()
     # 120 x 60 facets lie up to 0.25 (1 - cos(pi / 60)) = 0.3 mm within the ball, and their area is 0.1 % less
     assert relative_l2(results[1] - results[0], results[0]) <= 2 * sum(stated) + 0.01
+
+
+def test_shading_normals_across_the_triangles_leave_patches_where_the_mesh_is(tmp_path: Path) -> None:
+    """What such members send on may count as negative, without second moments; patches stay within the mesh."""
+    n, random = 40, np.random.default_rng(3)
+    x, y = (side.ravel() for side in np.meshgrid(np.linspace(-0.4, 0.4, n + 2), np.linspace(-0.4, 0.4, n + 1)))
+    vertices = np.stack([x, y, 0.05 * np.sin(9 * x)], axis=1)
+    normals = random.normal([0, 0, -0.05], 1, vertices.shape)
+    lines = [f"v {' '.join(map(str, row))}" for row in vertices] + [f"vn {' '.join(map(str, row))}" for row in normals]
+    lines += ["f " + " ".join(f"{k + 1}//{k + 1}" for k in face) for face in grid_faces(n, n + 1)[:, ::-1]]
+    (tmp_path / "rough.obj").write_text("\n".join(lines))
+    bsdf = {"type": "diffuse", "reflectance": 0.8}
+    item = {"type": "mesh", "filename": "rough.obj", "translate": [0.1, -0.05, 0.9], "bsdf": bsdf}
+    tessellator = tessellated(item, folder=tmp_path, scan="confocal")
+    for patch_scale in (1.0, 0.7, 0.5):
+        corners = tessellator.patches(patch_scale).corners
+        assert np.ptp(corners.reshape(-1, 3), axis=0).max() < 1.0  # engine units of 2 m

@@ -259,6 +259,13 @@ def test_a_fan_of_rays(tmp_path: Path) -> None:
 def test_what_a_camera_before_a_hidden_scene_cannot_have(tmp_path: Path) -> None:
     """A laser point of a wall, a laser grid of another size, another lamp: refused with the reason."""
     _refused(tmp_path, PIXELS.replace("SCAN", "single"), "is a point of a relay wall", laser=(0.0, 0.0))
+    for old, new, message in (
+        ('name="fov"', 'name="fow"', "5: sensor.fow: unknown here; remove it if it does not matter. Did you mean fov"),
+        ('"temporal_bins"', '"temporal_bin"', "6: film.temporal_bin: unknown here"),
+        ('value="30"', 'value="3O"', "5: sensor.fov: got '3O' (text), need a finite number"),
+        ('origin="0.5, 0, 2"', 'origin="0.5, 0"', "3: lookat: got <lookat origin='0.5, 0'"),
+    ):
+        _refused(tmp_path, PIXELS.replace("SCAN", "single").replace(old, new, 1), f"scene.xml:{message}")
     exhaustive = PIXELS.replace("SCAN", "exhaustive")
     wider = exhaustive.replace("</film>", f"{SCANNED}</film>")
     _refused(tmp_path, wider, "need film.width (4): laser points are the pixels' points")
@@ -418,7 +425,15 @@ REFUSED_XML = [  # what is replaced, by what, where it is told, and how
     (INTEGRATOR, f'<integer name="filter_bounces" value="0"/>{INTEGRATOR}', 4, "keeps bounce 1 alone"),
     (INTEGRATOR, f'<integer name="max_depth" value="1"/>{INTEGRATOR}', 4, "render.max_bounces: got 1, need"),
     (INTEGRATOR, f'<boolean name="camera_unwarp" value="true"/>{INTEGRATOR}', 4, "is for cameras"),
-    ("</scene>", "<scene>", None, "not well-formed XML"),
+    ("</scene>", "<scene>", 24, "not well-formed XML"),
+    ("<scene", "<!DOCTYPE s [<!ENTITY a 'b'>]><scene", 1, "document type or entities"),
+    ("</scene>", "<shape type='cube'>" * 70, 23, "more than 64 deep"),
+    ('x="1.5" y="1"', 'x="1.5" y="1O"', 10, "scale: got <scale x='1.5' y='1O'>, need translate, rotate"),
+    ('x="1.5" y="1"', 'x="1.5" Y="1"', 10, "scale: got <scale x='1.5' Y='1'>, need translate, rotate"),
+    ('<scale x="1.5" y="1"/>', '<skale x="1.5"/>', 10, "skale> is not supported"),
+    ('value="2"/>', 'value="2"/><integer name="height" value="4"/>', 16, "height is given a second time"),
+    ("</shape>\n</scene>", '<boolean name="flip_normals" value="no"/></shape>\n</scene>', 22, "need true or false"),
+    ('<film type="transient_hdr_film">', "", 17, "not well-formed XML: mismatched tag"),
 ]
 
 
@@ -443,6 +458,7 @@ def test_an_exhaustive_scan_of_a_fan_of_rays_is_refused(tmp_path: Path) -> None:
 
 
 REFUSED_YAML = [
+    (YAML, "name: x", ":1: geometry: got nothing"),
     ("name: plate\n", "nmae: plate\n", "1:7: nmae: unknown here.*Did you mean name"),
     ("sensor_width: 3", "sensor_width: wide", "2:15: sensor_width: got 'wide'"),
     ("sensor_width: 3", "sensor_width: 0", "2:15: capture.sensor_grid.nx: got 0, need an integer >= 1"),

@@ -143,7 +143,7 @@ def test_true_may_be_written_with_a_capital(tmp_path: Path) -> None:
         ("<scene><alias as='a'/></scene>", "<alias> has no id"),
         ("<scene version='new'/>", "its version is 'new' .*need one such as 3.0.0"),
         ("<scene><include filename='scene.xml'/></scene>", "include each other more than 15 deep"),
-        ("<scene>\n<include filename='bad.xml'/></scene>", r"line 2: .*bad.xml: it is not well-formed XML"),
+        ("<scene>\n<include filename='bad.xml'/></scene>", r"bad.xml, line 1: it is not well-formed XML"),
         ("<scene>\n<include filename='odd.xml'/></scene>", r"odd.xml, line 2: <phase> is not supported"),
         ("<scene><shape type='Sphere'/></scene>", "Did you mean sphere"),
         ("<scene><shape type='instance'/></scene>", "write each of the shapes out"),

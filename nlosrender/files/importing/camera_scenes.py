@@ -32,6 +32,12 @@ OF_PROJECTORS = {
         ("emitter.irradiance", "emitter.scale"), "capture.laser_energy is 1 J: one factor on H, for each laser point"
     ),
 }
+_LENGTHS = tuple(
+    f"sensor.{name}"
+    for name in ("fov", "near_clip", "far_clip", "principal_point_offset_x", "principal_point_offset_y")
+)
+_OF_CAMERAS = ("sensor.type", "sensor.to_world", "sensor.fov_axis", "sensor.focal_length")
+_OF_SCANS = ("film.exhaustive_scan", "film.laser_scan_width", "film.laser_scan_height")
 _PIXELS = (
     "a pixel's light is the mean over its area there, and its centre's here: a camera with more pixels, summed in "
     "blocks, comes as near as wanted"
@@ -46,8 +52,8 @@ def translate_view(translation: Translation, keys: Keys) -> None:
     """Judge a line-of-sight scene, which stays a Mitsuba scene: scene.mitsuba reads shapes, emitters and camera."""
     path = translation.source
     keys.keep("integrator.type", "capture.scan_type: line_of_sight")
-    translation.put("scene.mitsuba", translation.file_name(path.resolve(), is_absolute=False), str(path))
-    translation.put("capture.scan_type", "line_of_sight", str(path))
+    translation.put("scene.mitsuba", translation.file_name(path.resolve(), is_absolute=False), translation.start)
+    translation.put("capture.scan_type", "line_of_sight", translation.start)
     unwarped = keys.value("integrator.camera_unwarp", False, bool)
     keys.take("integrator.camera_unwarp", "capture.account_first_and_last_bounces", not unwarped, changed=True)
     depth = keys.value("integrator.max_depth", 6, int)
@@ -78,7 +84,7 @@ def translate_pixels(
     refuse_other_emitters(keys, emitters, root)
     keys.keep("integrator.type", "a scan whose points a camera sees")
     keys.keep("emitter.type", "the laser")
-    translation.put("scene.mitsuba", translation.file_name(path.resolve(), is_absolute=False), str(path))
+    translation.put("scene.mitsuba", translation.file_name(path.resolve(), is_absolute=False), translation.start)
     scan = scan_type(keys)
     keys.take("integrator.capture_type", "capture.scan_type", scan)
     is_aimed = _aim(keys, scan, matrix_of(placement(emitters[0]))) if emitters else True
@@ -86,7 +92,7 @@ def translate_pixels(
         translation.refuse("--laser", "", list(laser), "is a point of a relay wall; set capture.laser_target instead")
     keys.drop_all(OF_PROJECTORS)
     if not is_aimed:
-        translation.put("capture.pixel_point", [0.0, 1.0], str(path))
+        translation.put("capture.pixel_point", [0.0, 1.0], translation.start)
     translation.note(_PIXELS if is_aimed else _CORNERS)
     translate_bounces(keys, of_ytal=False)
     _translate_picture(keys)
@@ -131,8 +137,14 @@ def _translate_picture(keys: Keys) -> None:
     refuse_film(keys)
     translate_film(keys, 2048)
     say_samples(keys, "sampler.sample_count")
-    for name in [name for name in keys.found if name.startswith(("sensor.", "film."))]:
-        keys.keep(name, f"read by scene.mitsuba, {keys.translation.source.name}")
+    read = f"read by scene.mitsuba, {keys.translation.source.name}"
+    for names, kind in ((_LENGTHS, float), (("film.width", "film.height"), int)):
+        for name in names:
+            keys.value(name, None, kind)
+            keys.keep(name, read)
+    for name in _OF_CAMERAS:
+        keys.keep(name, read)
+    keys.drop_all(dict.fromkeys(_OF_SCANS, "of exhaustive scans"))
     keys.finish()
 
 

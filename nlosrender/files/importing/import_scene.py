@@ -58,7 +58,7 @@ def import_scene(
         document = read_document(text, str(source), source.absolute().parent)
         if document.issues or not isinstance(document.tree, dict):
             what = "no scene of y-tal, which is a mapping with geometry and relay_wall, and no XML of mitransient."
-            raise ConfigError(document.issues or ConfigError.of_file(str(source), what).issues)
+            raise ConfigError(document.issues or ConfigError.of_file(translation.start, what).issues)
         folders = (meshes, source.parent, source.absolute().parent.parent, Path.cwd())
         translate_yaml(translation, document, laser, [folder for folder in folders if folder is not None])
     scan = translation.config.get("capture", {}).get("scan_type")

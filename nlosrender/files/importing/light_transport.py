@@ -153,7 +153,7 @@ def say_samples(keys: Keys, name: str, default: int | None = None) -> None:
     if isinstance(samples, int):
         keys.translation.remarks["target_error"] = f"there {samples:_} samples per point"
     keys.drop(name, "render.target_error decides here; said beside it in a comment")
-    keys.translation.put("render.target_error", DEFAULT_TARGET_ERROR, str(keys.translation.source))
+    keys.translation.put("render.target_error", DEFAULT_TARGET_ERROR, keys.translation.start)
 
 
 def refuse_film(keys: Keys) -> None:

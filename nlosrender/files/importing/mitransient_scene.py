@@ -27,7 +27,7 @@ from nlosrender.files.importing.camera_scenes import (
 from nlosrender.files.importing.light_transport import refuse_film, say_samples, translate_bounces, translate_film
 from nlosrender.files.importing.scan_geometry import FlatWall, matrix_of, to_world_of
 from nlosrender.files.importing.translation import Keys, Translation, plain, rounded
-from nlosrender.files.importing.xml_plugins import DEFAULT_DIFFUSE, found_keys, place_in, plugin_of
+from nlosrender.files.importing.xml_plugins import DEFAULT_DIFFUSE, found_keys, mistakes, place_in, plugin_of
 from nlosrender.scene.pose import Float64
 
 NLOS = "transient_nlos_path"
@@ -69,6 +69,9 @@ def translate_xml(translation: Translation, laser: tuple[float, float] | None) -
         checked = None
     if integrator is None or sensor is None:
         return
+    parts = (part for part in root if part.tag != "sensor" or part is sensor)  # other cameras are not read
+    for element, why in mistakes(element for part in parts for element in part.iter()):
+        translation.refuse(place_in(path, element), element.get("name") or element.tag, "", why)
     if sensor.get("type") == "perspective" and integrator.get("type") == NLOS:
         translate_pixels(translation, root, [integrator, sensor], laser)
     elif sensor.get("type") == "perspective":
@@ -178,7 +181,7 @@ class _NlosScene:
             scan = "confocal"
             for name in ("sensor.confocal", "integrator.capture_type"):
                 keys.change(name, "capture.scan_type: confocal, all points in one capture")
-            self.translation.put("capture.scan_type", scan, str(self.path))
+            self.translation.put("capture.scan_type", scan, self.translation.start)
         keys.drop("sensor.confocal", "capture_type decides")
         keys.take("integrator.capture_type", "capture.scan_type", scan)
         for axis, key, size in (("width", "nx", DEFAULT_FILM[0]), ("height", "ny", DEFAULT_FILM[1])):
@@ -257,7 +260,7 @@ def _only(translation: Translation, elements: list[Element], tag: str, known: tu
             why = f"is not known here; need {' or '.join(known)}" + (f". {hint}" if hint else "")
             translation.refuse(place_in(translation.source, element), tag, kind, why)
     if len(elements) != 1:
-        place = place_in(translation.source, elements[1]) if elements else str(translation.source)
+        place = place_in(translation.source, elements[1]) if elements else translation.start
         translation.refuse(place, tag, "", f"the scene has {len(elements)} of them, need one")
         return None
     return elements[0] if elements[0].get("type") in known else None
@@ -268,7 +271,7 @@ def _refuse_error(translation: Translation, error: ValueError) -> None:
     path = translation.source
     placed = _PLACED.fullmatch(str(error))
     if placed is None:
-        translation.refuse(str(path), "", "", str(error))
+        translation.refuse(translation.start, "", "", str(error))
         return
     file = path.parent / placed["file"] if placed["file"] else path
     translation.refuse(f"{file}:{placed['line']}", "", "", placed["message"].rstrip("."))

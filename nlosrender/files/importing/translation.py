@@ -57,6 +57,11 @@ class Translation:
     remarks: dict[str, str] = field(default_factory=dict)  # comments behind keys of the configuration
     _origins: dict[KeyPath, str] = field(default_factory=dict)
 
+    @property
+    def start(self) -> str:
+        """Where the file begins: the place of what it leaves out."""
+        return f"{self.source}:1"
+
     def put(self, to: str, value: Any, place: str) -> None:
         """Set a dotted key of the configuration, whose value comes from ``place``."""
         *parents, last = to.split(".")
@@ -99,7 +104,7 @@ class Translation:
     def placed(self, issue: ValidationIssue) -> ValidationIssue:
         """Return a mistake in the configuration with the place in the imported file that it comes from."""
         ends = (issue.path[:end] for end in range(len(issue.path), 0, -1))
-        place = next((self._origins[path] for path in ends if path in self._origins), str(self.source))
+        place = next((self._origins[path] for path in ends if path in self._origins), self.start)
         return ValidationIssue(issue.path, issue.message, issue.at, place)
 
     def file_name(self, file: Path, *, is_absolute: bool) -> str:
@@ -121,7 +126,7 @@ class Keys:
     prefix
         Where they stand, before each name in the report.
     place
-        What is told of keys that are left out; default: the file.
+        What is told of keys that are left out; default: where the file begins.
     """
 
     def __init__(
@@ -133,7 +138,7 @@ class Keys:
         place: str = "",
     ):
         self.translation, self.found, self.prefix = translation, found, prefix
-        self._place = place or str(translation.source)
+        self._place = place or translation.start
         self._names = names or {}
         self._judged: set[str] = set()
         self._known: set[str] = set()  # judged, or asked for

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 from xml.etree.ElementTree import Element
 
+from nlosrender.config.issues import shown
 from nlosrender.config.xml_shapes import shape_parameters
 from nlosrender.config.xml_transforms import transform_steps
 from nlosrender.config.xml_tree import SceneElement
@@ -15,6 +16,8 @@ from nlosrender.files.importing.scan_geometry import to_world_of
 from nlosrender.files.importing.translation import Found
 
 _PARTS = ("film", "sampler", "rfilter")  # elements whose keys are listed under their own names
+_ATTRIBUTES = {*"xyz", "value", "angle", "origin", "target", "up"}  # of a step of a <transform>
+_BOOLEANS = ("true", "false")
 DEFAULT_DIFFUSE = {"type": "diffuse", "reflectance": 0.5}  # Mitsuba's, ours is white
 
 
@@ -68,6 +71,20 @@ def found_keys(path: Path, elements: list[Element], prefix: str = "") -> Iterato
             else:
                 said = child.get("value", child.get("type", child.tag))
                 yield f"{part}.{name}", Found(values.get(name, said), place_in(path, child))
+
+
+def mistakes(elements: Iterable[Element]) -> Iterator[tuple[Element, str]]:
+    """Yield what Mitsuba refuses to read, and what is wrong with it: here it would be left out without a word."""
+    for element in elements:
+        names = [child.get("name") for child in element]
+        for index, child in enumerate(element):
+            if names[index] and names[index] in names[:index]:
+                yield child, f"{names[index]} is given a second time; remove one of them"
+            if element.tag in ("shape", "bsdf") and child.tag == "boolean" and child.get("value") not in _BOOLEANS:
+                yield child, f"got {shown(child.get('value'))}, need true or false"
+            if element.tag == "transform" and (set(child.attrib) - _ATTRIBUTES or transform_steps([child]) is None):
+                said = " ".join([child.tag, *(f"{key}={value!r}" for key, value in child.attrib.items())])
+                yield child, f"got <{said}>, need translate, rotate, scale, matrix or lookat, with their numbers"
 
 
 def place_in(path: Path, element: Element) -> str:

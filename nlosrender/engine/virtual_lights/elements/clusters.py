@@ -35,6 +35,7 @@ MIN_LIT_SHARE = 1e-3  # of a cluster's area: what less of it sends on has no slo
 TILTS = math.sqrt(1.5) * np.array([1.0, -1.0, 0.0])  # of facets: none in the mean, variance 1
 TURNS = 2 * np.pi / 3 * np.arange(3)
 CIRCLE = math.sqrt(2) * np.stack([np.cos(TURNS), np.sin(TURNS)], axis=1)  # none in the mean, the unit matrix squared
+ROUNDING = 1e-9  # of moments in float64, many times over
 MIN_SLOPE_VARIANCE = 1e-12  # float64 rounds covariances by 1e-16 of squared slopes
 
 
@@ -239,6 +240,8 @@ def _parallelograms(
 
     The moments of one spanned by 2 p and 2 q are (p p^T + q q^T) / 3, so p and q are the columns of a Cholesky factor
     of 3 times the moments: a rectangle stays that rectangle. ``rises`` are added to p, along the upright axis.
+    Members whose shading normals lie across their triangles count as negative: moments that are none of an area then
+    become those of a line, or of a point.
     """
 
     def on_plane(one: Float64, other: Float64, rises: Float64 | float) -> Float64:
@@ -248,7 +251,8 @@ def _parallelograms(
 
     uu, uv, vv = 3 * plane.moments.T
     first = np.sqrt(np.maximum(uu, 0))
-    shear = uv / np.maximum(first, 1e-300)
+    shear, longest = uv / np.maximum(first, 1e-300), np.sqrt(np.maximum(vv, 0))
+    shear = np.where(np.abs(shear) > (1 + ROUNDING) * longest, np.copysign(longest, uv), shear)
     second = np.sqrt(np.maximum(vv - shear**2, 0))
     p, q = on_plane(first, shear, rises), on_plane(np.zeros_like(second), second, 0.0)
     return np.stack([centres - p - q, centres + p - q, centres + p + q], axis=1)
