@@ -250,7 +250,7 @@ def test_mistakes() -> None:
             "z.yaml",
             Path("/tmp"),
         )
-    with pytest.raises(ConfigError, match=r"ground_truth: is seen from a relay wall"):
+    with pytest.raises(ConfigError, match=r"ground_truth: is seen from a grid on a relay wall"):
         parse_config(
             "scene: {emitters: [{type: point, position: [0, 1, 1], intensity: 1}]}\n"
             "capture:\n  scan_type: line_of_sight\n"

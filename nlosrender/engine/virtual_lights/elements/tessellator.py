@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from functools import cached_property, lru_cache
+from functools import cached_property
 
 import mitsuba as mi
 import numpy as np
@@ -27,6 +27,8 @@ from nlosrender.engine.virtual_lights.tuning import DEFAULT_TUNING, VirtualLight
 from nlosrender.scene.build import BuiltScene
 from nlosrender.scene.loading.mitsuba_shapes import WALL_ID
 from nlosrender.scene.loading.round_surfaces import ROUND_PLUGINS
+
+N_KEPT = 2  # scales: that of the gather, and one coarser for its error
 
 
 class Tessellator:
@@ -90,7 +92,7 @@ class Tessellator:
         )
         self.shared = whole if self.regions is None else self.regions.shared
         self._is_hidden = whole.is_hidden
-        self._saved = lru_cache(maxsize=2)(self._make)
+        self._kept: dict[float, Patches] = {}  # by patch_scale, the last used at the end
 
     def set_up(self) -> None:
         """Sum up the elements that are merged at any scale, if there are any."""
@@ -104,7 +106,13 @@ class Tessellator:
         """
         if sum(self.shared.counts(patch_scale)) > self.tuning.max_kept_patches:
             return self._make(patch_scale)
-        return self._saved(patch_scale)
+        # a dict: lru_cache of a bound method is a reference cycle, in which the scene stays alive, and Dr.Jit compiles
+        # every living BSDF and shape into the kernels of the next capture
+        patches = self._kept.pop(patch_scale, None)
+        self._kept[patch_scale] = self._make(patch_scale) if patches is None else patches
+        if len(self._kept) > N_KEPT:
+            del self._kept[next(iter(self._kept))]
+        return self._kept[patch_scale]
 
     def regional_patches(self, patch_scale: float, wanted: Sequence[int]) -> Iterator[tuple[list[int], list[Patches]]]:
         """Yield the ``wanted`` regions, and the patches close to the wall of each: as many as fit at once."""
