@@ -44,7 +44,9 @@ def cell_means(scan: str, max_bounces: int) -> tuple[NDArray[np.float64], float]
     return total.reshape(shape).mean(axis=(3, 5)), fine.error_estimate
 
 
-@pytest.mark.parametrize(("scan", "max_bounces"), [("single", 3), ("exhaustive", 3), ("single", 4)])
+@pytest.mark.parametrize(
+    ("scan", "max_bounces"), [("single", 3), pytest.param("exhaustive", 3, marks=pytest.mark.slow), ("single", 4)]
+)
 @pytest.mark.parametrize("engine", ["path", "virtual_lights"])
 def test_a_footprint_of_the_cell_is_the_mean_of_a_fine_grid(engine: str, scan: str, max_bounces: int) -> None:
     """Within the stated errors; the point in the middle is off by many times that."""

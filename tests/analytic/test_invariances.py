@@ -51,8 +51,14 @@ def test_a_seed_repeats_bit_for_bit_and_another_seed_does_not() -> None:
     assert (first.mean != other.mean)[lit].mean() > 0.99
 
 
-@pytest.mark.parametrize("spot", [0.0, 0.05])
-@pytest.mark.parametrize("scan", ["single", "confocal", "exhaustive"])
+@pytest.mark.parametrize(
+    ("scan", "spot"),
+    [("single", 0.05), ("confocal", 0.0), ("exhaustive", 0.05)]
+    + [
+        pytest.param(*more, marks=pytest.mark.slow)
+        for more in (("single", 0.0), ("confocal", 0.05), ("exhaustive", 0.0))
+    ],
+)
 def test_cutting_a_capture_into_batches_changes_no_bit(scan: str, spot: float) -> None:
     """What a lane computes depends on its sensor point alone: not on the batch, not on the number of lasers in it."""
     config = interreflections(scan=scan, capture={"laser_spot_radius": spot})
@@ -65,8 +71,14 @@ def test_cutting_a_capture_into_batches_changes_no_bit(scan: str, spot: float) -
         assert_same(whole, cut)
 
 
-@pytest.mark.parametrize("spot", [0.0, 0.05])
-@pytest.mark.parametrize(("max_bounces", "p_hidden_sampling"), [(3, 1.0), (4, 0.0), (4, 0.5), (4, 1.0)])
+@pytest.mark.parametrize(
+    ("max_bounces", "p_hidden_sampling", "spot"),
+    [(3, 1.0, 0.0), (4, 0.0, 0.0), (4, 0.5, 0.05)]
+    + [
+        pytest.param(*more, marks=pytest.mark.slow)
+        for more in ((3, 1.0, 0.05), (4, 0.0, 0.05), (4, 0.5, 0.0), (4, 1.0, 0.0), (4, 1.0, 0.05))
+    ],
+)
 def test_cutting_a_render_into_launches_changes_no_bit(max_bounces: int, p_hidden_sampling: float, spot: float) -> None:
     """The random state is carried on: how fast a machine is, and so how long its launches are, does not matter."""
     config = interreflections(max_bounces=max_bounces, capture={"laser_spot_radius": spot})

@@ -28,9 +28,15 @@ def as_lists(config: dict[str, Any]) -> dict[str, Any]:
     return {**config, "capture": capture}
 
 
-@pytest.mark.parametrize("scan", ["single", "confocal", "exhaustive"])
-@pytest.mark.parametrize("engine", ["path", "virtual_lights"])
-def test_a_grid_given_as_a_list_has_the_bits_of_the_grid(scan: str, engine: str) -> None:
+@pytest.mark.parametrize(
+    ("engine", "scan"),
+    [("path", "exhaustive"), ("virtual_lights", "single"), ("virtual_lights", "confocal")]
+    + [
+        pytest.param(*more, marks=pytest.mark.slow)
+        for more in (("path", "single"), ("path", "confocal"), ("virtual_lights", "exhaustive"))
+    ],
+)
+def test_a_grid_given_as_a_list_has_the_bits_of_the_grid(engine: str, scan: str) -> None:
     """H and variance are the same numbers in another shape, calibrated from pilot points of the same places."""
     budget: dict[str, Any] = {"engine": engine, "spp": None, "target_error": 0.2, "max_bounces": 4}
     config = flat_wall(*ITEMS, scan=scan, sensors=SENSORS, lasers=LASERS, bins=(0.0, 0.04, 150), **budget)

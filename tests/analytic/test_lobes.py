@@ -169,8 +169,9 @@ def facing_plates(bsdf: dict[str, Any], *, turned: bool) -> tuple[dict[str, Any]
     return tuple({"type": "rectangle", "bsdf": bsdf} | place for place in (first, second))
 
 
-FURTHER = [("plastic", "single", False), ("two sides", "confocal", True)]
+FURTHER = [("plastic", "single", False)]
 FURTHER_SLOWLY = [
+    ("two sides", "confocal", True),
     ("principled", "single", False),
     ("two sides", "single", True),
     ("half a mirror", "confocal", False),

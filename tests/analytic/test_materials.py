@@ -72,7 +72,7 @@ def on_plate(bsdf: Mapping[str, Any]) -> Callable[[Cells, Array, Array], Array]:
 @pytest.mark.parametrize("hidden_geometry_sampling", [True, False])
 def test_a_rough_metal_plate_is_its_bsdf(hidden_geometry_sampling: bool) -> None:
     """A glossy plate: the BSDF's value between the directions to laser and sensor, in every bin."""
-    config = scene(plate(METAL), spp=65536, hidden_geometry_sampling=hidden_geometry_sampling)
+    config = scene(plate(METAL), spp=32768, hidden_geometry_sampling=hidden_geometry_sampling)
     result = render(config, replicas=REPLICAS)
     reference = third_bounces(Setup(CELLS, EDGES, brdf=on_plate(METAL)), LASER, SENSORS)
     lambertian = third_bounces(Setup(CELLS, EDGES), LASER, SENSORS)
@@ -216,7 +216,7 @@ def test_a_mirror_shows_the_image_of_the_laser_s_spot(laser_sampling: bool, p_hi
         mirror,
         capture={"laser_spot_radius": radius, "laser_point": laser[:2].tolist()},
         laser_sampling=laser_sampling,
-        spp=524288,
+        spp=131072,
     )
     config["capture"]["sensor_grid"] |= {"width": 1.2, "height": 1.0}
     result = render(config, replicas=REPLICAS, p_hidden_sampling=p_hidden_sampling)

@@ -27,7 +27,14 @@ LIGHTS = {"engine": "virtual_lights", "spp": None, "target_error": 0.05}
 GRID = {"nx": 5, "ny": 3, "width": 1.5, "height": 1.2}
 SAME = {"laser_grid": GRID, "sensor_grid": GRID}
 SEEN = {"type": "rectangle", "width": 1, "height": 1, "center": [0, 0, 0], "normal": [0, 0, 1]}
-SLOW = ("confocal paths in any direction", "confocal walks", "lights and paths")
+SLOW = (
+    "confocal paths in any direction",
+    "paths to an error",
+    "confocal third bounce",
+    "confocal walks",
+    "lights and paths",
+    "half of the pairs",
+)
 STOPS = 2
 LAMP = {"type": "point", "position": [0, 1, 3], "intensity": 1}
 SCENES: dict[str, Any] = {

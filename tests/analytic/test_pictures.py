@@ -298,14 +298,14 @@ def looked_up(uv: Array) -> Array:
 @pytest.mark.parametrize("engine", ["path", "virtual_lights"])
 def test_light_from_a_plate_with_a_picture(engine: str, picture: dict[str, Any]) -> None:
     """The third bounce of a turned plate is the quadrature over its texels."""
-    cells = rectangle_cells(0.9, 0.5, CENTER, TURNED["normal"], TURNED["up"], n=300)
+    cells = rectangle_cells(0.9, 0.5, CENTER, TURNED["normal"], TURNED["up"], n=150)
     plate = {"type": "rectangle", "width": 0.9, "height": 0.5, "center": CENTER.tolist(), "bsdf": picture, **TURNED}
-    budget = {"spp": 16384} if engine == "path" else {"spp": None, "target_error": 0.02}
+    budget = {"spp": 16384} if engine == "path" else {"spp": None, "target_error": 0.05}
     result = render(flat_wall(plate, bins=(0.0, 0.1, 60), engine=engine, color="grey", **budget))
     rho = looked_up(cells.uv)
     reference = third_bounces(Setup(cells, EDGES, brdf=lambda *_: rho / np.pi), LASER, SENSORS)
-    # 2 % asked; the picture upside down is 20 % off
-    assert np.linalg.norm(result.total - reference) < 0.03 * np.linalg.norm(reference)
+    # 5 % asked, 1 % of the quadrature's own; the picture upside down is 20 % off
+    assert np.linalg.norm(result.total - reference) < 0.06 * np.linalg.norm(reference)
 
 
 @pytest.mark.parametrize("engine", ["path", "virtual_lights"])

@@ -49,8 +49,18 @@ def colored(name: str, attribute: str = "vertex_color", **texture: Any) -> dict[
     return {"type": "mesh", "filename": name, "bsdf": {"type": "diffuse", "reflectance": read}}
 
 
-@pytest.mark.parametrize("engine", ["path", "virtual_lights"])
-@pytest.mark.parametrize(("kind", "names"), [("float", "r g b"), ("uchar", "red green blue"), ("ushort", "r g b")])
+@pytest.mark.parametrize(
+    ("engine", "kind", "names"),
+    [("path", "float", "r g b"), ("path", "uchar", "red green blue"), ("virtual_lights", "ushort", "r g b")]
+    + [
+        pytest.param(*more, marks=pytest.mark.slow)
+        for more in (
+            ("path", "ushort", "r g b"),
+            ("virtual_lights", "float", "r g b"),
+            ("virtual_lights", "uchar", "red green blue"),
+        )
+    ],
+)
 def test_light_from_a_mesh_with_colours(engine: str, kind: str, names: str, tmp_path: Path) -> None:
     """Each channel is the quadrature over the colours of the vertices; whole numbers stand for 0 to 1, linear."""
     item = colored(write_plate(tmp_path / "plate.ply", kind=kind, names=names))

@@ -160,7 +160,7 @@ def test_legs_and_start_shift_the_gather_as_they_shift_paths() -> None:
     assert_agrees(paths.total, paths.total_variance, lights, replicas=32, floor=0.01)
 
 
-@pytest.mark.parametrize("max_bounces", [5, None])
+@pytest.mark.parametrize("max_bounces", [5, pytest.param(None, marks=pytest.mark.slow)])
 def test_further_bounces_come_on_top(max_bounces: int | None) -> None:
     """With interreflections both engines agree bounce by bounce."""
     scene = (PLATE, BALL | {"center": [-0.45, 0.2, 0.7], "radius": 0.25})

@@ -108,7 +108,9 @@ def test_the_renderer_starts_in_one_piece(monkeypatch: pytest.MonkeyPatch) -> No
     assert mitsuba.started
 
 
-@pytest.mark.parametrize("command", [("paper", "--figure", "table1", "--quick"), ("doctor",)])
+@pytest.mark.parametrize(
+    "command", [pytest.param(("paper", "--figure", "table1", "--quick"), marks=pytest.mark.slow), ("doctor",)]
+)
 def test_a_command_is_interrupted_while_mitsuba_is_imported(tmp_path: Path, command: tuple[str, ...]) -> None:
     """Exit code 130 and one word, at the moment that hurts most: Mitsuba is half there."""
     (tmp_path / "configs").symlink_to(Path(__file__).parents[2] / "configs")
@@ -175,7 +177,13 @@ def captures(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.parametrize(
     ("arguments", "number"),
-    [*((arguments, "SIGTERM") for arguments in STOPPED), (("export", "wall.hdf5", "--format", "fk"), "SIGHUP")],
+    [
+        *(
+            pytest.param(arguments, "SIGTERM", marks=[] if arguments[0] in ("frames", "merge") else pytest.mark.slow)
+            for arguments in STOPPED
+        ),
+        (("export", "wall.hdf5", "--format", "fk"), "SIGHUP"),
+    ],
 )
 def test_a_batch_systems_notice_leaves_nothing_half_written(
     captures: Path, arguments: tuple[str, ...], number: str

@@ -72,9 +72,15 @@ def planned(*arguments: str) -> dict:
     return json.loads(run("plan", *arguments, "--json").stdout)
 
 
-@pytest.mark.parametrize("scan", ["single", "confocal", "exhaustive"])
-@pytest.mark.parametrize("engine", ["path", "auto"])
-def test_the_plan_agrees_with_the_render(scan, engine):
+@pytest.mark.parametrize(
+    ("engine", "scan"),
+    [("path", "single"), ("auto", "confocal")]
+    + [
+        pytest.param(*more, marks=pytest.mark.slow)
+        for more in (("path", "confocal"), ("path", "exhaustive"), ("auto", "single"), ("auto", "exhaustive"))
+    ],
+)
+def test_the_plan_agrees_with_the_render(engine, scan):
     """Bins, window, engine, reason, file size: what is announced is what comes."""
     changes = ["--set", f"render.engine={engine}", "--set", "render.spp=null", "--set", "render.target_error=0.3"]
     config = write_config(scan)

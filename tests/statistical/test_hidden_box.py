@@ -54,9 +54,10 @@ def rendered(engine: Any, batch: Any, spp: int = SPP) -> Any:
     return np.stack([histogram.mean, histogram.variance])
 
 
-# every scene with every scan, and every scene and every scan with either limit: kernels are compiled for each case
+# every scene with every scan, and every scene and every scan with either limit: kernels are compiled for each case;
+# in the quick suite every scene once, and every scan with either limit
 CASES = [
-    (name, scan, (3, None)[(i + j) % 2])
+    pytest.param(name, scan, (3, None)[(i + j) % 2], marks=[] if i % 3 == j else pytest.mark.slow)
     for i, name in enumerate(SCENES)
     for j, scan in enumerate(("single", "confocal", "exhaustive"))
 ]

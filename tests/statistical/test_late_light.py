@@ -60,7 +60,7 @@ def grouped_sums(short: Array, long: Array) -> Sums:
 
 CASES = [
     ("path", "single", (ROOM,), {}),
-    ("path", "confocal", (ROOM,), {"capture": LEGS}),
+    pytest.param("path", "confocal", (ROOM,), {"capture": LEGS}, marks=pytest.mark.slow),
     ("path", "exhaustive", OPEN, {"lasers": (2, 3), "capture": LEGS}),
     ("path", "single", (ROOM,), {"laser_sampling": False, "capture": {"laser_spot_radius": 0.2}}),
     ("virtual_lights", "single", (ROOM,), {}),
@@ -106,8 +106,13 @@ def test_a_window_that_holds_everything_keeps_every_bit(
     np.testing.assert_array_equal(ours.means, theirs.means)
 
 
-@pytest.mark.parametrize("engine", ["path", "virtual_lights"])
-@pytest.mark.parametrize("scan", ["confocal", "exhaustive"])
+@pytest.mark.parametrize(
+    ("engine", "scan"),
+    [("path", "confocal"), ("virtual_lights", "exhaustive")]
+    + [
+        pytest.param(*more, marks=pytest.mark.slow) for more in (("path", "exhaustive"), ("virtual_lights", "confocal"))
+    ],
+)
 def test_how_a_capture_is_cut_changes_no_bit_of_late_light(engine: str, scan: str) -> None:
     """What is late is so for the capture, not for the batch."""
     budget = {"spp": 64} if engine == "path" else {"spp": None, "target_error": 0.5}

@@ -44,7 +44,7 @@ def all_techniques(max_bounces: int) -> Rendering:
     return render(spot_scene(max_bounces=max_bounces, seed=77, spp=262144), replicas=REPLICAS)
 
 
-@pytest.mark.parametrize("max_bounces", [3, 5])
+@pytest.mark.parametrize("max_bounces", [pytest.param(3, marks=pytest.mark.slow), 5])
 @pytest.mark.parametrize(("laser", "hidden"), list(itertools.product([True, False], repeat=2)))
 def test_every_subset_of_the_paper_s_techniques_agrees(laser: bool, hidden: bool, max_bounces: int) -> None:
     """Laser sampling x hidden geometry sampling (Royo et al. 2022, the four-way ablation): one H."""
@@ -72,8 +72,8 @@ def mixed(scan: str, p_hidden_sampling: float, seed: int) -> Rendering:
     return render(config, replicas=REPLICAS, p_hidden_sampling=p_hidden_sampling)
 
 
-@pytest.mark.parametrize("p_hidden_sampling", [0.0, 0.3, 1.0])
-@pytest.mark.parametrize("scan", ["single", "exhaustive"])
+@pytest.mark.parametrize("p_hidden_sampling", [0.0, pytest.param(0.3, marks=pytest.mark.slow), 1.0])
+@pytest.mark.parametrize("scan", [pytest.param("single", marks=pytest.mark.slow), "exhaustive"])
 def test_the_mixture_does_not_change_the_result(scan: str, p_hidden_sampling: float) -> None:
     """Any share of hidden geometry sampling at wall vertices agrees with a half, bounce by bounce."""
     result, reference = mixed(scan, p_hidden_sampling, 0), mixed(scan, 0.5, 5)
