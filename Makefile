@@ -6,7 +6,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
 # Exact versions that passed the test suite; pyproject.toml holds the ranges that are allowed.
 PINS := -c .constraints.txt
 
-.PHONY: help install render test test-slow stress lint format peers bench bench-peers paper paper-quick docs wheel pythons clean
+.PHONY: help install render test test-slow stress lint format peers bench bench-peers paper paper-quick gpu-check docs wheel pythons clean
 .DEFAULT_GOAL := help
 
 help: ## Show this list.
@@ -77,6 +77,9 @@ paper: install ## Reproduce the paper's figures and tables: out/paper/index.html
 
 paper-quick: install ## The same with fewer points and paths, in minutes. FIGURES='4 8'
 	$(BIN)/nlosrender paper --quick $(foreach name,$(FIGURES),--figure $(name)) -o out/paper
+
+gpu-check: install ## Compare small captures on a GPU with those on the processor, and time both, in 5 minutes.
+	$(BIN)/python tests/gpu/compare_backends.py -o out/gpu-check
 
 docs: $(VENV)/.dev ## Build the docs site, with a reference of every key and command: out/site/index.html.
 	$(BIN)/python -m sphinx -W --keep-going -q -c docs . out/site

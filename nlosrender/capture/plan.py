@@ -21,6 +21,9 @@ MAX_SUMS = 2**32 - 1  # of a batch: Dr.Jit indexes with 32 bits
 # work item before, which is being written (8)
 BYTES_OF_STATISTICS = 64
 BYTES_OF_ASSEMBLY = 24  # mean and variance of a work item assembled from batches (16), and its float32 copies (8)
+# of a sensor point, as many as a CPU gives one point alone: loops over them are unrolled in Python. The lanes of a GPU
+# make 8,738 of each of 15 points, which took minutes to write into one kernel
+REPLICA_LIMIT = 128
 MAX_ITEM_SAMPLES = 2**26  # whatever the memory: 256 MB of float32, so that an interruption costs little
 
 
@@ -130,10 +133,11 @@ def plan_capture(
 def replicas_for(lanes: int, n_sensors: int) -> int:
     """Return how many independent estimates stand behind each sensor point: enough of them to keep the lanes busy.
 
-    They depend on the capture, not on the batch: the result must not depend on the memory limit.
+    An even number, at most ``REPLICA_LIMIT``. They depend on the capture, not on the batch: the result must not depend
+    on the memory limit.
     """
     replicas = max(2, math.ceil(lanes / n_sensors))
-    return replicas + replicas % 2
+    return min(replicas + replicas % 2, REPLICA_LIMIT)
 
 
 def remaining_items(plan: Plan, confocal: bool, finished: Iterable[tuple[Tile, Tile]]) -> list[WorkItem]:

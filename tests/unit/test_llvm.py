@@ -3,10 +3,11 @@
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
-from nlosrender.engine.backend import llvm
+from nlosrender.engine.backend import llvm, start
 from nlosrender.engine.backend.start import PROCESS_BYTES, batch_memory, scene_memory
 from nlosrender.errors import ConfigError
 
@@ -80,6 +81,28 @@ def test_a_memory_limit_below_the_program_itself_is_an_error():
     with pytest.raises(ConfigError, match="memory_limit"):
         batch_memory(int(PROCESS_BYTES) - 1)
     assert batch_memory(int(PROCESS_BYTES) + 1000) == 1000
+
+
+def test_the_memory_of_a_gpu_counts_where_one_runs(monkeypatch):
+    """The least of both bounds a batch; a driver that does not tell leaves the machine's."""
+
+    class Driver:
+        def cuDeviceGet(self, device, index):
+            return 0
+
+        def cuDeviceTotalMem_v2(self, size, device):
+            size._obj.value = 10**9
+            return self.code
+
+    driver = Driver()
+    machine = start.physical_memory()
+    monkeypatch.setattr(start, "_cuda_driver", lambda: driver)
+    found = {}
+    for variant, driver.code in (("llvm_ad_mono", 0), ("cuda_ad_mono", 0), ("cuda_ad_rgb", 999)):
+        monkeypatch.setitem(sys.modules, "mitsuba", SimpleNamespace(variant=lambda variant=variant: variant))
+        found[variant] = start.physical_memory()
+    assert machine > 10**9
+    assert found == {"llvm_ad_mono": machine, "cuda_ad_mono": 10**9, "cuda_ad_rgb": machine}
 
 
 def test_a_scene_takes_its_part_of_a_memory_limit():

@@ -15,6 +15,7 @@ from nlosrender.capture.plan import (
     Plan,
     plan_capture,
     remaining_items,
+    replicas_for,
 )
 from nlosrender.capture.tile import Tile, joined, runs
 from nlosrender.errors import ConfigError
@@ -68,6 +69,16 @@ def test_replicas_depend_on_the_capture_not_on_the_memory():
         for limit in (10_000, 100_000, 10_000_000)
     }
     assert replicas == {8}  # 100 lanes over 15 sensor points, rounded up to an even number
+
+
+@pytest.mark.parametrize("lanes", [128, 2**17])
+@pytest.mark.parametrize("n_sensors", [1, 3, 15, 4096])
+def test_a_point_has_no_more_replicas_on_a_gpu_than_one_alone_has_on_a_cpu(lanes, n_sensors):
+    """Engines loop over them in Python: a number that grows with the lanes would make kernels without end."""
+    replicas = replicas_for(lanes, n_sensors)
+    assert replicas % 2 == 0
+    assert 2 <= replicas <= replicas_for(128, 1) == 128
+    assert replicas * n_sensors >= min(lanes, 128 * n_sensors)
 
 
 def test_a_pair_that_does_not_fit_is_an_error_that_says_what_to_do():

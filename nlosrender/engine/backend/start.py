@@ -5,6 +5,7 @@ This is the only place that picks a variant. Everything after it is the same cod
 
 from __future__ import annotations
 
+import ctypes
 import os
 import sys
 from dataclasses import dataclass
@@ -36,15 +37,17 @@ class Backend:
 
 def cuda_available() -> bool:
     """Return whether an NVIDIA driver with at least one device is on this machine, without starting Dr.Jit."""
-    import ctypes
+    return _cuda_driver() is not None
 
+
+def _cuda_driver() -> ctypes.CDLL | None:
     name = "nvcuda.dll" if sys.platform == "win32" else "libcuda.so.1"
     try:
-        driver = ctypes.CDLL(name)
-        count = ctypes.c_int(0)
-        return driver.cuInit(0) == 0 and driver.cuDeviceGetCount(ctypes.byref(count)) == 0 and count.value > 0
+        driver, count = ctypes.CDLL(name), ctypes.c_int(0)
+        found = driver.cuInit(0) == 0 and driver.cuDeviceGetCount(ctypes.byref(count)) == 0 and count.value > 0
     except (OSError, AttributeError):
-        return False
+        return None
+    return driver if found else None
 
 
 def start_backend(wanted: BackendName = "auto", *, colored: bool = False, polarized: bool = False) -> Backend:
@@ -156,8 +159,22 @@ TRIANGLE_BYTES = 700.0  # at most at one time: read, put into trees, cut, merged
 
 
 def physical_memory() -> int:
-    """Return the machine's memory [bytes]; 8 GiB where the system does not tell."""
-    return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") if hasattr(os, "sysconf") else 8 << 30
+    """Return the memory that a render has [bytes]: the machine's, or the GPU's where one runs and has less.
+
+    8 GiB where the system does not tell.
+    """
+    machine = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") if hasattr(os, "sysconf") else 8 << 30
+    mitsuba = sys.modules.get("mitsuba")
+    runs_cuda = mitsuba is not None and (mitsuba.variant() or "").startswith("cuda")
+    driver = _cuda_driver() if runs_cuda else None
+    return machine if driver is None else min(machine, gpu_memory(driver) or machine)
+
+
+def gpu_memory(driver: ctypes.CDLL) -> int:
+    """Return the memory of the first GPU [bytes], on which Dr.Jit runs; 0 where the driver does not tell."""
+    device, size = ctypes.c_int(0), ctypes.c_size_t(0)
+    told = driver.cuDeviceGet(ctypes.byref(device), 0) == 0
+    return size.value if told and driver.cuDeviceTotalMem_v2(ctypes.byref(size), device) == 0 else 0
 
 
 def batch_memory(limit: int | None, n_triangles: int = 0) -> int:
@@ -166,7 +183,7 @@ def batch_memory(limit: int | None, n_triangles: int = 0) -> int:
     Parameters
     ----------
     limit
-        The user's for the process; None: a quarter of the machine's memory, beside what the scene takes.
+        The user's for the process; None: a quarter of ``physical_memory``, beside what the scene takes.
     n_triangles
         Of the scene. However many, an eighth of what the program leaves is for batches.
 

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nlosrender.capture.bounces import THIRD_BOUNCE
-from nlosrender.capture.plan import Batch
+from nlosrender.capture.plan import REPLICA_LIMIT, Batch
 from nlosrender.engine.launch.device_arrays import on_device
 from nlosrender.engine.launch.device_capture import DeviceCapture
 from nlosrender.engine.launch.flat_mirrors import FlatMirrors
@@ -325,7 +325,7 @@ class ThirdBounce:
         As many as the capture needs, not the batch: how a capture is cut must not show in the result. No more than
         the replicas that the plan has counted memory for.
         """
-        most = self.device.options.replicas if isinstance(batch, Batch) else self.lanes
+        most = self.device.options.replicas if isinstance(batch, Batch) else REPLICA_LIMIT
         points = self.device.capture.n_sensors if isinstance(batch, Batch) else batch.sensors.size
         replicas = max(1, min(math.ceil(self.lanes / points), most))
         if self.device.footprint is not None:  # a power of two, as the number of places is
