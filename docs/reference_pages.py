@@ -41,7 +41,8 @@ def _section(section: Schema, sections: Mapping[str, Schema], place: str, kind: 
     for key, value in section["properties"].items():
         path = f"{place}.{key}".lstrip(".")
         text = section["description"] if "const" in value else value.get("description", "")
-        default = json.dumps(value["default"]) if "default" in value else _IN_TEXT if "default" in text else _OF_KEYS
+        made = _IN_TEXT if "default" in text else _OF_KEYS if "$ref" in value else "{}"
+        default = json.dumps(value["default"]) if "default" in value else made
         said = "required" if key in required else f"default: {default}"
         yield _entry("confval", path + (f" ({kind})" if kind else ""), _type(value), said, text)
         inner += [(part, path + ".N" * is_list) for part, is_list in _sections_in(value)]
@@ -75,9 +76,13 @@ def _shape(value: Schema) -> str:
         size = f"{value['minItems']} x " if value.get("minItems", 0) == value.get("maxItems") else ""
         return f"list of {size}{_shape(value['items'])}" if "items" in value else "list"
     words: dict[str, str] = {"string": "text", "boolean": "true | false", "object": "mapping"}
-    bounds = [f"{text} {value[key]:g}" for key, text in _BOUNDS.items() if key in value]
+    bounds = [f"{sign} {_number(value[key])}" for key, sign in _BOUNDS.items() if key in value]
     kind = str(value.get("type", "mapping"))
     return " ".join([words.get(kind, kind), " and ".join(bounds)]).strip()
+
+
+def _number(value: float) -> str:
+    return str(value) if isinstance(value, int) else f"{value:g}"
 
 
 def _bsdf_keys() -> Iterator[str]:
@@ -161,7 +166,9 @@ def file_layout_page() -> str:
 
 
 def python_page() -> str:
-    """Return the page of what ``import nlosrender`` gives; Sphinx fills in the docstrings."""
+    """Return the page of what ``import nlosrender`` gives, and of its errors; Sphinx fills in the docstrings."""
+    from nlosrender.errors import NlosError
+
     lines = []
     for name in nlosrender.__all__:
         if name != "open":  # of Capture
@@ -169,6 +176,7 @@ def python_page() -> str:
             lines.append(f".. auto{'class' if is_class else 'function'}:: nlosrender.{name}")
             lines += ["   :members:", "   :exclude-members: args"] if is_class else []
     text = "`nlosrender.open(path)` is `Capture(path)`. [Python and notebooks](../python.md) has examples."
+    lines += [f".. autoexception:: nlosrender.errors.{error.__name__}" for error in NlosError.__subclasses__()]
     return "\n".join(["# Python API", "", text, "", "```{eval-rst}", *lines, "```"])
 
 
