@@ -123,6 +123,14 @@ def test_a_scene_without_light_says_why(plates: Any) -> None:
         ({"scene": "scene.xml"}, ConfigError, "scene: got a str, need a scene of the active variant llvm_ad_mono"),
         ({"sensor_points": SENSORS * 3}, ConfigError, r"capture\.sensor_points.*off the relay wall"),
         ({"sensor_points": SENSORS[..., :1]}, OptionError, r"sensor_points: got shape \(3, 5, 1\), need"),
+        (
+            {"sensor_points": "points.csv"},
+            OptionError,
+            "sensor_points: got .points.csv., need an array of real",
+        ),
+        ({"laser_points": [[0, 0], [1]]}, OptionError, r"laser_points: got .*, need an array of real numbers"),
+        ({"sensor_points": SENSORS + 1j}, OptionError, "need an array of real numbers"),
+        ({"render": 5}, OptionError, "render: got 5, need a mapping"),
         ({"laser_points": [np.nan, 0]}, ConfigError, r"capture\.laser_points\.0\.0: got nan"),
         ({"sensor_points": np.zeros((2, 2))}, ConfigError, r"capture\.sensor_points\.1: got .* a second time"),
         ({"laser_points": np.zeros((0, 2))}, OptionError, r"laser_points: got shape \(0, 2\)"),
@@ -154,6 +162,41 @@ def test_what_would_come_out_wrong_is_refused(plates: Any, shape: dict[str, Any]
     """Never left out."""
     with pytest.raises(ConfigError, match=message):
         nr.transient(plates(x={"type": "sphere", **shape}), WALL, SENSORS, time_axis=TIME, render=RENDER)
+
+
+@pytest.mark.parametrize(
+    ("kind", "scale", "is_round"),
+    [
+        ("sphere", [0.2, 0.2, 0.2], True),
+        ("sphere", [0.2, 0.2, 0.1], False),
+        ("cylinder", [0.2, 0.2, 0.1], True),
+        ("cylinder", [0.2, 0.1, 0.2], False),
+    ],
+)
+def test_a_stretched_round_shape_is_refused(plates: Any, kind: str, scale: list[float], is_round: bool) -> None:
+    """Mitsuba makes one radius of its matrix, while bounds and warnings would be those of the ellipsoid."""
+    import mitsuba as mi
+
+    stretched = mi.ScalarTransform4f().translate([0.5, 0, 1.25]).rotate([0.6, 0, 0.8], 40).scale(scale)
+    scene = plates(x={"type": kind, "to_world": stretched})
+    if is_round:
+        nr.transient(scene, WALL, SENSORS, time_axis=TIME, render=RENDER)
+    else:
+        with pytest.raises(ConfigError, match=f"scene.x: is stretched or sheared .* a {kind} of Mitsuba stays round"):
+            nr.transient(scene, WALL, SENSORS, time_axis=TIME, render=RENDER)
+
+
+def test_other_scenes_of_the_program_play_no_part(plates: Any) -> None:
+    """A call through a pointer to a shape is compiled for every shape of the process, also of kinds without samples."""
+    import mitsuba as mi
+
+    options = {"time_axis": TIME, "render": {"engine": "path", "spp": 64, "max_bounces": 3}}
+    alone = nr.transient(plates(), WALL, SENSORS, **options)
+    group = {"type": "shapegroup", "ball": {"type": "sphere"}}
+    copy = {"type": "instance", "of": {"type": "ref", "id": "group"}}
+    other = mi.load_dict({"type": "scene", "group": group, "copy": copy})
+    assert "Instance" in {shape.class_name() for shape in other.shapes()}
+    np.testing.assert_array_equal(nr.transient(plates(), WALL, SENSORS, **options).H, alone.H)
 
 
 def test_other_variants_are_refused() -> None:

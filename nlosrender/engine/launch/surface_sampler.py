@@ -116,7 +116,7 @@ class SurfaceSampler:
             primitive = dr.select(on_triangle, dr.gather(mi.UInt32, table.primitive, entry, on_triangle), ANALYTIC)
         if self.has_analytic:
             on_analytic = active & ~is_triangle
-            at, facing = self._on_analytic(shape, entry, mi.Point2f(u, v), on_analytic)
+            at, facing = self._on_analytic(entry, mi.Point2f(u, v), on_analytic)
             point, normal = dr.select(on_analytic, at, point), dr.select(on_analytic, facing, normal)
         return SurfaceSample(point, shape, normal, primitive, within)
 
@@ -182,21 +182,13 @@ class SurfaceSampler:
             sampled |= si.shape.shape_type() == int(getattr(mi.ShapeType, name))
         return hidden & sampled
 
-    def _on_analytic(
-        self, shape: mi.ShapePtr, entry: mi.UInt32, uv: mi.Point2f, active: mi.Bool
-    ) -> tuple[mi.Point3f, mi.Normal3f]:
+    def _on_analytic(self, entry: mi.UInt32, uv: mi.Point2f, active: mi.Bool) -> tuple[mi.Point3f, mi.Normal3f]:
         """Return points uniform by area on analytic shapes, and the normals there."""
-        if self.covers_everything:
-            sample = shape.sample_position(mi.Float(0), uv, active)
-            return sample.p, sample.n
-        # One by one: a call through the pointer is compiled for every shape of the scene, and kinds that cannot be
-        # sampled have no sample_position.
-        point, normal = mi.Point3f(0), mi.Normal3f(0)
-        for index, own in enumerate(self._analytic):
-            chosen = active & (entry == self.n_triangles + index)
-            sample = own.sample_position(mi.Float(0), uv, chosen)
-            point, normal = dr.select(chosen, sample.p, point), dr.select(chosen, sample.n, normal)
-        return point, normal
+        # Not through a ShapePtr: such a call is compiled for every shape that the process holds, those of a program's
+        # own scenes too, and kinds that cannot be sampled have no sample_position.
+        methods = [own.sample_position for own in self._analytic]
+        sample = dr.switch(entry - self.n_triangles, methods, mi.Float(0), uv, active)
+        return sample.p, sample.n
 
     def _corner(self, k: int, entry: mi.UInt32, active: mi.Bool) -> mi.Point3f:
         return mi.Point3f(*(dr.gather(mi.Float, self._table.corners[3 * k + j], entry, active) for j in range(3)))

@@ -106,8 +106,25 @@ def load_plugin(description: Mapping[str, object], surface: Surface, bsdf: mi.BS
         shape = mi.load_dict(plugin)
     except (RuntimeError, TypeError, ValueError) as error:
         raise ConfigError.at(surface.key, f"Mitsuba rejects this shape: {first_line(error)}") from error
+    if _loses_its_stretch(shape):
+        message = f"is stretched or sheared by its to_world, but a {plugin['type']} of Mitsuba stays round."
+        raise ConfigError.at(surface.key, f"{message} Scale it alike in all directions, or use a mesh.")
     check_surface(shape, f"{surface.key}.bsdf")
     return shape
+
+
+def _loses_its_stretch(shape: mi.Shape) -> bool:
+    """Return whether a sphere or cylinder has a ``to_world`` that no round shape fits: one radius is made of it."""
+    if shape.class_name() not in ("Sphere", "Cylinder"):
+        return False
+    axes = np.array(mi.traverse(shape)["to_world"].matrix, dtype=np.float64).reshape(4, 4)[:3, :3]
+    products = axes.T @ axes
+    expected = np.diag(products).copy()
+    expected[1] = expected[0]
+    if shape.class_name() == "Sphere":
+        expected[2] = expected[0]
+    lengths = np.sqrt(np.diag(products))
+    return bool(np.abs((products - np.diag(expected)) / np.outer(lengths, lengths)).max() > 1e-4)  # float32: 1e-6
 
 
 def load_flat_serialized(plugin: Mapping[str, object]) -> mi.Mesh:
