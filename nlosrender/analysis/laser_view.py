@@ -4,17 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from operator import index
 
 import numpy as np
 from numpy.typing import NDArray
 
-from nlosrender.errors import FileError
+from nlosrender.errors import FileError, OptionError
 from nlosrender.files.layout import STOKES
 from nlosrender.files.reading.reader import BAND_BYTES, StoredCapture
 from nlosrender.files.reading.scan import moved, wall_frame
 from nlosrender.files.reading.stored_header import intensity
 
 Float64 = NDArray[np.float64]
+Point = tuple[int, int]  # row, column
 
 FRAME_SHARES = (0.02, 0.2, 0.45, 0.7, 0.95)  # of the light that has arrived at the moments shown
 WINDOW_SHARES = (0.0005, 0.9995)  # of it at the ends of the part of the time axis that is worth showing
@@ -37,6 +39,26 @@ class LaserView:
         """Row and column of the sensor point that receives most light."""
         row, column = np.unravel_index(int(np.argmax(self.wall)), self.wall.shape)
         return int(row), int(column)
+
+
+def check_point(option: str, point: Point | None, rows: int, columns: int) -> Point | None:
+    """Return a (row, column) as plain integers, None as it is.
+
+    Raises
+    ------
+    OptionError
+        It is no such pair, or the grid does not have it; ``option`` is named.
+    """
+    if point is None:
+        return None
+    try:
+        row, column = map(index, point)
+    except (TypeError, ValueError) as error:
+        raise OptionError(f"{option}: got {point!r}, need two integers: row, column") from error
+    if not (0 <= row < rows and 0 <= column < columns):
+        need = f"a row from 0 to {rows - 1} and a column from 0 to {columns - 1}"
+        raise OptionError(f"{option}: got {row},{column}, need {need}")
+    return row, column
 
 
 def laser_view(capture: StoredCapture, laser: tuple[int, int], band_bytes: int = BAND_BYTES) -> LaserView:

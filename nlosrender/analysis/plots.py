@@ -14,6 +14,7 @@ from nlosrender.analysis.frames_plot import draw_frames, is_view, per_bin, unit_
 from nlosrender.analysis.laser_view import (
     Float64,
     LaserView,
+    check_point,
     laser_view,
     lit_window,
     point_histograms,
@@ -34,7 +35,6 @@ from nlosrender.analysis.theme import (
     style,
 )
 from nlosrender.constants import opl_to_seconds
-from nlosrender.errors import OptionError
 from nlosrender.files.atomic_write import check_writable
 from nlosrender.files.reading.reader import StoredCapture, open_capture
 from nlosrender.files.reading.stored_header import StoredHeader
@@ -93,18 +93,10 @@ def capture_picture(
     look = look or PictureStyle()
     with open_capture(path) as capture, ExitStack() as stack:
         sizes = capture.header.sizes
-        check_point("--laser", laser, sizes["laser_y"], sizes["laser_x"])
-        check_point("--pixel", pixel, sizes["sensor_y"], sizes["sensor_x"])
+        laser = check_point("--laser", laser, sizes["laser_y"], sizes["laser_x"])
+        pixel = check_point("--pixel", pixel, sizes["sensor_y"], sizes["sensor_x"])
         figure = _draw(capture, laser, pixel, measured_pair(capture, ideal, stack), look)
         return Picture(figure, look.dots_per_inch)
-
-
-def check_point(option: str, point: tuple[int, int] | None, rows: int, columns: int) -> None:
-    """Raise OptionError for a (row, column) that a grid does not have; ``option`` is named."""
-    if point is not None and not (0 <= point[0] < rows and 0 <= point[1] < columns):
-        raise OptionError(
-            f"{option}: got {point[0]},{point[1]}, need a row from 0 to {rows - 1} and a column from 0 to {columns - 1}"
-        )
 
 
 def _draw(
@@ -153,6 +145,8 @@ def _subtitle(header: StoredHeader, view: LaserView) -> str:
     engine, error = header.attributes.get("render_engine"), header.attributes.get("error_estimate")
     if header.is_multiplexed:
         parts.append("several laser spots at once")
+    if header.is_flash:
+        parts.append("a flash, not a laser point")
     if header.is_measured:
         parts.append("counts")
     if isinstance(engine, str):

@@ -4,21 +4,20 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
+from operator import index
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from nlosrender.capture.bounces import LINE_OF_SIGHT
+from nlosrender.analysis.laser_view import Point, check_point
 from nlosrender.errors import OptionError
-from nlosrender.files.reading.reader import StoredCapture, read_header
+from nlosrender.files.reading.reader import Part, StoredCapture, read_header
 from nlosrender.files.reading.scan import read_scan
 from nlosrender.files.reading.stored_header import StoredHeader
 
 if TYPE_CHECKING:
     from nlosrender.config.sensor import SensorConfig
-
-Point = tuple[int, int]  # row, column
 
 
 def sensor_for(
@@ -38,10 +37,13 @@ def bounce_indices(header: StoredHeader, bounces: int | Sequence[int] | None) ->
     """Return the indices of bounce numbers on the file's bounce axis; None: all that hold light."""
     if bounces is None:
         return None
-    wanted = [bounces] if isinstance(bounces, int) else list(bounces)
+    try:
+        wanted = [index(bounce) for bounce in np.atleast_1d(np.asarray(bounces, dtype=object))]
+    except TypeError as error:
+        raise OptionError(f"bounces: got {bounces!r}, need bounce numbers, integers") from error
     if header.split_bounces is False:
         raise OptionError(f"bounces: got {wanted}, but {header.path} holds the sum of all; leave it away")
-    known = [index + header.first_bounce for index in header.bounce_indices]
+    known = [slot + header.first_bounce for slot in header.bounce_indices]
     if not wanted or (missing := [bounce for bounce in wanted if bounce not in known]):
         raise OptionError(f"bounces: got {missing if wanted else wanted}, need some of {', '.join(map(str, known))}")
     return tuple(bounce - header.first_bounce for bounce in wanted)
@@ -49,24 +51,28 @@ def bounce_indices(header: StoredHeader, bounces: int | Sequence[int] | None) ->
 
 def laser_point(header: StoredHeader, laser: Point | None) -> Point:
     """Return a laser point as ``plot`` chooses it."""
-    grid = header.sizes["laser_y"], header.sizes["laser_x"]
-    chosen = (grid[0] // 2, grid[1] // 2) if laser is None else laser
-    check_place("laser", chosen, grid)
-    return chosen
+    rows, columns = header.sizes["laser_y"], header.sizes["laser_x"]
+    return check_point("laser", laser, rows, columns) or (rows // 2, columns // 2)
 
 
-def check_place(name: str, point: Point, grid: Point) -> None:
-    """Raise OptionError for a point that a grid of (rows, columns) does not have."""
-    if not all(0 <= index < length for index, length in zip(point, grid, strict=True)):
-        need = f"a row from 0 to {grid[0] - 1} and a column from 0 to {grid[1] - 1}"
-        raise OptionError(f"{name}: got {point[0]},{point[1]}, need {need}")
+def check_parts(name: str, parts: tuple[Part, Part] | None) -> None:
+    """Raise OptionError for what is no part of a grid; whether the grid has it the reader says."""
+    kinds = (int, np.integer, slice, type(None))
+    if parts is None or (
+        isinstance(parts, (tuple, list))
+        and len(parts) == 2
+        and all(isinstance(part, kinds) and getattr(part, "step", None) in (None, 1) for part in parts)
+    ):
+        return
+    need = "(row, column), each an integer, a slice of step 1 or None: (slice(0, 8), None)"
+    raise OptionError(f"{name}: got {parts!r}, need {need}")
 
 
 def nearest_point(stored: StoredCapture, x: float | None, y: float | None) -> Point:
     """Return row and column of the sensor point nearest to a place on a flat wall [m]."""
     if x is None or y is None:
         raise OptionError("histogram: need x and y [m], or pixel=(row, column)")
-    scan = read_scan(stored) if stored.header.scan_type != LINE_OF_SIGHT else None
+    scan = None if stored.header.has_pixels else read_scan(stored)
     if scan is None or not scan.planar:
         what = "a camera" if scan is None else "a curved wall"
         raise OptionError(f"x, y: {what} has no such coordinates; give pixel=(row, column)")

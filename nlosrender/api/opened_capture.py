@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from nlosrender.analysis.laser_view import laser_energies, point_histograms, wall_frames
+from nlosrender.analysis.laser_view import Point, check_point, laser_energies, point_histograms, wall_frames
 from nlosrender.analysis.summary import summarise
-from nlosrender.api.arguments import Point, bounce_indices, check_place, laser_point, nearest_point, sensor_for
+from nlosrender.api.arguments import bounce_indices, check_parts, laser_point, nearest_point, sensor_for
 from nlosrender.api.progress_bar import Wanted, reported, warn_caller
 from nlosrender.config.mapping_load import Changes, change_texts
 from nlosrender.constants import SPEED_OF_LIGHT, opl_to_seconds
@@ -114,6 +114,8 @@ class Capture:
             (channel, bounce, laser_y, laser_x, sensor_y, sensor_x, bin) float32; rows ascend in the wall's y, an index
             keeps its axis, and a confocal capture has one laser row and column.
         """
+        check_parts("lasers", lasers)
+        check_parts("sensors", sensors)
         with open_capture(self.path) as stored:
             return stored.read_block(lasers, sensors, bounce_indices(stored.header, bounces), dataset)
 
@@ -130,6 +132,8 @@ class Capture:
         """
         from nlosrender.api.named_samples import named_samples
 
+        check_parts("lasers", lasers)
+        check_parts("sensors", sensors)
         with open_capture(self.path) as stored:
             indices = bounce_indices(stored.header, bounces)
             return named_samples(stored, lasers, sensors, indices, dataset)
@@ -164,8 +168,7 @@ class Capture:
         """
         with open_capture(self.path) as stored:
             header = stored.header
-            chosen = nearest_point(stored, x, y) if pixel is None else pixel
-            check_place("pixel", chosen, header.sensor_grid)
+            chosen = check_point("pixel", pixel, *header.sensor_grid) or nearest_point(stored, x, y)
             return point_histograms(stored, laser_point(header, laser), chosen)
 
     def energy(self) -> dict[str, float]:

@@ -96,6 +96,8 @@ def transient(
     lasers = None if laser_points is None else _points(laser_points, "laser_points")
     if (sensor_position is None) != (laser_position is None):
         raise OptionError("sensor_position, laser_position: need both, for time to count the legs, or none")
+    if render is not None and not isinstance(render, Mapping):
+        raise OptionError(f"render: got {render!r:.60}, need a mapping of keys and values")
     given = dict(render or {})
     if decided := [key for key in OF_THE_VARIANT if key in given]:
         raise OptionError(f"render: {decided[0]} is decided by Mitsuba's variant; leave it away")
@@ -150,7 +152,13 @@ def transient(
 
 
 def _points(points: ArrayLike, name: str) -> Float64:
-    array = np.asarray(points, dtype=np.float64)
+    try:
+        array = np.asarray(points)
+        if array.dtype.kind not in "iuf":
+            raise TypeError
+        array = array.astype(np.float64)
+    except (TypeError, ValueError) as error:
+        raise OptionError(f"{name}: got {points!r:.60}, need an array of real numbers (..., 2)") from error
     if not array.ndim or array.shape[-1] != 2 or not array.size:
         raise OptionError(f"{name}: got shape {array.shape}, need (..., 2): x and y on the wall [m]")
     return array

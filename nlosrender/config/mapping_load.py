@@ -12,7 +12,7 @@ from typing import Any
 from nlosrender.config.foreign_scenes import advice_to_import
 from nlosrender.config.issues import Wrong
 from nlosrender.config.yaml_tree import MAX_DEPTH, Document, Place
-from nlosrender.errors import ConfigError, KeyPath, ValidationIssue
+from nlosrender.errors import ConfigError, KeyPath, OptionError, ValidationIssue
 
 SOURCE = "dict"  # what a mapping is called in messages, before the key
 Changes = Mapping[str, object]  # values by dotted key, such as {"render.spp": 64}
@@ -43,9 +43,14 @@ def change_texts(changes: Changes | Iterable[str]) -> tuple[str, ...]:
     ------
     ConfigError
         A value is none that a YAML holds; its key is named.
+    OptionError
+        An item is no text.
     """
     if not isinstance(changes, Mapping):
-        return (changes,) if isinstance(changes, str) else tuple(changes)
+        texts = (changes,) if isinstance(changes, str) else tuple(changes)
+        if other := [text for text in texts if not isinstance(text, str)]:
+            raise OptionError(f"changes: got {other[0]!r}, need texts KEY=VALUE, or a mapping of keys and values")
+        return texts
     document = Document("changes", Path.cwd(), "", places={(): Place("changes", "changes")})
     values = {str(key): _plain(value, tuple(str(key).split(".")), document) for key, value in changes.items()}
     if document.issues:

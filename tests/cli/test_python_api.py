@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import subprocess
 import sys
 import warnings
@@ -91,6 +92,8 @@ def test_changes_are_those_of_set(changes: Any, tmp_path: Path) -> None:
     for source in (SCENE, tmp_path / "z.yaml", loaded):
         assert nr.load(source, changes).config.capture.laser_grid.nx == 7  # type: ignore[union-attr]
     assert loaded.config.capture.laser_grid.nx == 2  # type: ignore[union-attr]
+    with pytest.raises(OptionError, match="changes: got 5, need texts KEY=VALUE"):
+        nr.load(SCENE, [5])  # type: ignore[list-item]
     twice = nr.load(nr.load(SCENE, changes), {"name": "1e3", "render.seed": 5})
     assert (twice.config.name, twice.config.render.seed, twice.config.capture.laser_grid.nx) == ("1e3", 5, 7)  # type: ignore[union-attr]
 
@@ -266,6 +269,12 @@ def test_listed_points_have_places_of_their_own(tmp_path: Path) -> None:
     [
         (lambda capture: capture.numpy(bounces=5), "bounces: got .5., need some of 2, 3, 4"),
         (lambda capture: capture.numpy(bounces=[]), "bounces: got .., need some of"),
+        (lambda capture: capture.numpy(bounces=3.0), "bounces: got 3.0, need bounce numbers"),
+        (lambda capture: capture.numpy(sensors=3), r"sensors: got 3, need .row, column."),
+        (lambda capture: capture.xarray(lasers=(0, slice(0, 4, 2))), r"lasers: got .*, need .* slice of step 1"),
+        (lambda capture: capture.histogram(pixel=1), "pixel: got 1, need two integers: row, column"),
+        (lambda capture: capture.frame(6e-9, laser=(0, 0, 0)), r"laser: got .0, 0, 0., need two integers"),
+        (lambda capture: capture.plot(pixel=(0.5, 1)), "--pixel: got .0.5, 1., need two integers"),
         (lambda capture: capture.frame(1.0), "t: got 1.0, need a time from 5.00346e-09 to below 1.50104e-08 s"),
         (lambda capture: capture.frame(float("nan")), "t: got nan"),
         (lambda capture: capture.frame(6e-9, laser=(4, 0)), "laser: got 4,0, need a row from 0 to 3"),
@@ -284,6 +293,25 @@ def test_what_a_capture_does_not_have_is_refused(rendered: nr.Capture, call: Any
     """With what it has; nothing is clamped or rounded to the nearest."""
     with pytest.raises(OptionError, match=message):
         call(rendered)
+
+
+def test_numbers_of_numpy_are_numbers(rendered: nr.Capture) -> None:
+    """Bounces and points that a computation has found name the same as plain integers do."""
+    row, column = brightest = np.argwhere(rendered.numpy()[0, 1, 0, 0].sum(axis=-1) > 0)[-1]
+    named = rendered.histogram(pixel=brightest)
+    assert np.array_equal(named, rendered.histogram(pixel=(int(row), int(column))))
+    for bounce in np.array([3, 4]):
+        assert np.array_equal(rendered.numpy(bounces=bounce), rendered.numpy(bounces=int(bounce)))
+
+
+def test_a_camera_has_no_places_on_a_wall(rendered: nr.Capture, tmp_path: Path) -> None:
+    """Its pixels may be empty, with zeros for positions: x and y would find one of them and give its darkness."""
+    seen = tmp_path / "camera.hdf5"
+    shutil.copy(rendered.path, seen)
+    with h5py.File(seen, "r+") as file:
+        file.attrs["empty_sensor_points"] = 1
+    with pytest.raises(OptionError, match="a camera has no such coordinates; give pixel"):
+        nr.open(seen).histogram(0.0, 0.0)
 
 
 def test_measure_and_reconstruct_are_the_commands(rendered: nr.Capture, tmp_path: Path) -> None:

@@ -7,9 +7,11 @@ import re
 import warnings
 from pathlib import Path
 
+import h5py
 import matplotlib.image
 import numpy as np
 import pytest
+from matplotlib.text import Text
 from support.point_captures import LASER_POINT, cells, points_header, write_light
 
 from nlosrender.analysis.drawn_picture import Picture
@@ -30,6 +32,10 @@ def write(path: Path, scan: str = "single") -> Path:
     lasers = header.laser_positions.shape[:2] if scan == "exhaustive" else (1, 1)
     decay = np.logspace(0, -4, BINS)
     return write_light(path, header, decay * np.random.default_rng(0).random((*lasers, ROWS, COLUMNS, BINS)))
+
+
+def texts_of(picture: Picture) -> str:
+    return "\n".join(text.get_text() for text in picture.figure.findobj(Text))
 
 
 def frames_of(picture: Picture) -> list:
@@ -90,6 +96,16 @@ def test_the_laser_is_marked(tmp_path: Path, scan: str) -> None:
     expected = {"single": LASER_POINT, "confocal": at_pixel, "exhaustive": cells(3, 2, 0.9, 0.7)[1, 2, :2]}[scan]
     # positions are float32 [m], the fit adds some roundings
     np.testing.assert_allclose(ring.get_xydata()[0], expected, atol=1e-6)
+
+
+def test_a_flash_is_told(tmp_path: Path) -> None:
+    """The mark is where its axis meets the wall, and is no lit point."""
+    path = write(tmp_path / "a.hdf5")
+    before = texts_of(capture_picture(path))
+    with h5py.File(path, "r+") as file:
+        file.attrs["laser_flash"] = "a flash: a cone of 40 degrees"
+    assert "a flash, not a laser point" in texts_of(capture_picture(path))
+    assert "flash" not in before
 
 
 def test_a_point_is_placed_on_a_grid_in_any_pose() -> None:

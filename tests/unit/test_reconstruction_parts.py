@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -233,8 +234,6 @@ def silhouette_of(*items: dict, wall: dict | None = None) -> np.ndarray:
     """Return the silhouette on ``GRID`` of hidden items."""
     scene = {"relay_wall": {"type": "rectangle", "width": 2.0, "height": 2.0, **(wall or {})}, "hidden_geometry": items}
     config = configured({"scene": scene, "capture": {"scan_type": "confocal", "sensor_grid": {"nx": 2, "ny": 2}}})
-    import json
-
     return true_silhouette(Path("x.hdf5"), {"config": json.dumps(config_to_dict(config))}, GRID)
 
 
@@ -272,6 +271,20 @@ def test_silhouettes_take_what_lies_in_the_volumes_depth() -> None:
     np.testing.assert_array_equal(silhouette_of(behind, sphere), silhouette_of(sphere))
     with pytest.raises(FileError, match="does not carry"):
         true_silhouette(Path("x.hdf5"), {}, GRID)
+
+
+def test_a_scene_without_a_relay_wall_has_no_silhouette() -> None:
+    """What a camera sees itself and what is hidden from it stand in one list there: all of it would be the truth."""
+    camera = {"position": [0, 0, 2], "look_at": [0, 0, 0], "fov_deg": 60, "width": 3, "height": 2}
+    wall = {"type": "rectangle", "width": 2.0, "height": 2.0, "center": [0, 0, 0], "normal": [0, 0, 1]}
+    config = {
+        "scene": {"hidden_geometry": [wall]},
+        "capture": {"scan_type": "confocal", "camera": camera},
+        "time_axis": {"bin_width_opl": 0.01, "n_bins": 9},
+        "output": {"path": "a.hdf5"},
+    }
+    with pytest.raises(FileError, match=r"no relay wall.* hidden"):
+        true_silhouette(Path("x.hdf5"), {"config": json.dumps(config)}, GRID)
 
 
 def test_scores_of_known_pictures() -> None:

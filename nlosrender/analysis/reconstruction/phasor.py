@@ -42,8 +42,9 @@ def refuse_curved(scan: Scan) -> None:
     """
     if not scan.planar:
         raise FileError(
-            "the relay wall is curved: phasor fields go from plane to plane and need a planar one. "
-            "Use --method backprojection, which takes any wall."
+            "the points do not lie in one plane along the wall (it is curved, or they are the pixels of a camera that "
+            "sees several surfaces): phasor fields go from plane to plane. Use --method backprojection, which takes "
+            "any points."
         )
 
 

@@ -74,6 +74,10 @@ def _surfaces(source: Path, text: object) -> Iterator[tuple[Surface, TriangleMes
         raise FileError(f"{source}: does not carry the scene's configuration, so there is nothing to score against")
     try:
         config = parse_config(text, str(source), source.absolute().parent)
+        if config.scene.relay_wall is None:
+            raise FileError(
+                f"{source}: has no relay wall, so that nothing says which surfaces are hidden; leave --score away"
+            )
         surfaces = hidden_surfaces(config.scene.hidden_geometry, relay_wall_from_config(config.scene.wall).pose)
         yield from zip(surfaces, read_surfaces(surfaces).shapes, strict=True)
     except (ConfigError, ValueError) as error:

@@ -199,7 +199,10 @@ def _refuse_pairs(ordered: OrderedCapture, program: str) -> None:
 def _refuse_shape(ordered: OrderedCapture) -> None:
     path = ordered.capture.path
     if not ordered.scan.planar:
-        raise FileError(f"{path}: has a curved relay wall, and this format holds no positions. Export it as tal.")
+        raise FileError(
+            f"{path}: its points lie in no plane (a curved relay wall, or a camera that sees several "
+            f"surfaces), and this format holds no positions. Export it as tal."
+        )
     if not ordered.is_grid:
         are = "a list" if ordered.scan.has_sensor_list else "no grid along the wall's axes"
         raise FileError(f"{path}: its sensor points are {are}, and this format holds no positions. Export it as tal.")

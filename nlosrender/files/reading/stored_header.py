@@ -109,9 +109,14 @@ class StoredHeader:
         """Whether several laser spots were lit at once."""
         return layout.MULTIPLEXED in self.attributes
 
+    @property
+    def is_flash(self) -> bool:
+        """Whether the laser lit a part of the wall at once, not points."""
+        return layout.FLASH in self.attributes
+
     def refuse_spots(self, what: str) -> None:
         """Raise FileError where a flash or several laser spots lit the wall, for ``what`` is for one laser point."""
-        if layout.FLASH in self.attributes:
+        if self.is_flash:
             raise FileError(
                 f"{self.path}: its laser is {self.attributes[layout.FLASH]}, and {what} takes a laser point."
             )
