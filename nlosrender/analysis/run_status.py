@@ -16,6 +16,7 @@ from nlosrender.config.canonical import tree_hash
 from nlosrender.errors import FileError
 from nlosrender.files.atomic_write import partial_folder
 from nlosrender.files.dataset_index import has_index, read_index
+from nlosrender.files.file_kinds import is_derived
 from nlosrender.files.identity import SELECTION
 from nlosrender.files.reading.reader import read_header
 
@@ -51,7 +52,7 @@ class RenderStatus:
 
 
 def status_of(paths: Iterable[Path], stale_after: float) -> list[RenderStatus]:
-    """Return the status of files, and of all that is in folders at any depth, each once.
+    """Return the status of files, and of all captures that are in folders at any depth, each once.
 
     Parameters
     ----------
@@ -89,7 +90,9 @@ def _in_folder(folder: Path, stale_after: float) -> Iterator[RenderStatus]:
         partials = {match[1] for name in folders if (match := _PARTIAL.fullmatch(name))}
         folders[:] = sorted(name for name in folders if not name.startswith("."))
         captures = {name for name in files if name.endswith(SUFFIXES) and not name.startswith(".")}
-        yield from (_status(Path(parent) / name, stale_after) for name in sorted(captures | partials))
+        for status in (_status(Path(parent) / name, stale_after) for name in sorted(captures | partials)):
+            if status.state != "failed" or not is_derived(Path(status.file)):
+                yield status
         if has_index(Path(parent)):
             yield from _only_in_index(Path(parent))
 

@@ -107,6 +107,11 @@ VOLUME = _hdf5("a reconstruction by nlosrender", lambda file: {"volume", *"xyz"}
 TAL = _hdf5("an HDF5_TAL file", lambda file: {"H", "H_format"} <= file.keys())
 
 
+def is_derived(path: Path) -> bool:
+    """Return whether a file was made of a capture and is none: what ``reconstruct`` and ``export`` write beside it."""
+    return any(kind.objection(path) is None for kind in (VOLUME, TAL))
+
+
 def _is_damaged_capture(path: Path) -> bool:
     """Return whether a file began as a capture of ours and can be read by nothing any more."""
     with path.open("rb") as stream:

@@ -30,6 +30,7 @@ CLASSES = {layout.FLOAT: h5py.h5t.FLOAT, layout.INTEGER: h5py.h5t.INTEGER}
 WORDS = {h5py.h5t.FLOAT: "floating point", h5py.h5t.INTEGER: "integer"}
 NORMAL_TOLERANCE = 1e-5  # three float32 components: 1e-7, with room for other writers' float32 arithmetic
 PLANE_TOLERANCE = 1e-5  # m, a wall a few metres wide in float32
+SHARE_TOLERANCE = 1e-4  # of a sum: shares of a thousand spots, each rounded to float32
 # Energies are sums of float64 samples, which the file holds rounded to float32: by at most half a unit in the last of
 # 24 digits, or of the smallest denormal number. Twice that leaves room for the float64 sums themselves.
 ENERGY_TOLERANCE = 2.0**-23
@@ -91,6 +92,7 @@ def _layout(file: h5py.File, path: Path, samples: h5py.Dataset) -> list[str]:
     found += _ground_truth(file, path)
     if not found:  # values mean something only where types and shapes are right
         found += _values(file, path, sizes, confocal) + _points(file, path, sizes, confocal)
+        found += _lit_and_seen(file, path)
     return found + _attributes(file, samples)
 
 
@@ -226,6 +228,26 @@ def _points(file: h5py.File, path: Path, sizes: Mapping[str, int], confocal: boo
             if (np.diff(points[..., 2], axis=0) <= 0).any() or (np.diff(points[..., 0], axis=1) <= 0).any():
                 found.append(f"{name}Positions: rows must ascend in Z and columns in X")
     return found
+
+
+def _lit_and_seen(file: h5py.File, path: Path) -> Iterator[str]:
+    """Yield what is wrong with spots, flash and footprint, where a capture has them."""
+    attributes = get_attributes(file)
+    try:
+        spots = StoredCapture(file, path).laser_spots
+    except FileError as error:
+        yield str(error).removeprefix(f"{path}: ")
+    else:
+        if spots is not None and not np.isfinite(spots[0]).all():
+            yield f"{layout.SPOT_POSITIONS}: holds a value that is not finite"
+        if spots is not None and not (spots[1].min() > 0 and abs(spots[1].sum() - 1) <= SHARE_TOLERANCE):
+            yield f"{layout.SPOT_SHARES}: need shares above 0 that add up to 1"
+    for name in (layout.FLASH, layout.FOOTPRINT):
+        if not isinstance(words := attributes.get(name, ""), str):
+            yield f"attribute {name!r}: {words}, need text"
+    area = attributes.get(layout.FOOTPRINT_AREA)
+    if layout.FOOTPRINT in attributes and not (isinstance(area, (int, float)) and 0 < area < math.inf):
+        yield f"attribute {layout.FOOTPRINT_AREA!r}: {'missing' if area is None else area}, need an area > 0 [m^2]"
 
 
 def _attributes(file: h5py.File, samples: h5py.Dataset) -> list[str]:

@@ -9,10 +9,13 @@ from collections.abc import Callable
 from contextlib import contextmanager
 from pathlib import Path
 
+import h5py
+import numpy as np
 import pytest
 from support import commands
 from support.partial_captures import CONFIG, Stopped, write_part
 
+from nlosrender.analysis.comparison.dataset import captures_below
 from nlosrender.analysis.run_status import RenderStatus, missing_shards, status_of, status_report
 from nlosrender.capture.part import Selection
 from nlosrender.errors import EXIT_BAD_INPUT, EXIT_OK, FileError
@@ -112,6 +115,20 @@ def test_damage_is_a_failure_and_a_cut_journal_is_not(parts: Path) -> None:
     assert (stopped.state, stopped.finished_units) == ("stopped", 1)
     journal_of(parts).write_bytes(b"")
     assert status_of([parts / "2.hdf5"], STALE)[0].finished_units == 0
+
+
+def test_what_was_made_of_a_capture_is_no_render(tmp_path: Path) -> None:
+    """Volumes of ``reconstruct`` and exports for y-tal stand beside their capture by default; status, check and report
+    pass over them, named they are refused."""
+    for name, datasets in (("z-phasor.hdf5", "volume x y z"), ("z-tal.hdf5", "H H_format")):
+        with h5py.File(tmp_path / name, "w") as file:
+            file.update(dict.fromkeys(datasets.split(), np.zeros(1)))
+    assert status_of([tmp_path], STALE) == []
+    assert captures_below(tmp_path) == []
+    assert status_of([tmp_path / "z-tal.hdf5"], STALE)[0].state == "failed"
+    (tmp_path / "z.hdf5").write_bytes(b"damaged")
+    assert [status.state for status in status_of([tmp_path], STALE)] == ["failed"]
+    assert captures_below(tmp_path) == ["z.hdf5"]
 
 
 def test_captures_of_a_sweep_that_are_not_there(tmp_path: Path) -> None:

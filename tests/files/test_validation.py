@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import h5py
@@ -101,6 +102,33 @@ def test_each_violation_is_reported(
         change(file)
     found = validate_file(path)
     assert any(re.match(message, line) for line in found), found
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda file: file.pop("laserSpotPositions"), "has no usable laserSpotPositions"),
+        (lambda file: file["laserSpotPositions"].__setitem__((0, 0, 1), np.nan), "laserSpotPositions: .* not finite"),
+        (lambda file: file["laserSpotShares"].__setitem__(0, 0.5), "laserSpotShares: need shares .* add up to 1"),
+        (lambda file: file["laserSpotShares"].__setitem__(0, np.nan), "laserSpotShares: need shares"),
+        (lambda file: file.attrs.__setitem__("laser_flash", 5), "attribute 'laser_flash': 5, need text"),
+        (lambda file: file.attrs.__setitem__("footprint_area", -1.0), "attribute 'footprint_area': -1.0, need an area"),
+        (lambda file: file.attrs.__delitem__("footprint_area"), "attribute 'footprint_area': missing"),
+    ],
+)
+def test_spots_flash_and_footprint_are_checked(
+    tmp_path: Path, header_of: Callable, write_capture: Callable, change: Callable, message: str
+) -> None:
+    """A file that says so has what it says, or --check fails."""
+    path = tmp_path / "a.hdf5"
+    spots = np.array([[0.1, 0.2, 0.0], [-0.3, 0.2, 0.0]]), np.array([0.25, 0.75])
+    header = replace(header_of(), laser_spots=spots, laser_flash="a cone", footprint=("a disc", 0.01))
+    write_capture(path, header)
+    assert validate_file(path) == []
+    with h5py.File(path, "r+") as file:
+        change(file)
+    (found,) = validate_file(path)
+    assert re.match(message, found)
 
 
 def test_confocal_lasers_must_be_the_sensors(tmp_path: Path, header_of: Callable, write_capture: Callable) -> None:

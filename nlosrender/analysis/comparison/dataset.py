@@ -15,7 +15,7 @@ from nlosrender.analysis.comparison.report import comparison_report
 from nlosrender.analysis.comparison.tolerance_rules import ToleranceRule, refuse_idle_rules, tolerances_of
 from nlosrender.errors import FileError
 from nlosrender.files.atomic_write import check_writable, replacing
-from nlosrender.files.file_kinds import CAPTURE
+from nlosrender.files.file_kinds import CAPTURE, is_derived
 
 SUFFIXES = (".hdf5", ".h5")  # names that captures have
 
@@ -116,7 +116,7 @@ def replace_references(files: Iterable[CheckedFile], folder: Path, reference: Pa
 
 
 def captures_below(folder: Path) -> list[str]:
-    """Return the captures below a folder as sorted relative paths.
+    """Return the captures below a folder as sorted relative paths; volumes and exports beside them are left out.
 
     Raises
     ------
@@ -133,5 +133,6 @@ def captures_below(folder: Path) -> list[str]:
     for parent, folders, files in os.walk(folder, onerror=refuse):
         folders[:] = [name for name in folders if not name.startswith(".")]
         names = (name for name in files if name.endswith(SUFFIXES) and not name.startswith("."))
-        found += [(Path(parent) / name).relative_to(folder).as_posix() for name in names]
+        paths = (Path(parent) / name for name in names)
+        found += [path.relative_to(folder).as_posix() for path in paths if not is_derived(path)]
     return sorted(found)
