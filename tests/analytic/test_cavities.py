@@ -127,9 +127,11 @@ SAME = {"type": "blendbsdf", "weight": 0.3, "first": GREY, "second": GREY}  # no
     ("scan", "bsdf"),
     [
         ("single", GREY),
-        ("confocal", GREY),
         ("confocal", SAME),
-        *(pytest.param(*more, marks=pytest.mark.slow) for more in (("exhaustive", GREY), ("single", SAME))),
+        *(
+            pytest.param(*more, marks=pytest.mark.slow)
+            for more in (("confocal", GREY), ("exhaustive", GREY), ("single", SAME))
+        ),
     ],
 )
 def test_virtual_lights_give_every_bounce_of_a_sphere_its_energy(scan: str, bsdf: dict) -> None:
@@ -223,7 +225,7 @@ def test_arrival_times_in_a_sphere_are_sums_of_chords() -> None:
         assert_agrees(mean[None], variance[None], reference[None], replicas=REPLICAS, floor=floor)
 
 
-@pytest.mark.parametrize("p_hidden_sampling", [0.0, 0.5, 1.0])
+@pytest.mark.parametrize("p_hidden_sampling", [0.0, 0.5, pytest.param(1.0, marks=pytest.mark.slow)])
 def test_a_small_wall_in_a_large_sphere(p_hidden_sampling: float) -> None:
     """Wherever the wall is, all its light meets the sphere: H_k = rho_w^2 rho^(k-2) / (4 pi^2 R^2) for k >= 4.
 

@@ -50,8 +50,14 @@ def expected(stage: Stage, screens: int = 1) -> Array:
     return image_sum(triangles(stage, 0), np.concatenate(before), stage.engine.capture, stage.engine.time_axis)
 
 
-@pytest.mark.parametrize("engine", ["path", "virtual_lights"])
-@pytest.mark.parametrize("scan", ["single", "confocal", "exhaustive"])
+@pytest.mark.parametrize(
+    ("scan", "engine"),
+    [("single", "path"), ("confocal", "virtual_lights"), ("exhaustive", "path")]
+    + [
+        pytest.param(*more, marks=pytest.mark.slow)
+        for more in (("single", "virtual_lights"), ("confocal", "path"), ("exhaustive", "virtual_lights"))
+    ],
+)
 def test_a_mirror_mesh_sends_the_light_of_its_images(scan: str, engine: str, tmp_path: Path) -> None:
     """Every facet has an image of every laser point, where nothing hides the way to and fro; legs are counted."""
     name = write_uv_ply(tmp_path / "mirror.ply", *sheet(wavy(1.6, 1.2, 0.05), 9, 7))

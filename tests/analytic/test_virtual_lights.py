@@ -95,7 +95,9 @@ QUADRATURE = {"single": 2e-3, "confocal": 2e-3, "exhaustive": 5e-3}  # exhaustiv
 CELLS = {"single": 700, "confocal": 700, "exhaustive": 350}
 
 
-@pytest.mark.parametrize("scan", ["single", pytest.param("confocal", marks=pytest.mark.slow), "exhaustive"])
+@pytest.mark.parametrize(
+    "scan", ["single", *(pytest.param(scan, marks=pytest.mark.slow) for scan in ("confocal", "exhaustive"))]
+)
 def test_a_plate_meets_the_target_error_and_says_so(scan: str) -> None:
     """H per bin of a tilted plate, for every scan type, at 1 %."""
     truth = reference(
@@ -370,8 +372,11 @@ def test_auto_takes_the_cheapest_engine_that_is_right(hidden: list[dict], render
     assert start(config)[-1].name == engine
 
 
-@pytest.mark.parametrize("inside", [False, True])
-@pytest.mark.parametrize("scan", ["single", "confocal"])
+@pytest.mark.parametrize(
+    ("scan", "inside"),
+    [("single", True), ("confocal", False)]
+    + [pytest.param(*more, marks=pytest.mark.slow) for more in (("single", False), ("confocal", True))],
+)
 def test_a_cylinder_is_round(scan: str, inside: bool) -> None:
     """A tilted cylinder without caps before a plate, seen from outside or through its ends: both engines agree."""
     scene = (PLATE | {"center": [0.15, -0.1, 0.9]}, TUBE | {"inside": inside})

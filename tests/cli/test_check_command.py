@@ -192,7 +192,7 @@ def test_update_needs_a_terminal_or_yes(folders: Path) -> None:
     assert check(folders, "--yes").returncode == EXIT_USAGE
 
 
-@pytest.mark.parametrize(("answer", "is_replaced"), [("y", True), ("", False)])
+@pytest.mark.parametrize(("answer", "is_replaced"), [("y", True), pytest.param("", False, marks=pytest.mark.slow)])
 def test_update_asks_at_a_terminal(folders: Path, answer: str, is_replaced: bool) -> None:
     """Only a yes replaces."""
     before = (folders / "ref" / ODD).read_bytes()

@@ -257,9 +257,13 @@ def fail_with(error: OSError, folder: Path) -> None:
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="a device of Linux")
-@pytest.mark.parametrize(("arguments", "on_stdout", "on_stderr"), [
-    (("schema",), EXIT_FAILURE, EXIT_OK), (("info", "no.hdf5"), EXIT_BAD_INPUT, EXIT_BAD_INPUT),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("arguments", "on_stdout", "on_stderr"),
+    [
+        (("schema",), EXIT_FAILURE, EXIT_OK),
+        pytest.param(("info", "no.hdf5"), EXIT_BAD_INPUT, EXIT_BAD_INPUT, marks=pytest.mark.slow),
+    ],
+)
 def test_a_stream_that_is_full(arguments: tuple[str, ...], on_stdout: int, on_stderr: int) -> None:
     """Results that cannot be written are an explained failure; messages that cannot leave the exit code as it is."""
     with Path("/dev/full").open("w") as full:

@@ -99,7 +99,13 @@ def test_a_render_without_standard_streams(folder: Path) -> None:
     assert validate_file(folder / "a.hdf5") == []
 
 
-@pytest.mark.parametrize("command", [("plan", "{}/scene.yaml"), ("render", "{}/scene.yaml", "-o", "{}/a.hdf5")])
+@pytest.mark.parametrize(
+    "command",
+    [
+        pytest.param(("plan", "{}/scene.yaml"), marks=pytest.mark.slow),
+        ("render", "{}/scene.yaml", "-o", "{}/a.hdf5"),
+    ],
+)
 def test_a_current_folder_that_is_gone(folder: Path, command: tuple[str, ...]) -> None:
     """Mitsuba's import would end the process; the environment is what is to be mended."""
     (folder / "gone").mkdir()

@@ -53,7 +53,7 @@ def claimed(path: Path) -> PartialCapture:
     return PartialCapture.claim(path, {"config": CONFIG, "variant": "none", "replicas": 2, "part": "the whole capture"})
 
 
-@pytest.mark.parametrize("compression", ["gzip", "none"])
+@pytest.mark.parametrize("compression", ["gzip", pytest.param("none", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("closed", [True, False], ids=["stopped", "killed"])
 @pytest.mark.parametrize("kind", ["flip", "cut"])
 @pytest.mark.parametrize("name", ["samples.0.hdf5", "journal"])

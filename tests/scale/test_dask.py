@@ -101,7 +101,8 @@ def assert_same(one: Path, other: Path) -> None:
 
 def test_a_killed_worker_costs_nothing(folder: Path) -> None:
     """Two worker processes, one of them killed half-way: the file of a local render in one process, bit for bit."""
-    assert report_of(started(folder, "-o", "whole.hdf5", "--json"))["units"] == 1
+    done = run(folder, "render", "scene.yaml", "-o", "whole.hdf5", "--json")
+    assert json.loads(done.stdout)["units"] == 1
     process = started(folder, *DASK, "--json")
     assert wait_for_units(folder, process, 2) >= 2
     local_workers(process)[0].kill()

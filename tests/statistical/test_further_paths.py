@@ -49,8 +49,14 @@ def assert_same_light(one: Rendering, other: Rendering) -> None:
         )
 
 
-@pytest.mark.parametrize("scan", ["single", "confocal", "exhaustive"])
-@pytest.mark.parametrize("p_hidden_sampling", [0.0, 0.5, 1.0])
+@pytest.mark.parametrize(
+    ("scan", "p_hidden_sampling"),
+    [
+        pytest.param(scan, (0.0, 0.5, 1.0)[j], marks=[] if i == j else pytest.mark.slow)
+        for i, scan in enumerate(("exhaustive", "single", "confocal"))
+        for j in range(3)
+    ],
+)
 def test_few_paths_carry_the_light_of_all(scan: str, p_hidden_sampling: float) -> None:
     """Bounce by bounce, H has the same expectation whether one path of seven goes on or every one.
 

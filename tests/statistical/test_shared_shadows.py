@@ -17,7 +17,7 @@ COARSE, FINE = 0.2, 0.02
 @pytest.mark.parametrize(
     ("scan", "sensors", "lasers"),
     [
-        pytest.param("single", {"nx": 1, "ny": 1}, {"laser_point": [0.0, 0.0]}, id="single"),
+        pytest.param("single", {"nx": 1, "ny": 1}, {"laser_point": [0.0, 0.0]}, id="single", marks=pytest.mark.slow),
         pytest.param("exhaustive", {"nx": 1, "ny": 2}, {"laser_grid": {"nx": 1, "ny": 2}}, id="exhaustive"),
     ],
 )

@@ -134,26 +134,41 @@ class Setup:
     sensor_brdf: WallBrdf | None = None
 
 
-def contributions(setup: Setup, laser: Array, sensor: Array) -> tuple[Array, Array]:
-    """Value [J m^-2 sr^-1] and optical path length [m] of every cell for one pair of points."""
+@dataclass(frozen=True)
+class Legs:
+    """From one point on the wall to every cell."""
+
+    value: Array  # of the point's factors in H
+    opl: Array  # m
+    way_back: Array  # (n, 3), unit, from the cells to the point
+
+
+def legs_of(setup: Setup, point: Array, wall_brdf: WallBrdf | None) -> Legs:
+    """Return the way between a laser or sensor point and every cell."""
     cells = setup.cells
     wall_normal = Z if setup.wall_normal is None else setup.wall_normal
-    value = cells.areas * setup.energy
-    opl = np.full(len(value), setup.laser_leg + setup.sensor_leg)
-    ways = []
-    for point, wall_brdf in ((laser, setup.laser_brdf), (sensor, setup.sensor_brdf)):
-        way = cells.points - point
-        distance = np.linalg.norm(way, axis=-1)
-        way = way / distance[:, None]
-        at_wall = np.maximum(way @ wall_normal, 0)
-        at_cell = np.maximum(-np.einsum("ij,ij->i", way, cells.normals), 0)
-        value = value * at_wall * at_cell / distance**2
-        value = value * (setup.rho_wall / np.pi if wall_brdf is None else wall_brdf(point, way))
-        if setup.visible is not None:
-            value = value * setup.visible(point, cells.points)
-        opl = opl + distance
-        ways.append(-way)
-    return value * (setup.rho / np.pi if setup.brdf is None else setup.brdf(cells, *ways)), opl
+    way = cells.points - point
+    distance = np.sqrt(np.einsum("ij,ij->i", way, way))
+    way /= distance[:, None]
+    at_wall = np.maximum(way @ wall_normal, 0)
+    at_cell = np.maximum(-np.einsum("ij,ij->i", way, cells.normals), 0)
+    value = at_wall * at_cell / distance**2
+    value = value * (setup.rho_wall / np.pi if wall_brdf is None else wall_brdf(point, way))
+    if setup.visible is not None:
+        value = value * setup.visible(point, cells.points)
+    return Legs(value, distance, -way)
+
+
+def of_pair(setup: Setup, to_laser: Legs, to_sensor: Legs) -> tuple[Array, Array]:
+    """Value [J m^-2 sr^-1] and optical path length [m] of every cell."""
+    value = setup.cells.areas * setup.energy * to_laser.value * to_sensor.value
+    value *= setup.rho / np.pi if setup.brdf is None else setup.brdf(setup.cells, to_laser.way_back, to_sensor.way_back)
+    return value, setup.laser_leg + setup.sensor_leg + to_laser.opl + to_sensor.opl
+
+
+def contributions(setup: Setup, laser: Array, sensor: Array) -> tuple[Array, Array]:
+    """Value [J m^-2 sr^-1] and optical path length [m] of every cell for one pair of points."""
+    return of_pair(setup, legs_of(setup, laser, setup.laser_brdf), legs_of(setup, sensor, setup.sensor_brdf))
 
 
 def third_bounce(setup: Setup, laser: Array, sensor: Array) -> Array:
@@ -172,15 +187,23 @@ def binned(value: Array, opl: Array, edges: Array) -> Array:
 
 def third_bounces(setup: Setup, lasers: Array, sensors: Array) -> Array:
     """Histograms (ly, lx, sy, sx, bins) of every pair of two grids (y, x, 3)."""
-    rows = [
-        [third_bounce(setup, laser, sensor) for sensor in sensors.reshape(-1, 3)] for laser in lasers.reshape(-1, 3)
-    ]
+    rows = []
+    for laser in lasers.reshape(-1, 3):
+        to_laser = legs_of(setup, laser, setup.laser_brdf)
+        for sensor in sensors.reshape(-1, 3):
+            value, opl = of_pair(setup, to_laser, legs_of(setup, sensor, setup.sensor_brdf))
+            rows.append(binned(value, opl, setup.edges))
     return np.array(rows).reshape(*lasers.shape[:2], *sensors.shape[:2], -1)
 
 
 def confocal_third_bounces(setup: Setup, points: Array) -> Array:
     """Histograms (1, 1, sy, sx, bins) where laser and sensor share each point of a grid (y, x, 3)."""
-    rows = [third_bounce(setup, point, point) for point in points.reshape(-1, 3)]
+    rows = []
+    for point in points.reshape(-1, 3):
+        to_laser = to_sensor = legs_of(setup, point, setup.laser_brdf)
+        if setup.sensor_brdf is not setup.laser_brdf:
+            to_sensor = legs_of(setup, point, setup.sensor_brdf)
+        rows.append(binned(*of_pair(setup, to_laser, to_sensor), setup.edges))
     return np.array(rows).reshape(1, 1, *points.shape[:2], -1)
 
 

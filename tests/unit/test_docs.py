@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import re
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -12,9 +13,6 @@ ROOT = Path(__file__).parents[2]
 PACKAGE = ROOT / "nlosrender"
 PAGES = sorted([*ROOT.glob("docs/*.md"), ROOT / "docs/notebook.ipynb", *ROOT.glob("*.md")])
 OF_CODE = [ROOT / "docs" / name for name in ("virtual-lights.md", "architecture.md")]
-MODULES = {
-    path: ast.parse(path.read_text()) for path in (*PACKAGE.rglob("*.py"), ROOT / "tests/support/constant_engine.py")
-}
 ENGINE = PACKAGE / "engine"
 FOLDERS = (ROOT, PACKAGE, PACKAGE / "rendering", ENGINE, ENGINE / "path", ENGINE / "virtual_lights")
 FOREIGN = {"bsdf.eval", "wall_bsdf.eval", "ray_test", "sample_emitter_direction", "SmoothDiffuse"}  # Mitsuba's
@@ -44,12 +42,28 @@ def defined_in(tree: ast.AST) -> set[str]:
     return names
 
 
-NAMES = set().union(*(defined_in(tree) for tree in MODULES.values())) | {path.stem for path in MODULES}
-CLASSES: dict[str, set[str]] = {}
-for tree in MODULES.values():
-    for node in ast.walk(tree):
-        if isinstance(node, ast.ClassDef):
-            CLASSES.setdefault(node.name, set()).update(defined_in(node))
+@cache  # not at import: every process that collects tests would parse the package
+def modules() -> dict[Path, ast.Module]:
+    """Return the trees of all modules."""
+    paths = (*PACKAGE.rglob("*.py"), ROOT / "tests/support/constant_engine.py")
+    return {path: ast.parse(path.read_text()) for path in paths}
+
+
+@cache
+def all_names() -> set[str]:
+    """Return what is defined anywhere, and the names of modules."""
+    return set().union(*(defined_in(tree) for tree in modules().values())) | {path.stem for path in modules()}
+
+
+@cache
+def names_of_classes() -> dict[str, set[str]]:
+    """Return by class what is defined in it."""
+    result: dict[str, set[str]] = {}
+    for tree in modules().values():
+        for node in ast.walk(tree):
+            if isinstance(node, ast.ClassDef):
+                result.setdefault(node.name, set()).update(defined_in(node))
+    return result
 
 
 def code_spans(page: Path) -> list[str]:
@@ -69,10 +83,10 @@ def test_every_name_in_backquotes_is_defined_in_the_code(page: Path) -> None:
         ):
             continue
         first, *rest = span.lstrip(".").split(".")
-        if rest and first in CLASSES:
-            found = rest[0] in CLASSES[first]
+        if rest and first in names_of_classes():
+            found = rest[0] in names_of_classes()[first]
         else:
-            found = all(name in NAMES for name in (first, *rest))
+            found = all(name in all_names() for name in (first, *rest))
         if not found:
             missing.append(span)
     assert not missing
@@ -91,7 +105,7 @@ def test_a_name_beside_a_file_is_defined_in_that_file(page: Path) -> None:
     assert found
     missing = []
     for names, path in found:
-        defined = defined_in(MODULES[module(path)])
+        defined = defined_in(modules()[module(path)])
         missing += [(span, path) for span in re.findall(r"`([^`]+)`", names) if span.split(".")[0] not in defined]
     assert not missing
 
@@ -102,7 +116,7 @@ def test_a_constant_is_defined_in_a_file_that_its_section_names(page: Path) -> N
     missing = []
     for section in re.split(r"^#+ ", page.read_text(), flags=re.MULTILINE):
         paths = set(re.findall(r"(?<![\w/])[a-z_][\w/-]*\.py\b", section))
-        defined = set().union(*(defined_in(MODULES.get(module(path), ast.Module([], []))) for path in paths))
+        defined = set().union(*(defined_in(modules().get(module(path), ast.Module([], []))) for path in paths))
         missing += [name for name in re.findall(r"`([A-Z][A-Z_\d]+)`", section) if name not in defined]
     assert not missing
 
@@ -134,5 +148,5 @@ def test_no_section_that_the_code_cites_is_missing(page: Path) -> None:
     """``docs/virtual-lights.md, 2.3`` in a docstring leads to a heading with that number."""
     headings = set(re.findall(r"^#+ ([\d.]+) ", page.read_text(), flags=re.MULTILINE))
     cited = re.compile(rf"docs/{re.escape(page.name)}, (\d+(?:\.\d+)?)")
-    found = {number for path in MODULES for number in cited.findall(path.read_text())}
+    found = {number for path in modules() for number in cited.findall(path.read_text())}
     assert found <= headings

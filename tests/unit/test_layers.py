@@ -4,6 +4,7 @@ import ast
 import subprocess
 import sys
 from collections import defaultdict
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -35,6 +36,7 @@ MUST_NOT_RENDER = [
 ]
 
 
+@cache
 def imported(path: Path) -> set[str]:
     """Return the dotted names of our own modules, or of things in them, that a module imports anywhere in it."""
     package = (PACKAGE.name, *path.relative_to(PACKAGE).parent.parts)
