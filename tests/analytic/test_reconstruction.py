@@ -50,7 +50,7 @@ FRAMES = [(False, 0.0, "znlos"), (True, 0.0, "scene"), (True, 1.3, "znlos"), (Fa
 @pytest.mark.parametrize(
     ("scan_type", "method", "legs", "start", "frame"),
     [
-        (scan_type, method, *frame)
+        pytest.param(scan_type, method, *frame, marks=[] if k // 2 == j else pytest.mark.slow)
         for i, scan_type in enumerate(SCANS)
         for j, method in enumerate(("phasor", "backprojection"))
         for k, frame in enumerate(FRAMES)

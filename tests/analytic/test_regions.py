@@ -43,8 +43,15 @@ def whole(engine) -> Batch:
     return Batch(tile, tile if engine.capture.scan_type == "confocal" else Tile(0, 1, 0, 1))
 
 
-@pytest.mark.parametrize("scan", ["single", "confocal"])
-@pytest.mark.parametrize("hidden", [(ROOM,), (ROOM, TOUCHING)], ids=["room", "room and plate"])
+@pytest.mark.parametrize(
+    ("hidden", "scan"),
+    [
+        pytest.param((ROOM, TOUCHING), "single", id="room and plate, single"),
+        pytest.param((ROOM,), "confocal", id="room, confocal"),
+        pytest.param((ROOM,), "single", id="room, single", marks=pytest.mark.slow),
+        pytest.param((ROOM, TOUCHING), "confocal", id="room and plate, confocal", marks=pytest.mark.slow),
+    ],
+)
 def test_regions_agree_with_one_set_of_patches(hidden: tuple[dict, ...], scan: str) -> None:
     """Both err by what they state; together by no more than the root of the sum of the squares, times two.
 

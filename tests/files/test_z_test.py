@@ -66,8 +66,11 @@ def tracer(header_of: Header) -> Callable[..., Tracer]:
     return lambda *arguments: Tracer(header_of("exhaustive", n_bins=N_BINS), *arguments)
 
 
-@pytest.mark.parametrize("paths", [0.3, 4.0, 100.0])
-@pytest.mark.parametrize("replicas", [2, 6])
+@pytest.mark.parametrize(
+    ("paths", "replicas"),
+    [(0.3, 2), (4.0, 6), (100.0, 2)]
+    + [pytest.param(*more, marks=pytest.mark.slow) for more in ((0.3, 6), (4.0, 2), (100.0, 6))],
+)
 def test_noise_raises_no_alarm(tmp_path: Path, tracer: Callable, paths: float, replicas: int) -> None:
     """Captures of one scene agree, however rare their paths and whether the other side is noisy or exact."""
     renders = [tracer(paths, replicas).render(tmp_path / f"{seed}.hdf5", seed, replicas=replicas) for seed in range(4)]

@@ -43,10 +43,16 @@ def imported(path: Path) -> set[str]:
     return imported_by(path.read_text(), package)
 
 
+@cache
+def imports(source: str) -> list[ast.Import | ast.ImportFrom]:
+    """Return the statements of a module, anywhere in it, that import."""
+    return [node for node in ast.walk(ast.parse(source)) if isinstance(node, ast.Import | ast.ImportFrom)]
+
+
 def imported_by(source: str, package: tuple[str, ...]) -> set[str]:
     """Return the names below ``nlosrender`` that ``source``, a module of ``package``, imports."""
     names = set()
-    for node in ast.walk(ast.parse(source)):
+    for node in imports(source):
         if isinstance(node, ast.ImportFrom):
             base = [*package[: len(package) - node.level + 1]] if node.level else []
             base += node.module.split(".") if node.module else []
@@ -113,9 +119,9 @@ def test_a_stage_imports_only_stages_above_it(path):
 @pytest.mark.parametrize("path", MUST_NOT_RENDER, ids=lambda path: str(path.relative_to(PACKAGE)))
 def test_only_the_scene_builder_and_the_engine_know_mitsuba(path):
     """Everything else has to work on a machine that cannot render."""
-    tree = ast.parse(path.read_text())
-    names = {alias.name for node in ast.walk(tree) if isinstance(node, ast.Import) for alias in node.names}
-    names |= {node.module for node in ast.walk(tree) if isinstance(node, ast.ImportFrom) and node.module}
+    found = imports(path.read_text())
+    names = {alias.name for node in found if isinstance(node, ast.Import) for alias in node.names}
+    names |= {node.module for node in found if isinstance(node, ast.ImportFrom) and node.module}
     assert not {name for name in names if name.split(".")[0] in ("mitsuba", "drjit")}
 
 
