@@ -152,7 +152,8 @@ def _grid(summary: Mapping[str, Any], name: str) -> str:
     points, size = summary[f"{name}_grid"], summary[f"{name}_grid_size"]
     is_list = name in _sequence(summary["point_lists"])
     shown = f"a list of {_text(points[0])}" if is_list else _joined(points, " x ")
-    return shown + (f" over {_joined(size, ' x ')} m" if size else "")
+    # a single point, and a camera's points in no plane, have no extent
+    return shown + (f" over {_joined(size, ' x ')} m" if size and any(_sequence(size)) else "")
 
 
 def _lengths(position: object) -> str:

@@ -12,6 +12,7 @@ import typer
 from nlosrender.cli.compare_command import MaxEnergy, MaxRelL2, MaxShift, Significance, ZTestWanted, tolerances_given
 from nlosrender.cli.json_output import OUTPUT
 from nlosrender.cli.options import AsJson
+from nlosrender.readable import printable
 
 if TYPE_CHECKING:
     from nlosrender.analysis.comparison.dataset import CheckedFile
@@ -95,7 +96,7 @@ def check(
         OUTPUT.print(report | updated, failure.exit_code if failed else 0)
     else:
         for name in found.extra:
-            typer.echo(f"extra       {name}: not in the reference")
+            typer.echo(f"extra       {printable(name)}: not in the reference")
         for file in replaced:
             typer.echo(f"replaced    {reference / file.name}")
         agreeing = len(found.files) - len(failed) - len(replaced)

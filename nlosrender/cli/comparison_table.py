@@ -45,7 +45,7 @@ def check_line(file: CheckedFile) -> str:
     if file.report and not file.report["structure"]:
         numbers = f"relative L2 {_number(file.report['relative_l2'])}, energy {_signed(file.report['relative_energy'])}"
     reason = printable(file.message) if file.status != "ok" else ""
-    return f"{file.status:<11} {file.name}" + "".join(f": {text}" for text in (numbers, reason) if text)
+    return f"{file.status:<11} {printable(file.name)}" + "".join(f": {text}" for text in (numbers, reason) if text)
 
 
 def _totals(report: dict[str, Any]) -> Iterator[tuple[str, str]]:

@@ -83,6 +83,15 @@ def test_junit_of_a_name_that_xml_cannot_hold(tmp_path: Path) -> None:
     assert r"caf\udce9\x01.hdf5" in (tmp_path / "c.html").read_text()
 
 
+def test_each_capture_has_one_line(tmp_path: Path) -> None:
+    """Also one whose name has a line break, which would else read as a line of its own."""
+    write(tmp_path / "ref" / "a\nok b.hdf5")
+    for name in ("a\nok b.hdf5", "c\nok d.hdf5"):
+        write(tmp_path / "out" / name)
+    lines = [line for line in check(tmp_path).stdout.splitlines() if "hdf5" in line]
+    assert [line.partition(":")[0] for line in lines] == [r"ok          a\nok b.hdf5", r"extra       c\nok d.hdf5"]
+
+
 def test_page_loads_nothing_and_runs_nothing(folders: Path) -> None:
     """No tag comes from a file's name; pictures are in the page: three walls of each capture that differs."""
     done = check(folders, "--max-rel-l2", 0.05, "--html", "c.html")

@@ -12,9 +12,10 @@ import matplotlib.image
 import numpy as np
 import pytest
 from support.partial_captures import write_capture
-from support.point_captures import cells, points_header, write_points
+from support.point_captures import cells, points_header, write_light, write_points
 
 from nlosrender.analysis import laser_view as views
+from nlosrender.analysis.capture_table import summary_rows
 from nlosrender.analysis.plots import plot_capture
 from nlosrender.analysis.reconstruction.reconstruct import ReconstructionSettings, reconstruct_capture
 from nlosrender.analysis.summary import summarise
@@ -56,6 +57,16 @@ def test_summary_says_what_was_written(tmp_path: Path, header_of: Callable, writ
     # 7 bins of 3 mm from 0.7 m; 3 mm of light are 10.007 ps
     assert summary["end_opl"] == pytest.approx(0.721, rel=1e-12)
     assert summary["bin_width_ps"] == pytest.approx(10.006923, rel=1e-7)
+
+
+def test_points_without_extent_state_none(tmp_path: Path) -> None:
+    """A single laser point, and a camera's points in no plane, are not told to lie within 0 x 0 m."""
+    path = tmp_path / "a.hdf5"
+    write_light(path, points_header("single", cells(5, 3, 2.0, 1.6), bins=(0.0, 0.01, 7)), np.zeros((1, 1, 3, 5, 7)))
+    with h5py.File(path, "r+") as file:
+        file["laserGridSize"][...] = 0
+    rows = dict(summary_rows(summarise(path)))
+    assert (rows["sensor points"], rows["laser points"]) == ("5 x 3 over 2 x 1.6 m", "1 x 1")
 
 
 def test_summary_of_files_by_others(tmp_path: Path) -> None:
