@@ -293,6 +293,10 @@ def test_apertures_of_ytal(tmp_path: Path) -> None:
     lasers = points(config_of(tmp_path, text), "laser_grid")
     assert lasers[0, :, 0] == pytest.approx(0.25 + 1.2 * np.array([-0.75, -0.25, 0.25, 0.75]))
     assert lasers[:, 0, 1] == pytest.approx([-0.8, -0.4, 0.0, 0.4, 0.8])
+    found = config_of(tmp_path, text.replace("laser_aperture_end_x: 0.9", "laser_aperture_end_x: 0.5")).capture
+    x, y = np.meshgrid(3 * (np.array([0.15, 0.25, 0.35, 0.45]) - 0.5), [-0.8, -0.4, 0.0, 0.4, 0.8])
+    assert np.array(found.laser_points) == pytest.approx(np.stack([x, y], axis=-1).reshape(-1, 2))
+    assert found.laser_grid is None
 
 
 def test_shapes_of_ytal(tmp_path: Path) -> None:
@@ -447,14 +451,22 @@ def test_what_mitransient_means_otherwise_is_refused(
     assert re.search(f"{place}.*{message}", str(ConfigError(translation.issues)))
 
 
-def test_an_exhaustive_scan_of_a_fan_of_rays_is_refused(tmp_path: Path) -> None:
-    """Its laser points are no grid on the wall; nor are those of a laser grid that is not the sensors'."""
+def test_a_fan_of_rays_on_a_wall(tmp_path: Path) -> None:
+    """Its laser points are where the rays meet the wall, in their order; one that misses it is told."""
     kind = '<integer name="capture_type" value="3"/>'
-    fan = '<boolean name="force_equal_illumination_scanning" value="false"/>'
-    for extra, message in ((fan, "a fan of rays"), ("", "got 7, need film.width")):
-        text = XML.replace(INTEGRATOR, kind + extra + INTEGRATOR)
-        text = text if extra else text.replace("</film>", '<integer name="laser_scan_width" value="7"/></film>')
-        assert message in str(ConfigError(imported(tmp_path, text)[0].issues))
+    fan = '<boolean name="force_equal_illumination_scanning" value="false"/><float name="illumination_scan_fov" '
+    text = XML.replace('target="0.25, -0.5, 0"', 'target="0.5, 0, 0"')  # from 1 m, straight at the wall
+    text = text.replace("</film>", f"{SCANNED}</film>")
+    found = config_of(tmp_path, text.replace(INTEGRATOR, f'{kind}{fan}value="53.130102354"/>{INTEGRATOR}'))
+    expected = [[x, y] for y in (0.5, 0.0) for x in (0.0, 1 / 3, 2 / 3)]  # half a metre to each side, at i / N
+    assert np.array(found.capture.laser_points) == pytest.approx(np.array(expected), abs=1e-9)
+    _refused(
+        tmp_path, text.replace(INTEGRATOR, f'{kind}{fan}value="130"/>{INTEGRATOR}'), "rays of its fan miss the wall"
+    )
+    wide = XML.replace(INTEGRATOR, kind + INTEGRATOR)
+    _refused(
+        tmp_path, wide.replace("</film>", '<integer name="laser_scan_width" value="7"/></film>'), "got 7, need film.w"
+    )
 
 
 REFUSED_YAML = [
@@ -474,11 +486,7 @@ REFUSED_YAML = [
     ("{id: white}", "{id: custom, text: <bsdf type='velvet'/>}", "9:.*text: .*velvet.*is not supported"),
     ("  displacement_z: 1.0", "  displacement: 1.0", "8:.*displacement: unknown here"),
     ("relay_wall: wall", "relay_wall: hall", "15:13: relay_wall: is none of the names"),
-    (
-        "relay_wall: wall",
-        "relay_wall: wall\nscan_type: exhaustive\nlaser_aperture_end_x: 0.5",
-        "not centred on the wall",
-    ),
+    ("sensor_width: 3", "scan_type: exhaustive\nlaser_aperture_end_x: 1.5", "3:23: .*from 0 to 1.5, need 0 <= start"),
 ]
 
 

@@ -33,7 +33,7 @@ def test_y_tal_reads_the_export(tmp_path: Path, scan: str) -> None:
     """Samples, positions, time axis and whether it is confocal arrive as they are meant."""
     header = points_header(scan, cells(5, 4, 1.0, 0.8), bins=(0.7, 0.02, 260), legs=True)
     path = write_points(tmp_path / "x.hdf5", header, [(0.1, -0.2, 0.8)])
-    export_capture(path, tmp_path / "tal.hdf5", "tal", "3")
+    export_capture(path, tmp_path / "tal.hdf5", "tal", "3", legs="keep")
     environment = {"HOME": str(tmp_path), "PATH": os.environ.get("PATH", "")}
     command = [PEER, "-c", READ, tmp_path / "tal.hdf5", tmp_path / "found.npz"]
     run = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=120, check=False)

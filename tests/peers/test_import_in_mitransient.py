@@ -45,6 +45,11 @@ KEYS</integrator>
 </scene>
 """
 
+FAN = (
+    '<boolean name="exhaustive_scan" value="true"/><integer name="laser_scan_width" value="3"/>'
+    '<integer name="laser_scan_height" value="2"/><rfilter'
+)
+
 # a camera before a corner: wall and floor see each other, and a plate that it does not see
 CORNER = """<scene version="3.0.0">
 <integrator type="transient_nlos_path"><boolean name="nlos_laser_sampling" value="true"/>
@@ -77,20 +82,24 @@ def peer() -> Iterator[Peer]:
         '<integer name="max_depth" value="3"/><boolean name="account_first_and_last_bounces" value="true"/>',
         '<integer name="max_depth" value="-1"/><integer name="filter_bounces" value="2"/>',
         '<integer name="max_depth" value="3"/><string name="capture_type" value="Confocal"/>',
+        '<integer name="max_depth" value="3"/><string name="capture_type" value="Exhaustive"/>'
+        '<boolean name="force_equal_illumination_scanning" value="false"/>'
+        '<float name="illumination_scan_fov" value="40"/>',
     ],
-    ids=["third bounce with legs", "filter_bounces 2", "confocal"],
+    ids=["third bounce with legs", "filter_bounces 2", "confocal", "exhaustive, a fan of rays"],
 )
 def test_an_imported_scene_is_mitransients(peer: Peer, tmp_path: Path, keys: str) -> None:
     """Points, bins, legs and bounces are the same: H differs by noise, after one factor for each laser point."""
-    (tmp_path / "m.xml").write_text(XML.replace("KEYS", keys))
+    (tmp_path / "m.xml").write_text(XML.replace("KEYS", keys).replace("<rfilter", FAN if "fov" in keys else "<rfilter"))
     assert run(tmp_path, "import", "m.xml", "-o", "z.yaml").returncode == 0
     target = f"render.target_error={TARGET_ERROR}"
     assert run(tmp_path, "render", "z.yaml", "-o", "z.hdf5", "--set", target, "-q").returncode == 0
     with h5py.File(tmp_path / "z.hdf5") as file:
         data = file["data"][0].sum(axis=1)
-    ours = data.reshape(150, 4, 5).transpose(1, 2, 0)
+    ours = data.reshape(150, 4, 5, -1).transpose(3, 1, 2, 0)  # lasers, rows, columns, bins
     mean, noise = _theirs(peer, tmp_path, SAMPLES)
-    axis = -1 if "Confocal" in keys else None  # mitransient's energy depends on where the laser looks
+    mean = mean.reshape(4, 5, -1, 150).transpose(2, 0, 1, 3)
+    axis = -1 if "Confocal" in keys else (1, 2, 3)  # mitransient's energy depends on where the laser looks
     power = (ours**2).sum(axis=axis, keepdims=True)
     factor = (mean * ours).sum(axis=axis, keepdims=True) / np.where(power > 0, power, 1)
     difference, total = np.linalg.norm(mean - factor * ours), np.linalg.norm(mean)

@@ -53,7 +53,7 @@ def write_tal(path: Path, ordered: OrderedCapture, keep_legs: bool) -> list[str]
     path, ordered
         File and capture.
     keep_legs
-        Leave time as it is in the capture; else count it from the wall.
+        Leave time as it is in the capture; else count it from the wall. Without legs it is counted so.
 
     Raises
     ------
@@ -61,7 +61,7 @@ def write_tal(path: Path, ordered: OrderedCapture, keep_legs: bool) -> list[str]
         The disk refuses.
     """
     scan = ordered.scan
-    move = None if keep_legs else rectification(scan)
+    move = rectification(scan) if scan.legs_counted and not keep_legs else None
     lasers = (1, 1) if scan.confocal else scan.lasers.shape[:2]
     pairs = lasers != (1, 1)
     n_bins = scan.n_bins if move is None else move.n_bins
@@ -80,7 +80,7 @@ def write_tal(path: Path, ordered: OrderedCapture, keep_legs: bool) -> list[str]
         _write_grids(file, ordered)
         _write_enum(file, "volume_format", VolumeFormat.X_Y_Z_3)
         file["delta_t"] = scan.bin_width_opl
-        file["t_start"] = scan.start_opl if keep_legs else 0.0
+        file["t_start"] = scan.start_opl if move is None else 0.0
         file["t_accounts_first_and_last_bounces"] = scan.legs_counted and keep_legs
         file["scene_info"] = _scene_info(ordered.capture, scan)
     return [*_list_losses(ordered.capture), *_leg_losses(scan, move)]
@@ -100,7 +100,7 @@ def _leg_losses(scan: Scan, move: Rectification | None) -> list[str]:
         return [kept] if scan.legs_counted else []
     if move.is_identity:
         return []
-    what = "the legs laser -> wall and wall -> sensor are taken off" if scan.legs_counted else "time starts at the wall"
+    what = "the legs laser -> wall and wall -> sensor are taken off"
     return [f"{what}: histograms are moved, and blurred by up to a bin; --legs keep leaves time as it is"]
 
 

@@ -21,11 +21,15 @@ from nlosrender.files.importing.light_transport import (
     translate_film,
 )
 from nlosrender.files.importing.scan_geometry import matrix_of
-from nlosrender.files.importing.translation import Keys, Translation, plain, rounded
+from nlosrender.files.importing.translation import MAX_POINTS, Keys, Translation, plain, rounded
 from nlosrender.files.importing.xml_plugins import found_keys, place_in
 from nlosrender.scene.pose import Float64
 
 _SCANS = {1: "single", 2: "confocal", 3: "exhaustive"}
+FAN = (
+    *("integrator.force_equal_illumination_scanning", "integrator.illumination_scan_fov"),
+    *("film.laser_scan_width", "film.laser_scan_height"),
+)
 OF_PROJECTORS = {
     "emitter.fov": "the laser is a point here, as it is there with nlos_laser_sampling",
     **dict.fromkeys(
@@ -101,11 +105,11 @@ def translate_pixels(
 
 def _aim(keys: Keys, scan: str, to_world: Float64) -> bool:
     """Judge where the projector stands and looks; return whether its points are other ones than the pixels'."""
-    translation, equal = keys.translation, "integrator.force_equal_illumination_scanning"
+    translation, equal = keys.translation, FAN[0]
     position = rounded(to_world[:3, 3])
     place = keys.place("emitter.to_world" if "emitter.to_world" in keys else "emitter.type")
     translation.put("capture.laser_position", position, place)
-    sides = ("film.laser_scan_width", "film.laser_scan_height")
+    sides = FAN[2:]
     is_fan = scan == "exhaustive" and not keys.value(equal, True, bool)
     aim = ""
     if scan == "single":
@@ -113,23 +117,35 @@ def _aim(keys: Keys, scan: str, to_world: Float64) -> bool:
         translation.put("capture.laser_target", target, place)
         aim = f", capture.laser_target: {plain(target)}, on its axis"
     elif is_fan:
-        columns, rows = (keys.value(name, 0, int) for name in sides)
-        opening = math.tan(math.radians(keys.value("integrator.illumination_scan_fov", 20.0, float)) / 2)
-        u, v = np.meshgrid(np.arange(columns) / max(columns, 1), np.arange(rows) / max(rows, 1))
-        rays = np.stack([(1 - 2 * u) * opening, (1 - 2 * v) * opening, np.ones_like(u)], axis=-1).reshape(-1, 3)
-        targets = rounded(to_world[:3, 3] + rays @ to_world[:3, :3].T)
+        targets = rounded(to_world[:3, 3] + fan_of_rays(keys) @ to_world[:3, :3].T)
         translation.put("capture.laser_targets", targets, keys.place(equal))
-        for name in (equal, "integrator.illumination_scan_fov", *sides):
-            keys.change(name, f"capture.laser_targets: {len(targets)} rays of a fan, row by row from its upper left")
+        say_fan(keys, "capture.laser_targets", len(targets))
     elif scan == "exhaustive":
         for name, pixels, size in zip(sides, ("film.width", "film.height"), DEFAULT_FILM, strict=True):
             count = keys.value(pixels, size, int)
             if keys.value(name, count, int) != count:
                 keys.refuse(name, f"need {pixels} ({count}): laser points are the pixels' points")
     keys.drop_all(dict.fromkeys((equal, *sides), "laser points are the pixels' points"))
-    keys.drop("integrator.illumination_scan_fov", "of a fan of rays that is not used")
+    keys.drop(FAN[1], "of a fan of rays that is not used")
     keys.keep("emitter.to_world", f"capture.laser_position: {plain(position)}{aim}")
     return scan == "single" or is_fan
+
+
+def fan_of_rays(keys: Keys) -> Float64:
+    """Return the directions (n, 3) of a fan in the projector's frame, row by row from its upper left, at i / N."""
+    columns, rows = (keys.value(name, 0, int) for name in FAN[2:])
+    if min(columns, rows) < 1 or columns * rows > MAX_POINTS:
+        keys.refuse(FAN[2], f"a fan of {columns} x {rows} rays, need 1 to {MAX_POINTS} (and film.laser_scan_height)")
+        columns = rows = 1
+    opening = math.tan(math.radians(keys.value(FAN[1], 20.0, float)) / 2)
+    u, v = np.meshgrid(np.arange(columns) / max(columns, 1), np.arange(rows) / max(rows, 1))
+    return np.stack([(1 - 2 * u) * opening, (1 - 2 * v) * opening, np.ones_like(u)], axis=-1).reshape(-1, 3)
+
+
+def say_fan(keys: Keys, to: str, count: int) -> None:
+    """Report on the keys of a fan, which became ``count`` places."""
+    for name in FAN:
+        keys.change(name, f"{to}: {count} rays of a fan, row by row from its upper left")
 
 
 def _translate_picture(keys: Keys) -> None:

@@ -31,6 +31,10 @@ _DROPPED = {
     ),
 }
 _CROPS = ("film.crop_width", "film.crop_height", "film.crop_offset_x", "film.crop_offset_y")
+_CROPPED = (
+    "a part of a film is not read: mitransient 1.3 stretches it over the whole wall, and aims confocal lasers by the "
+    "whole film. Set width and height to what is measured"
+)
 _ENERGY = (
     "H is in J m^-2 sr^-1 per joule of pulse; mitransient's depends on where its projector looks: compare with one "
     "factor per laser point"
@@ -138,7 +142,7 @@ def translate_film(keys: Keys, default_bins: int) -> None:
         keys.take(name, to, keys.value(name, default, kind))
     for name in _CROPS:
         if name in keys:
-            keys.refuse(name, "a part of a film is not read; set width and height to what is measured")
+            keys.refuse(name, _CROPPED)
     blurred = keys.value("rfilter.type", "box", str) != "box"
     if blurred:
         keys.change("rfilter.type", "box: a point's light is its own here; there it spreads over its neighbours")

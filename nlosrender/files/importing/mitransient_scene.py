@@ -18,8 +18,11 @@ from nlosrender.config.mitsuba_xml import DEFAULT_FILM, read_mitsuba_xml
 from nlosrender.config.xml_expansion import Expansion
 from nlosrender.config.xml_shapes import placement, shape_parameters
 from nlosrender.files.importing.camera_scenes import (
+    FAN,
     OF_PROJECTORS,
+    fan_of_rays,
     refuse_other_emitters,
+    say_fan,
     scan_type,
     translate_pixels,
     translate_view,
@@ -189,14 +192,26 @@ class _NlosScene:
             self.pixels[key] = keys.value(name, size, int)
             keys.take(name, f"capture.sensor_grid.{key}", self.pixels[key])
             keys.drop(f"film.{axis}", "one point at a time there; original_film decides")
-            self._lasers(scan, f"film.laser_scan_{axis}", f"film.{axis}", key)
-        fan = "the points are where a fan of rays meets the wall, no grid of ours. Make it true, or give a laser_grid"
-        if scan == "exhaustive" and not keys.value("integrator.force_equal_illumination_scanning", True, bool):
-            keys.refuse("integrator.force_equal_illumination_scanning", fan)
-        keys.drop("integrator.force_equal_illumination_scanning", "laser points are the sensor points")
-        keys.drop("integrator.illumination_scan_fov", "of a fan of rays that is not used")
+            if not self._is_fan(scan):
+                self._lasers(scan, f"film.laser_scan_{axis}", f"film.{axis}", key)
+        if not self._is_fan(scan):
+            keys.drop_all(dict.fromkeys(FAN, "laser points are the sensor points"))
         keys.drop("film.exhaustive_scan", "capture_type decides")
         return str(scan)
+
+    def _is_fan(self, scan: str) -> bool:
+        """Return whether laser points are where a fan of rays meets the wall, no grid on it."""
+        return scan == "exhaustive" and not self.keys.value(FAN[0], True, bool)
+
+    def _fan(self, wall: FlatWall, matrix: Float64) -> None:
+        """Set the laser points to where a fan of rays meets the wall."""
+        keys = self.keys
+        points = [wall.hit(matrix[:3, 3], matrix[:3, :3] @ ray) for ray in fan_of_rays(keys)]
+        if None in points:
+            why = f"{points.count(None)} of the {len(points)} rays of its fan miss the wall; make the fan narrower"
+            keys.refuse(FAN[1] if FAN[1] in keys else FAN[0], why)
+        self.translation.put("capture.laser_points", points, keys.place(FAN[0]))
+        say_fan(keys, "capture.laser_points", len(points))
 
     def _lasers(self, scan: object, name: str, sensors: str, key: str) -> None:
         """Judge one side of the laser grid."""
@@ -226,6 +241,8 @@ class _NlosScene:
             )
             translation.line("default", "emitter.to_world", None, "changed", remark)
         aim = self._laser_point(wall, matrix, given) if scan == "single" and wall is not None else ""
+        if self._is_fan(scan) and wall is not None:
+            self._fan(wall, matrix)
         keys.keep("emitter.to_world", f"capture.laser_position: {plain(position)}{aim}")
         keys.drop_all(OF_PROJECTORS)
 

@@ -70,6 +70,14 @@ class FlatWall:
         width, height = self.size
         return [rounded((u - 0.5) * width * (-1 if self.is_mirrored else 1)), rounded((v - 0.5) * height)]
 
+    def cells(self, ranges: Sequence[tuple[float, float]], counts: tuple[int, int]) -> list[list[float]]:
+        """Return the cell centres of a part of the wall, from (u, v) ranges, row by row, as wall coordinates [m]."""
+        us, vs = (
+            [low + (index + 0.5) / count * (high - low) for index in range(count)]
+            for (low, high), count in zip(ranges, counts, strict=True)
+        )
+        return [self.at_uv(u, v) for v in vs for u in us]
+
     def hit(self, origin: Float64, direction: Float64) -> list[float] | None:
         """Return the wall coordinates (x, y) [m] that a ray meets; None where it misses the wall."""
         along = float(direction @ self.normal)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,7 +15,10 @@ from nlosrender.errors import KeyPath, ValidationIssue
 
 Verdict = Literal["taken", "changed", "dropped", "refused", "note"]
 _DIGITS = 12  # of what a float64 matrix product gives: -0.5, not -0.49999999999999994
+MAX_POINTS = 1_000_000  # of a list that is written out
 _SHOWN = 60  # characters of a value in the report
+_INTEGER = re.compile(r"[-+]?\d[\d_]*")
+_YAML_11 = {"yes": True, "on": True, "no": False, "off": False}
 _NEEDS: Mapping[type, str] = {bool: "true or false", float: "a finite number", int: "an integer", str: "text"}
 
 
@@ -257,3 +261,10 @@ def _is(kind: type, value: Any) -> bool:
     if kind is float:
         return isinstance(value, (int, float)) and math.isfinite(value)
     return isinstance(value, kind)
+
+
+def as_yaml_11(value: Any) -> Any:
+    """Return a scalar as YAML 1.1 reads it: 1_000_000 is a number, yes is true."""
+    if isinstance(value, str) and _INTEGER.fullmatch(value):
+        return int(value.replace("_", ""))
+    return _YAML_11.get(value.lower(), value) if isinstance(value, str) else value

@@ -5,7 +5,6 @@ y-tal writes a scene for mitransient from it: its settings are mitransient's und
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -16,7 +15,7 @@ from nlosrender.config.yaml_tree import Document
 from nlosrender.errors import KeyPath
 from nlosrender.files.importing.light_transport import say_samples, translate_bounces, translate_film
 from nlosrender.files.importing.scan_geometry import FlatWall, matrix_of, to_world_of
-from nlosrender.files.importing.translation import Found, Keys, Translation, plain, rounded
+from nlosrender.files.importing.translation import MAX_POINTS, Found, Keys, Translation, as_yaml_11, plain, rounded
 from nlosrender.files.importing.xml_plugins import plugin_of
 
 _INTEGRATOR = (
@@ -32,10 +31,8 @@ _NAMES = {
     "film.start_opl": "start_opl",
 }
 _POSITION = (-0.5, 0.0, 0.25)  # of laser and sensor where the file does not say
-_APERTURE = tuple(f"laser_aperture_{end}_{axis}" for axis in "xy" for end in ("start", "end"))
 _GRID = "y-tal states a grid of laser_width x laser_height in the aperture, which is taken"
-_DIGITS = re.compile(r"[-+]?\d[\d_]*")
-_YAML_11 = {"yes": True, "on": True, "no": False, "off": False}
+_CENTRED = 1e-9  # of the wall
 
 
 def translate_yaml(
@@ -63,7 +60,7 @@ class _YtalScene:
         self.keys = Keys(translation, self._found(document.tree, ()), _NAMES)
 
     def _found(self, mapping: Mapping[str, Any], path: KeyPath) -> dict[str, Found]:
-        return {key: Found(_as_yaml_11(value), self.document.place((*path, key))) for key, value in mapping.items()}
+        return {key: Found(as_yaml_11(value), self.document.place((*path, key))) for key, value in mapping.items()}
 
     def translate(self, laser: tuple[float, float] | None) -> None:
         """Judge everything."""
@@ -241,7 +238,7 @@ class _YtalScene:
         is_stepped = scan == "confocal" and not keys.value("simultaneous_scan", True, bool)
         if scan == "exhaustive" or is_stepped:
             self._aperture(wall, "laser_grid" if scan == "exhaustive" else "sensor_grid")
-        for name in _APERTURE:
+        for name in _ends("x") + _ends("y"):
             keys.drop(name, "the whole wall, as y-tal has it for this scan")
         if scan == "single" and wall is not None:
             self._laser_point(wall, list(sizes.values()), laser)
@@ -265,26 +262,36 @@ class _YtalScene:
             translation.line("default", "laser_lookat", "the middle", "taken", f"capture.laser_point: {plain(point)}")
 
     def _aperture(self, wall: FlatWall | None, grid: str) -> None:
-        """Set the extent of a grid from the part of the wall that the laser scans."""
+        """Set the part of the wall that the laser scans: the extent of a grid, or a list where it is not centred."""
         if wall is None:
             return
-        for axis, (key, size) in zip("xy", zip(("width", "height"), wall.size, strict=True), strict=True):
-            start, end = f"laser_aperture_start_{axis}", f"laser_aperture_end_{axis}"
-            low, high = self.keys.value(start, 0.0, float), self.keys.value(end, 1.0, float)
-            if not 0 <= low < high <= 1 or abs(low + high - 1) > 1e-9:
-                self.keys.refuse(
-                    start if start in self.keys else end,
-                    f"from {low:g} to {high:g} is not centred on the wall, as grids are here",
-                )
-                continue
-            if (low, high) != (0.0, 1.0):
-                self.translation.put(f"capture.{grid}.{key}", rounded((high - low) * size), self.keys.place(start))
-            for name in (start, end):
-                self.keys.change(name, f"capture.{grid}.{key}: {(high - low) * size:g}")
+        ranges, counts = [], self.translation.config["capture"][grid]
+        for axis in "xy":
+            names = _ends(axis)
+            low, high = (self.keys.value(name, default, float) for name, default in zip(names, (0.0, 1.0), strict=True))
+            if not 0 <= low < high <= 1:
+                name = next((name for name in names if name in self.keys), names[0])
+                self.keys.refuse(name, f"from {low:g} to {high:g}, need 0 <= start < end <= 1, shares of the wall")
+                return
+            ranges.append((low, high))
+        if all(abs(low + high - 1) < _CENTRED for low, high in ranges):
+            for axis, key, (low, high), size in zip("xy", ("width", "height"), ranges, wall.size, strict=True):
+                to, length, names = f"capture.{grid}.{key}", rounded((high - low) * size), _ends(axis)
+                if high - low < 1:
+                    self.translation.put(to, length, self.keys.place(names[0]))
+                for name in names:
+                    self.keys.change(name, f"{to}: {length:g}")
+            return
+        to, place = f"capture.{grid.replace('grid', 'points')}", self.keys.place(_ends("x")[0])
+        nx, ny = counts["nx"], counts["ny"]
+        if not 1 <= nx * ny <= MAX_POINTS:
+            self.translation.refuse(place, _ends("x")[0], nx * ny, f"a list of points has at most {MAX_POINTS}")
+            return
+        del self.translation.config["capture"][grid]
+        self.translation.put(to, wall.cells(ranges, (nx, ny)), place)
+        for name in _ends("x") + _ends("y"):
+            self.keys.change(name, f"{to}: the grid's points as a list, since its middle is not the wall's")
 
 
-def _as_yaml_11(value: Any) -> Any:
-    """Return a scalar as YAML 1.1 reads it: 1_000_000 is a number, yes is true."""
-    if isinstance(value, str) and _DIGITS.fullmatch(value):
-        return int(value.replace("_", ""))
-    return _YAML_11.get(value.lower(), value) if isinstance(value, str) else value
+def _ends(axis: str) -> list[str]:
+    return [f"laser_aperture_{end}_{axis}" for end in ("start", "end")]
