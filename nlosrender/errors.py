@@ -131,3 +131,9 @@ def nearest(name: str, known: Iterable[str]) -> str | None:
 
     matches = difflib.get_close_matches(name, list(known), n=1, cutoff=0.6)
     return matches[0] if matches else None
+
+
+def did_you_mean(value: object, known: Iterable[str]) -> str:
+    """Return the question after the nearest known name; empty where none is near."""
+    close = nearest(value, known) if isinstance(value, str) else None
+    return f"Did you mean {close}?" if close else ""

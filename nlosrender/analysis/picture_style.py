@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 from nlosrender.analysis.drawn_picture import DOTS_PER_INCH
 from nlosrender.analysis.theme import THEMES, Theme
-from nlosrender.errors import OptionError, nearest
+from nlosrender.errors import OptionError, did_you_mean
 
 USUAL_SIZE = (14.0, 7.6)  # inches: five frames fit beside each other
 SMALLEST, LARGEST = (6.5, 3.6), 60.0  # inches: below, the text of the panels overlaps; a poster
@@ -33,9 +33,8 @@ class PictureStyle:
 
     def __post_init__(self) -> None:
         if self.theme not in THEMES:
-            close = nearest(self.theme, THEMES)
-            hint = f" Did you mean {close}?" if close else ""
-            raise OptionError(f"--theme: got {self.theme!r}, need one of {', '.join(THEMES)}.{hint}")
+            hint = did_you_mean(self.theme, THEMES)
+            raise OptionError(f"--theme: got {self.theme!r}, need one of {', '.join(THEMES)}. {hint}".rstrip())
         if not all(least <= side <= LARGEST for side, least in zip(self.size, SMALLEST, strict=True)):
             width, height = self.size
             least = " x ".join(f"{side:g}" for side in SMALLEST)

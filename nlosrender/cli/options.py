@@ -76,11 +76,10 @@ def one_of(name: str, known: Iterable[str], option: str, remark: str = "") -> st
     BadParameter
         It is not one of ``known``; ``remark`` is added to the message.
     """
-    from nlosrender.errors import nearest
+    from nlosrender.errors import did_you_mean
 
     names = list(known)
     if name not in names:
-        close = nearest(name, names)
-        hint = f" Did you mean {close}?" if close else ""
-        raise typer.BadParameter(f"got {name!r}, need one of {', '.join(names)}.{hint}{remark}", param_hint=option)
+        needed = f"got {name!r}, need one of {', '.join(names)}. {did_you_mean(name, names)}".rstrip()
+        raise typer.BadParameter(f"{needed}{remark}", param_hint=option)
     return name

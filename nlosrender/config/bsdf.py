@@ -24,9 +24,9 @@ from nlosrender.config.bsdf_table import (
 )
 from nlosrender.config.fields import as_finite, finite_numbers
 from nlosrender.config.frozen import FrozenDict
-from nlosrender.config.issues import did_you_mean, shown
+from nlosrender.config.issues import shown
 from nlosrender.config.plugin_check import TRANSFORM_KEYS, PluginCheck, plugin_mapping
-from nlosrender.errors import KeyPath
+from nlosrender.errors import KeyPath, did_you_mean
 
 _NAMES = {  # known ones only: Mitsuba makes a file name of a metal's
     Kind.MATERIAL: (NO_METAL, *METALS),

@@ -9,7 +9,7 @@ import re
 from dataclasses import dataclass
 from pathlib import Path
 
-from nlosrender.errors import OptionError, nearest
+from nlosrender.errors import OptionError, did_you_mean
 
 FOLDER = Path(__file__).parents[1] / "examples"
 _FILES = re.compile(r"(?:\.\./scenes/)?[\w*-]+\.(?:csv|ply|xml)\b")
@@ -37,9 +37,9 @@ def read_example(name: str, file: str = "capture.yaml") -> Example:
         There is no such example.
     """
     if name not in example_names():
-        close = nearest(name, example_names())
-        hint = f" Did you mean {close}?" if close else ""
-        raise OptionError(f"--example: got {name!r}, need one of {', '.join(example_names())}.{hint}")
+        known = example_names()
+        hint = did_you_mean(name, known)
+        raise OptionError(f"--example: got {name!r}, need one of {', '.join(known)}. {hint}".rstrip())
     configs = FOLDER / "configs"
     text = (configs / f"{name}.yaml").read_text(encoding="utf-8")
     files = {path for pattern in _FILES.findall(text) for path in configs.glob(pattern)}

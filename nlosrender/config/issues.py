@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-from nlosrender.errors import ValidationIssue, nearest
+from nlosrender.errors import ValidationIssue
 
 _MAX_SHOWN = 60  # characters of a wrong value that still help
 
@@ -60,12 +60,6 @@ def one_of(names: Iterable[str]) -> str:
     """Return what is needed where one of a few names is."""
     known = list(names)
     return known[0] if len(known) == 1 else f"one of {', '.join(known)}"
-
-
-def did_you_mean(value: object, known: Iterable[str]) -> str:
-    """Return the question after the nearest known name; empty where none is near."""
-    close = nearest(value, known) if isinstance(value, str) else None
-    return f"Did you mean {close}?" if close else ""
 
 
 def shown(value: object) -> str:

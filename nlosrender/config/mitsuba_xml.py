@@ -27,14 +27,14 @@ from nlosrender.config.bsdf_table import (
     TEXTURE_TYPES,
 )
 from nlosrender.config.fields import Checked
-from nlosrender.config.issues import InvalidValue, did_you_mean, invalid_value
+from nlosrender.config.issues import InvalidValue, invalid_value
 from nlosrender.config.plugin_check import config_folder, existing_file, mitsuba_file
 from nlosrender.config.xml_expansion import LEFT_OUT, START, Expansion
 from nlosrender.config.xml_numbers import check_numbers
 from nlosrender.config.xml_shapes import check_xml_bsdf, check_xml_shape
 from nlosrender.config.xml_transforms import check_rotation
 from nlosrender.config.xml_tree import SceneElement, parsed_xml, prefixed_with_place
-from nlosrender.errors import ValidationIssue
+from nlosrender.errors import ValidationIssue, did_you_mean
 
 DEFAULT_FILM = (768, 576)  # Mitsuba's
 _PLUGINS = {  # element: the types it may have

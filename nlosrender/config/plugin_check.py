@@ -12,9 +12,9 @@ from pydantic import ValidationInfo
 from nlosrender.config.encodable import is_encodable
 from nlosrender.config.fields import MAX_LENGTH, Checked, as_finite, finite_numbers
 from nlosrender.config.frozen import freeze
-from nlosrender.config.issues import InvalidValue, did_you_mean, mismatch, shown
+from nlosrender.config.issues import InvalidValue, mismatch, shown
 from nlosrender.config.vectors import cross, dot
-from nlosrender.errors import KeyPath, ValidationIssue, nearest
+from nlosrender.errors import KeyPath, ValidationIssue, did_you_mean, nearest
 
 TRANSFORM_KEYS = ("to_world", "to_uv")
 _OPERATIONS = "translate: [x, y, z], rotate: {axis: [x, y, z], angle_deg: a}, scale: s or [x, y, z]"

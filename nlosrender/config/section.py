@@ -20,9 +20,9 @@ from pydantic import (
 )
 from pydantic_core import CoreSchema, core_schema
 
-from nlosrender.config.issues import Wrong, WrongValueRead, did_you_mean, one_of, shown, wrong_value
+from nlosrender.config.issues import Wrong, WrongValueRead, one_of, shown, wrong_value
 from nlosrender.config.vectors import parallel
-from nlosrender.errors import KeyPath, ValidationIssue
+from nlosrender.errors import KeyPath, ValidationIssue, did_you_mean
 
 
 class Section(BaseModel):

@@ -30,12 +30,12 @@ from nlosrender.config.fields import (
     finite_numbers,
     integer,
 )
-from nlosrender.config.issues import Wrong, did_you_mean, invalid_value, mismatch, shown
+from nlosrender.config.issues import Wrong, invalid_value, mismatch, shown
 from nlosrender.config.plugin_check import config_folder
 from nlosrender.config.section import ONE_OF, Section
 from nlosrender.config.yaml_tree import read_document
 from nlosrender.constants import SPEED_OF_LIGHT
-from nlosrender.errors import ConfigError, ValidationIssue
+from nlosrender.errors import ConfigError, ValidationIssue, did_you_mean
 
 PROFILES = Path(__file__).parent.parent / "sensor" / "profiles"
 MAX_PULSES, MAX_BINS = 10**12, 2**24  # a day at 11 MHz; beyond them they are slips of the pen

@@ -7,8 +7,8 @@ sampling it adds none. So ``filter_bounces`` (``filter_depth`` - 1) of 3 is not 
 
 from __future__ import annotations
 
-from nlosrender.config.issues import did_you_mean
 from nlosrender.config.render import DEFAULT_TARGET_ERROR
+from nlosrender.errors import did_you_mean
 from nlosrender.files.importing.translation import Keys
 
 _NOISE = "how paths are found: it changes the noise, not the result"

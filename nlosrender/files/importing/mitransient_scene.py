@@ -13,10 +13,10 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from nlosrender.config.issues import did_you_mean
 from nlosrender.config.mitsuba_xml import DEFAULT_FILM, read_mitsuba_xml
 from nlosrender.config.xml_expansion import Expansion
 from nlosrender.config.xml_shapes import placement, shape_parameters
+from nlosrender.errors import did_you_mean
 from nlosrender.files.importing.camera_scenes import (
     FAN,
     OF_PROJECTORS,

@@ -10,8 +10,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
-from nlosrender.config.issues import did_you_mean, shown
-from nlosrender.errors import KeyPath, ValidationIssue
+from nlosrender.config.issues import shown
+from nlosrender.errors import KeyPath, ValidationIssue, did_you_mean
 
 Verdict = Literal["taken", "changed", "dropped", "refused", "note"]
 _DIGITS = 12  # of what a float64 matrix product gives: -0.5, not -0.49999999999999994
