@@ -12,10 +12,8 @@ from nlosrender.analysis.laser_view import (
     FRAME_SHARES,
     Float64,
     LaserView,
-    frame_bins,
     list_on_wall,
-    lit_window,
-    wall_frames,
+    moments,
 )
 from nlosrender.analysis.theme import COLORMAP, DARK, FRAME_MARK, Theme, color_bar, power_of_ten, style
 from nlosrender.capture.bounces import LINE_OF_SIGHT
@@ -80,20 +78,16 @@ class Frame:
 def _frames(capture: StoredCapture, view: LaserView, shared_scale: bool) -> tuple[list[Frame], str]:
     """Return the moments, and the label of the scale that they share."""
     header = capture.header
-    first, last = lit_window(view.time)
-    half = (last - first) // 400  # a single bin is mostly noise where bins are many
-    bins = frame_bins(view.time)
-    light = wall_frames(capture, view.laser, [slice(max(index - half, 0), index + half + 1) for index in bins])
-    shared = max(float(light.max()), 0.0) if shared_scale else 0.0
+    found = moments(capture, view)
+    shared = max(float(found.light.max()), 0.0) if shared_scale else 0.0
     factor, power = power_of_ten(shared)
     frames = []
     if header.has_pixels:  # of all bins: on its scale the moments would be black
         frames.append(_own_scale("sum over time", view.wall))
-    for index, moment in zip(bins, light, strict=True):
-        opl = header.start_opl + (index + 0.5) * header.bin_width_opl
+    for opl, moment in zip(found.opl, found.light, strict=True):
         title = f"{opl:.3f} m   {opl_to_seconds(opl) * 1e9:.2f} ns"
         frames.append(Frame(title, moment / factor, shared / factor) if shared_scale else _own_scale(title, moment))
-    return frames, per_bin(header, power, 2 * half + 1)
+    return frames, per_bin(header, power, found.n_bins)
 
 
 def _own_scale(title: str, light: Float64) -> Frame:

@@ -169,6 +169,24 @@ def dotted(points: Float64 | None, values: Float64, empty: float = np.nan) -> Fl
     return picture
 
 
+@dataclass(frozen=True, eq=False)
+class Moments:
+    """The wall at the bins of ``frame_bins``, and a few bins around each where there are very many."""
+
+    light: Float64  # (moment, Ny, Nx)
+    opl: Float64  # (moment,) m, in the middle
+    n_bins: int  # that are summed, away from the ends of the time axis
+
+
+def moments(capture: StoredCapture, view: LaserView) -> Moments:
+    """Return the wall at a few moments of a laser point; errors as of ``wall_frames``."""
+    first, last = lit_window(view.time)
+    half = (last - first) // 400  # a single bin is mostly noise where bins are many
+    bins = frame_bins(view.time)
+    light = wall_frames(capture, view.laser, [slice(max(index - half, 0), index + half + 1) for index in bins])
+    return Moments(light, capture.header.bin_centres()[bins], 2 * half + 1)
+
+
 def frame_bins(time: Float64) -> list[int]:
     """Return the bins at which ``FRAME_SHARES`` of the light in ``time`` (bin,) have arrived, each once."""
     return sorted({_bin_of_share(time, share) for share in FRAME_SHARES})

@@ -57,7 +57,7 @@ def named_samples(
     dims = [*layout.MEMORY_AXES[:-1], "time"]
     if header.confocal:
         block, dims = block[:, :, 0, 0], [dim for dim in dims if not dim.startswith("laser")]
-    opl = header.start_opl + (np.arange(header.n_bins) + 0.5) * header.bin_width_opl
+    opl = header.bin_centres()
     coordinates: dict[str, Any] = {"time": ("time", opl / SPEED_OF_LIGHT, {"units": "s"})}
     coordinates["opl"] = ("time", opl, METRES | {"long_name": "optical path length"})
     if header.split_bounces is not False:

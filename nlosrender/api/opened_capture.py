@@ -82,9 +82,7 @@ class Capture:
 
     def opl(self) -> NDArray[np.float64]:
         """Return the optical path length in the middle of each bin, (bin,) [m]."""
-        header = self.header
-        middles: NDArray[np.float64] = np.arange(header.n_bins, dtype=np.float64) + 0.5
-        return header.start_opl + middles * header.bin_width_opl
+        return self.header.bin_centres()
 
     def time(self) -> NDArray[np.float64]:
         """Return the time in the middle of each bin, (bin,) [s]: ``opl`` over the speed of light."""

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from nlosrender.errors import ConfigError
 
@@ -42,6 +43,12 @@ class TimeAxis:
     def end_opl(self) -> float:
         """OPL at the end of the last bin [m]."""
         return self.start_opl + self.n_bins * self.bin_width_opl
+
+
+def bin_centres(start_opl: float, bin_width_opl: float, n_bins: int) -> NDArray[np.float64]:
+    """Return the optical path length in the middle of every bin, (bin,) [m]."""
+    middles: NDArray[np.float64] = np.arange(n_bins, dtype=np.float64) + 0.5
+    return start_opl + middles * bin_width_opl
 
 
 def resolve_time_axis(time_axis_config: TimeAxisConfig, latest_opl: float) -> TimeAxis:

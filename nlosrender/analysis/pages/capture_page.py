@@ -14,13 +14,12 @@ from nlosrender.analysis.capture_table import summary_rows
 from nlosrender.analysis.laser_view import (
     LaserView,
     dotted,
-    frame_bins,
     laser_view,
     list_on_wall,
     lit_window,
+    moments,
     point_histograms,
     row_over_time,
-    wall_frames,
 )
 from nlosrender.analysis.pages.html_page import Float64, colored, curve, write_page
 from nlosrender.analysis.summary import summarise
@@ -119,16 +118,9 @@ def _pictures(capture: StoredCapture) -> dict[str, Any]:
 
 def _frames(capture: StoredCapture, view: LaserView) -> list[dict[str, str]]:
     """Return the wall as all of time sums up, then at a few moments, each on its own scale."""
-    header = capture.header
-    first, last = lit_window(view.time)
-    half = (last - first) // 400  # a single bin is mostly noise where bins are many
-    bins = frame_bins(view.time)
-    windows = [slice(max(index - half, 0), index + half + 1) for index in bins]
-    captions = ["all bins"]
-    for index in bins:
-        opl = header.start_opl + (index + 0.5) * header.bin_width_opl
-        captions.append(f"{opl:.3f} m, {_ns(opl)} ns")
-    shown = [view.wall, *wall_frames(capture, view.laser, windows)]
+    found = moments(capture, view)
+    captions = ["all bins", *(f"{opl:.3f} m, {_ns(opl)} ns" for opl in found.opl)]
+    shown = [view.wall, *found.light]
     tops = [max(float(frame.max()), 0.0) for frame in shown]
     points = list_on_wall(capture)
     return [

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nlosrender.capture.bounces import LINE_OF_SIGHT
+from nlosrender.capture.time_axis import bin_centres
 from nlosrender.errors import FileError
 from nlosrender.files.layout import ZNLOS_FROM_LOCAL, Float64
 from nlosrender.files.reading.reader import StoredCapture, finite
@@ -59,7 +60,7 @@ class Scan:
 
     def bin_centres(self) -> Float64:
         """Return the optical path length in the middle of every bin, (bin,) [m]."""
-        return self.start_opl + (np.arange(self.n_bins, dtype=np.float64) + 0.5) * self.bin_width_opl
+        return bin_centres(self.start_opl, self.bin_width_opl, self.n_bins)
 
 
 def read_scan(capture: StoredCapture) -> Scan:

@@ -20,6 +20,7 @@ from nlosrender.capture.bounces import (
     BounceAxis,
     first_bounce_of,
 )
+from nlosrender.capture.time_axis import bin_centres
 from nlosrender.errors import FileError
 from nlosrender.files import layout
 from nlosrender.files.attributes import get_attributes
@@ -90,6 +91,10 @@ class StoredHeader:
         """Rows and columns of the laser grid; a confocal capture has its sensor grid here."""
         return self.sensor_grid if self.confocal else (self.sizes["laser_y"], self.sizes["laser_x"])
 
+    def bin_centres(self) -> NDArray[np.float64]:
+        """Return the optical path length in the middle of every bin, (bin,) [m]."""
+        return bin_centres(self.start_opl, self.bin_width_opl, self.n_bins)
+
     def is_list(self, name: str = "sensor") -> bool:
         """Whether ``sensor`` or ``laser`` points are a list, in one row, and not a grid."""
         return name in str(self.attributes.get(layout.POINT_LISTS, "")).split()
@@ -103,6 +108,11 @@ class StoredHeader:
     def has_pixels(self) -> bool:
         """Whether rows and columns are those of a camera's picture, not of a grid on a wall."""
         return self.scan_type == LINE_OF_SIGHT or layout.EMPTY_POINTS in self.attributes
+
+    @property
+    def whose_points(self) -> str:
+        """Whose the sensor points are where they have no cells: ``a list``, ``a camera``; empty: a grid's."""
+        return "a list" if self.is_list() else "a camera" if self.has_pixels else ""
 
     @property
     def is_multiplexed(self) -> bool:
