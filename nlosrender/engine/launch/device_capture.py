@@ -26,7 +26,7 @@ from nlosrender.engine.launch.second_bounce import deposit_second_bounce
 from nlosrender.engine.launch.sensor_footprint import SensorFootprint
 from nlosrender.engine.launch.surface_sampler import SurfaceSampler
 from nlosrender.engine.launch.time_gate import CaptureTimeGate, light_leaves_window
-from nlosrender.engine.launch.wall_points import laser_points, sensor_points
+from nlosrender.engine.launch.wall_points import RectanglePoints, laser_points, sensor_points
 
 if TYPE_CHECKING:
     from nlosrender.capture.bounces import BounceAxis
@@ -76,9 +76,11 @@ class DeviceCapture:
     @cached_property
     def footprint(self) -> SensorFootprint | None:
         """The area that sensor points stand for; None: they are points."""
-        if self.capture.footprint is None:
+        capture, built = self.capture, self.built
+        if capture.footprint is None:
             return None
-        return SensorFootprint(self.built, self.capture, self.time_axis, self.options.seed)
+        wall = RectanglePoints(built, capture, self.time_axis, capture.sensor_position)
+        return SensorFootprint(capture.footprint, wall, built.metres_per_engine_unit, self.options.seed)
 
     @cached_property
     def capture_gate(self) -> CaptureTimeGate | None:

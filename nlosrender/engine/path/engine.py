@@ -115,9 +115,8 @@ class PathEngine:
     @cached_property
     def hidden_aabb(self) -> HiddenAabb | None:
         """Box around the hidden geometry; None where few rays from the wall miss it, or all are sent to points."""
-        if (
-            self.p_hidden_sampling > 0 or self.capture.footprint is not None
-        ):  # places that miss it would start more paths
+        # with a footprint, places that see less of the box would start more paths: a bias
+        if self.p_hidden_sampling > 0 or self.capture.footprint is not None:
             return None
         return box_often_missed(self.device, self.tuning)
 
@@ -216,7 +215,7 @@ class PathEngine:
             "hidden_aabb": self.hidden_aabb,
             "continuation_period": dr.opaque(mi.UInt32, period),
             "mirrors": self.mirrors,
-            "flash": None if not self.settings.flashes else LaserFlash(self.built, self.capture, self.time_axis),
+            "flash": LaserFlash.of(self.built, self.capture, self.time_axis),
             "mirrors_per_vertex": dr.opaque(mi.UInt32, self.tuning.mirrors_per_vertex),
         }
         return PathParams(**vars(params), **own)

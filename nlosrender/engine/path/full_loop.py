@@ -182,7 +182,7 @@ def trace_paths(
         if dr.hint(q > 0, mode="scalar"):
             sample = sampler.sample(numbers.bits_u, numbers.v, has_target)
             dark = has_target & turns_away(params, sample, vertex.p)
-            # with a footprint they would favour the places that see most dark points
+            # with a footprint, places that see more dark points would start more paths: a bias
             may_skip = q == 1 and sampler.dark_behind and not settings.mirrors_spot and params.footprint is None
             if dr.hint(may_skip, mode="scalar"):
                 starts, sample, dark = _begin_until_lit(
