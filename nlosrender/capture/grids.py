@@ -260,8 +260,8 @@ def _capture_of_pixels(capture_config: CaptureConfig, wall: RelayWall, pixels: P
     if capture_config.scan_type == "confocal":
         laser_grid = sensor_grid
     laser, eye = (wall.pose.to_local(pixels.frame.to_scene(at)) for at in (pixels.laser, pixels.sensors.origin))
-    n_unlit = int((~pixels.lasers.is_reached & ~pixels.lasers.is_empty).sum())
-    return replace(_capture(capture_config, sensor_grid, laser_grid, laser, eye), n_unlit_lasers=n_unlit)
+    capture = _capture(capture_config, sensor_grid, laser_grid, laser, eye)
+    return replace(capture, n_unlit_lasers=pixels.lasers.n_hidden)
 
 
 def _extent(xy: Float64) -> tuple[float, float]:

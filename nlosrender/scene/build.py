@@ -10,10 +10,12 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import TypeVar
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from numpy.typing import NDArray
 
 from nlosrender.errors import ConfigError
 from nlosrender.scene.bounding_box import Bounds, box_corners, joined_bounds
@@ -32,6 +34,7 @@ from nlosrender.scene.walls.wall import RelayWall
 
 MAX_REACH = 1e5  # hidden geometry over the wall's size: float32 then resolves 1 % of the wall
 MIN_EXTENT = 1e-12  # hidden geometry over the wall's size: the squares of areas stay numbers in float32
+Value = TypeVar("Value", np.float32, np.bool_)
 EXACT_PLUGINS = ("Rectangle", "Disk", *ROUND_PLUGINS)  # intersections in closed form, as those of meshes
 
 
@@ -76,11 +79,15 @@ class BuiltScene(EngineScene):
     @cached_property
     def curvatures(self) -> mi.Float:
         """``curvature_of_shapes`` on the device; index = registry of shapes."""
-        registry = np.array(dr.reinterpret_array(mi.UInt32, self.scene.shapes_dr()))
-        values = np.zeros(int(registry.max(initial=0)) + 1, np.float32)
-        values[registry] = self.curvature_of_shapes
-        table = mi.Float(values)
+        table = mi.Float(self._by_registry(self.curvature_of_shapes.astype(np.float32)))
         dr.eval(table)
+        return table
+
+    def _by_registry(self, values: NDArray[Value]) -> NDArray[Value]:
+        """Return values (shapes,), in the scene's order, by the index of each shape in Dr.Jit's registry; else 0."""
+        registry = np.array(dr.reinterpret_array(mi.UInt32, self.scene.shapes_dr()))
+        table = np.zeros(int(registry.max(initial=0)) + 1, values.dtype)
+        table[registry] = values
         return table
 
     @property
@@ -136,10 +143,8 @@ class SceneWithoutWall(BuiltScene):
 
     @cached_property
     def _is_wall(self) -> mi.Bool:
-        registry = np.array(dr.reinterpret_array(mi.UInt32, self.scene.shapes_dr()))
-        values = np.zeros(int(registry.max(initial=0)) + 1, bool)
-        values[registry[sorted(self._walls)]] = True
-        table = mi.Bool(values)
+        is_wall = np.array([number in self._walls for number in range(len(self.scene.shapes()))])
+        table = mi.Bool(self._by_registry(is_wall))
         dr.eval(table)
         return table
 

@@ -32,6 +32,11 @@ class FirstHits:
         """Which rays meet nothing."""
         return np.asarray(self.shapes == NO_SHAPE)
 
+    @property
+    def n_hidden(self) -> int:
+        """Number of rays that are aimed at a surface and do not get there."""
+        return int((~self.is_reached & ~self.is_empty).sum())
+
 
 @dataclass(frozen=True, eq=False)
 class PixelPoints:

@@ -76,7 +76,7 @@ def _pixel_warnings(built: BuiltScene) -> Iterator[str]:
     """Yield how many pixels of a camera see nothing, and how many of their points the laser does not light."""
     if built.pixels is None:
         return
-    sensors, is_lit = built.pixels.sensors, built.pixels.lasers.is_reached
+    sensors, lasers = built.pixels.sensors, built.pixels.lasers
     is_empty = sensors.is_empty
     shapes = built.scene.shapes() if isinstance(built, SceneWithoutWall) else []
     one_sided = [not shape.bsdf().flags() & TWO_SIDED for shape in shapes] or [False]
@@ -85,9 +85,9 @@ def _pixel_warnings(built: BuiltScene) -> Iterator[str]:
         yield f"{from_behind} of {is_empty.size} pixels see a surface from behind, where its BSDF is black."
     if is_empty.any():
         yield f"{int(is_empty.sum())} of {is_empty.size} pixels see no surface: they stay empty, H is zero there."
-    unlit = int((~is_lit & ~built.pixels.lasers.is_empty).sum())
-    if unlit:
-        yield f"{unlit} of {is_lit.size} laser points are hidden from the laser: H is zero there. Move laser_position."
+    if unlit := lasers.n_hidden:
+        n_lasers = lasers.shapes.size
+        yield f"{unlit} of {n_lasers} laser points are hidden from the laser: H is zero there. Move laser_position."
 
 
 def dark_surface_warnings(built: BuiltScene, capture: Capture, max_bounces: int | None) -> Iterator[str]:
