@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from nlosrender.errors import FileError
 from nlosrender.files.partial.journal import JOURNAL, is_in_use, read_records
@@ -13,7 +13,7 @@ from nlosrender.files.partial.work_item_log import JournalState
 from nlosrender.files.reading.reader import explained_read
 
 STALE_SECONDS = 900.0  # without a byte written: states of work items in flight come every minute or so
-RUNNING, STALE, STOPPED = "running", "stale", "stopped"
+UnfinishedState = Literal["running", "stale", "stopped"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,11 +25,11 @@ class Unfinished:
     in_use: bool | None  # whether a process has it open; None: the file system does not say
     silent_seconds: float  # since anything was written
 
-    def state(self, stale_after: float = STALE_SECONDS) -> str:
+    def state(self, stale_after: float = STALE_SECONDS) -> UnfinishedState:
         """Return ``running``, ``stopped``, or ``stale``: a process has it open, or may have, but writes nothing."""
         if self.in_use is False:
-            return STOPPED
-        return STALE if self.silent_seconds > stale_after else RUNNING
+            return "stopped"
+        return "stale" if self.silent_seconds > stale_after else "running"
 
     @property
     def finished_units(self) -> int:

@@ -10,19 +10,18 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
-from nlosrender.analysis.partial_summary import is_unfinished, read_unfinished
+from nlosrender.analysis.partial_summary import UnfinishedState, is_unfinished, read_unfinished
 from nlosrender.capture.part import WHOLE
 from nlosrender.config.canonical import tree_hash
 from nlosrender.errors import FileError
 from nlosrender.files.atomic_write import partial_folder
 from nlosrender.files.dataset_index import has_index, read_index
-from nlosrender.files.file_kinds import is_derived
+from nlosrender.files.file_kinds import CAPTURE_SUFFIXES, is_derived
 from nlosrender.files.identity import SELECTION
 from nlosrender.files.reading.reader import read_header
 
-State = Literal["done", "running", "stale", "stopped", "failed", "pending"]
+State = Literal[UnfinishedState, "done", "failed", "pending"]
 STATES: tuple[State, ...] = ("running", "stale", "stopped", "failed", "pending", "done")  # in the order of a table
-SUFFIXES = (".hdf5", ".h5")
 _PARTIAL = re.compile(r"\.(.+)\.partial")
 _SHARD = re.compile(r"--shard (\d+)/(\d+)")
 
@@ -89,7 +88,7 @@ def _in_folder(folder: Path, stale_after: float) -> Iterator[RenderStatus]:
     for parent, folders, files in os.walk(folder, onerror=refuse):
         partials = {match[1] for name in folders if (match := _PARTIAL.fullmatch(name))}
         folders[:] = sorted(name for name in folders if not name.startswith("."))
-        captures = {name for name in files if name.endswith(SUFFIXES) and not name.startswith(".")}
+        captures = {name for name in files if name.endswith(CAPTURE_SUFFIXES) and not name.startswith(".")}
         for status in (_status(Path(parent) / name, stale_after) for name in sorted(captures | partials)):
             if status.state != "failed" or not is_derived(Path(status.file)):
                 yield status
@@ -142,7 +141,7 @@ def _unfinished(path: Path, folder: Path, stale_after: float) -> RenderStatus:
     state = found.state(stale_after)
     status = RenderStatus(
         str(path),
-        next(known for known in STATES if known == state),
+        state,
         finished_units=found.finished_units,
         units=found.units,
         seconds_left=found.seconds_left if state == "running" else None,

@@ -21,6 +21,7 @@ from nlosrender.files.identity import SELECTION, comparable_config, differences,
 from nlosrender.files.parts.shards import PART
 from nlosrender.files.reading.reader import open_hdf5
 
+CAPTURE_SUFFIXES = (".hdf5", ".h5")  # of the names that are looked at in folders
 START_BYTES = 16_384  # of a file, in which its kind is looked for: the longest start is that of an SVG with comments
 
 

@@ -329,8 +329,8 @@ class _Measurement:
             seen = header.footprint
             if seen is not None:
                 area = seen[1]
-            elif config.footprint_area is None and (area <= 0 or header.is_list() or header.has_pixels):
-                whose = "a list" if header.is_list() else "a camera" if header.has_pixels else ""
+            elif config.footprint_area is None and (area <= 0 or header.whose_points):
+                whose = header.whose_points
                 lacks = f"points of {whose} have no cells" if whose else "the sensor grid has no size"
                 raise ConfigError.at("sensor.footprint_area", f"missing: {lacks}, so give the area that is seen [m^2].")
             return physical_scale(config, area)
@@ -389,8 +389,7 @@ def _refuse(header: StoredHeader, config: SensorConfig, corrections: tuple[str, 
         )
     for key, message in () if counts else misfits(config, header.scan_type):
         raise ConfigError.at(f"sensor.{key}", message)
-    if config.zones is not None and not counts and (header.is_list() or header.has_pixels):
-        whose = "a list" if header.is_list() else "a camera"
+    if config.zones is not None and not counts and (whose := header.whose_points):
         message = f"add up the cells of a grid, and points of {whose} have none; need capture.sensor_grid, or no zones."
         raise ConfigError.at("sensor.zones", message)
 

@@ -15,9 +15,7 @@ from nlosrender.analysis.comparison.report import comparison_report
 from nlosrender.analysis.comparison.tolerance_rules import ToleranceRule, refuse_idle_rules, tolerances_of
 from nlosrender.errors import FileError
 from nlosrender.files.atomic_write import check_writable, replacing
-from nlosrender.files.file_kinds import CAPTURE, is_derived
-
-SUFFIXES = (".hdf5", ".h5")  # names that captures have
+from nlosrender.files.file_kinds import CAPTURE, CAPTURE_SUFFIXES, is_derived
 
 Status = Literal["ok", "exceeds", "missing", "unreadable"]
 
@@ -76,7 +74,9 @@ def check_dataset(
     """
     expected, present = captures_below(reference), captures_below(folder)
     if not expected:
-        raise FileError(f"{reference}: holds no capture (files named {' or '.join(SUFFIXES)}) to check against.")
+        raise FileError(
+            f"{reference}: holds no capture (files named {' or '.join(CAPTURE_SUFFIXES)}) to check against."
+        )
     refuse_idle_rules(rules, expected, reference)
     files = []
     for name in expected:
@@ -132,7 +132,7 @@ def captures_below(folder: Path) -> list[str]:
     found = []
     for parent, folders, files in os.walk(folder, onerror=refuse):
         folders[:] = [name for name in folders if not name.startswith(".")]
-        names = (name for name in files if name.endswith(SUFFIXES) and not name.startswith("."))
+        names = (name for name in files if name.endswith(CAPTURE_SUFFIXES) and not name.startswith("."))
         paths = (Path(parent) / name for name in names)
         found += [path.relative_to(folder).as_posix() for path in paths if not is_derived(path)]
     return sorted(found)
