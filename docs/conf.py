@@ -48,7 +48,7 @@ def add_contents(_: Sphinx, page: str, source: list[str]) -> None:
 
 
 def add_index(app: Sphinx, failure: Exception | None) -> None:
-    """Make the README the page that servers show first."""
+    """Copy README.html to index.html, which servers show for the folder."""
     if failure is None:
         shutil.copy(app.outdir / "README.html", app.outdir / "index.html")
 

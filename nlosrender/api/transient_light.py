@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from nlosrender.api.configuration import load
 from nlosrender.api.progress_bar import Wanted, reported, warn_caller
 from nlosrender.capture.relative_error import relative_l2_error
+from nlosrender.capture.time_axis import bin_centres
 from nlosrender.errors import OptionError
 from nlosrender.rendering import stages
 from nlosrender.rendering.outcome import missing_light
@@ -94,30 +95,12 @@ def transient(
     backend, colored = join_backend()
     sensors = _points(sensor_points, "sensor_points")
     lasers = None if laser_points is None else _points(laser_points, "laser_points")
-    if (sensor_position is None) != (laser_position is None):
-        raise OptionError("sensor_position, laser_position: need both, for time to count the legs, or none")
-    if render is not None and not isinstance(render, Mapping):
-        raise OptionError(f"render: got {render!r:.60}, need a mapping of keys and values")
-    given = dict(render or {})
-    if decided := [key for key in OF_THE_VARIANT if key in given]:
-        raise OptionError(f"render: {decided[0]} is decided by Mitsuba's variant; leave it away")
-    counted = (
-        {"sensor_position": sensor_position, "laser_position": laser_position} if sensor_position is not None else {}
-    )
-    lists = {"sensor_points": sensors.reshape(-1, 2)}
-    if lasers is not None:
-        lists["laser_points"] = lasers.reshape(-1, 2)
-    section = {
-        "scan_type": "confocal" if lasers is None else "exhaustive",
-        "account_first_and_last_bounces": bool(counted),
-        **lists,
-        **counted,
-    }
+    settings = _settings(render) | {"color": "rgb" if colored else "grey", "backend": backend.name}
     values = {
         "scene": {"relay_wall": wall, "hidden_geometry": []},
-        "capture": section,
+        "capture": _scan(sensors, lasers, sensor_position, laser_position),
         "time_axis": time_axis,
-        "render": given | {"color": "rgb" if colored else "grey", "backend": backend.name},
+        "render": settings,
     }
     config = load(values).config
     from nlosrender.engine.preflight.scene_warnings import scene_warnings
@@ -137,7 +120,6 @@ def transient(
     if not mean.any():
         warn_caller(f"H is zero everywhere: {'; '.join(zero_reasons(engine, unsampled, float(outside.sum())))}.")
     shape = (*(() if lasers is None else lasers.shape[:-1]), *sensors.shape[:-1])
-    middles: Float64 = time.start_opl + (np.arange(time.n_bins, dtype=np.float64) + 0.5) * time.bin_width_opl
     error = relative_l2_error(float(variance.sum()), float(np.square(mean).sum()))
     axes = mean.shape[:2]
     return Transient(
@@ -145,10 +127,38 @@ def transient(
         variance=variance.reshape(*axes, *shape, time.n_bins),
         outside=outside.reshape(*axes, *shape),
         bounces=tuple(engine.options.bounces.name(slot) for slot in range(axes[1])),
-        opl=middles,
+        opl=bin_centres(time.start_opl, time.bin_width_opl, time.n_bins),
         error_estimate=np.nan if unsampled else error,
         engine=f"{engine.name}: {engine.reason}",
     )
+
+
+def _settings(render: Mapping[str, object] | None) -> dict[str, object]:
+    """Return the keys of the section ``render`` that a caller gives; OptionError for those that are not his."""
+    if render is not None and not isinstance(render, Mapping):
+        raise OptionError(f"render: got {render!r:.60}, need a mapping of keys and values")
+    given = dict(render or {})
+    if decided := [key for key in OF_THE_VARIANT if key in given]:
+        raise OptionError(f"render: {decided[0]} is decided by Mitsuba's variant; leave it away")
+    return given
+
+
+def _scan(
+    sensors: Float64, lasers: Float64 | None, sensor_position: Sequence[float] | None, laser_position: object
+) -> dict[str, object]:
+    """Return the section ``capture`` of points (..., 2); OptionError where one device has a position."""
+    if (sensor_position is None) != (laser_position is None):
+        raise OptionError("sensor_position, laser_position: need both, for time to count the legs, or none")
+    section: dict[str, object] = {
+        "scan_type": "confocal" if lasers is None else "exhaustive",
+        "account_first_and_last_bounces": sensor_position is not None,
+        "sensor_points": sensors.reshape(-1, 2),
+    }
+    if lasers is not None:
+        section["laser_points"] = lasers.reshape(-1, 2)
+    if sensor_position is not None:
+        section |= {"sensor_position": sensor_position, "laser_position": laser_position}
+    return section
 
 
 def _points(points: ArrayLike, name: str) -> Float64:

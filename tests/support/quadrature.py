@@ -139,7 +139,7 @@ class Legs:
     """From one point on the wall to every cell."""
 
     value: Array  # of the point's factors in H
-    opl: Array  # m
+    opl: Array  # optical path length [m]
     way_back: Array  # (n, 3), unit, from the cells to the point
 
 

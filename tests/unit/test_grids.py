@@ -1,12 +1,12 @@
 """Grids on the relay wall, and captures."""
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from support.built_captures import built_capture
 
-from nlosrender.capture.grids import build_capture, point_grid, single_point
+from nlosrender.capture.grids import point_grid, single_point
 from nlosrender.errors import ConfigError
 from nlosrender.scene.pose import Pose
 from nlosrender.scene.walls.round_walls import SphereWall
@@ -16,30 +16,8 @@ WALL = RectangleWall(Pose.from_normal_up([5.0, -2.0, 1.0], [1, 0.5, 0.2], [0, 0.
 SPHERE = SphereWall(np.array([1.0, 2.0, 3.0]), 0.8)
 
 
-def grid(nx, ny, width=None, height=None):
-    return SimpleNamespace(nx=nx, ny=ny, width=width, height=height)
-
-
 def capture(wall=WALL, **changes):
-    keys = {
-        "scan_type": "exhaustive",
-        "sensor_grid": grid(5, 3),
-        "laser_grid": grid(7, 2, 1.4, 0.4),
-        "sensor_list": None,
-        "laser_list": None,
-        "footprint": None,
-        "spot_list": None,
-        "laser_flash": None,
-        "laser_spot_weights": None,
-        "laser_point": None,
-        "laser_position": [6.0, -2.0, 1.5],
-        "sensor_position": None,
-        "laser_energy": 2.0,
-        "laser_spot_radius": 0.0,
-        "account_first_and_last_bounces": True,
-        **changes,
-    }
-    return build_capture(SimpleNamespace(**keys), wall)
+    return built_capture(wall, **{"laser_position": [6.0, -2.0, 1.5], "laser_energy": 2.0} | changes)
 
 
 def test_points_are_cell_centres():

@@ -4,9 +4,9 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from support.built_captures import built_capture
 
 from nlosrender.capture.arrivals import latest_arrival
-from nlosrender.capture.grids import build_capture
 from nlosrender.capture.time_axis import TimeAxis, resolve_time_axis
 from nlosrender.errors import ConfigError
 from nlosrender.scene.pose import Pose
@@ -21,25 +21,8 @@ SMALL_BOX = (np.array([-0.1, -0.3, -0.2]), np.array([0.3, 0.2, 0.1]))
 
 
 def capture(wall=WALL, scan_type="exhaustive", **changes):
-    keys = {
-        "scan_type": scan_type,
-        "sensor_grid": SimpleNamespace(nx=5, ny=3, width=None, height=None),
-        "laser_grid": SimpleNamespace(nx=7, ny=2, width=1.4, height=0.4),
-        "sensor_list": None,
-        "laser_list": None,
-        "footprint": None,
-        "spot_list": None,
-        "laser_flash": None,
-        "laser_spot_weights": None,
-        "laser_point": (0.3, -0.2),
-        "laser_position": [-0.5, 0.1, 0.25],
-        "sensor_position": [0.2, 0.3, 0.4],
-        "laser_energy": 1.0,
-        "laser_spot_radius": 0.0,
-        "account_first_and_last_bounces": True,
-        **changes,
-    }
-    return build_capture(SimpleNamespace(**keys), wall)
+    keys = {"laser_point": (0.3, -0.2), "laser_position": [-0.5, 0.1, 0.25], "sensor_position": [0.2, 0.3, 0.4]}
+    return built_capture(wall, scan_type=scan_type, **keys | changes)
 
 
 def config(start_opl=0.0, bin_width_opl=0.003, n_bins="auto"):

@@ -31,7 +31,7 @@ from nlosrender.scene.pose import Float64
 if TYPE_CHECKING:
     from nlosrender.engine.virtual_lights.elements.subdivision import Elements
 
-MIN_LIT_SHARE = 1e-3  # of a cluster's area: what less of it sends on has no slopes to speak of
+MIN_LIT_SHARE = 1e-3  # sum of w over a cluster's area, least: shading normals across the triangles make it 0 or less
 TILTS = math.sqrt(1.5) * np.array([1.0, -1.0, 0.0])  # of facets: none in the mean, variance 1
 TURNS = 2 * np.pi / 3 * np.arange(3)
 CIRCLE = math.sqrt(2) * np.stack([np.cos(TURNS), np.sin(TURNS)], axis=1)  # none in the mean, the unit matrix squared
@@ -152,7 +152,7 @@ class Merger:
 
 @dataclass(frozen=True, eq=False)
 class Facets:
-    """Three facets per group that send on what all members do, from where they do it, one group after the other.
+    """Three facets per group, one group after the other, with the light and the delays of the group's members.
 
     With slopes p, normals are (p, 1) over its length and M is the sum of w (p, 1) (p, 1)^T: three equal w, their slopes
     on an ellipse about the mean at 120 degrees, have its sum, mean and covariance. Their centres are the positions that
@@ -209,7 +209,7 @@ def _placed_by_slope(
 
     ``variances`` (n, 2) of the slopes along orthonormal ``axes`` (n, 2, 2), columns.
     """
-    # where slopes vary along one line only, positions follow them there
+    # an axis without variance has no regression: the step along it is 0
     deviations = np.sqrt(np.where(variances > MIN_SLOPE_VARIANCE, variances, np.inf))
     places, by_slopes = (part / slopes.weights[:, None] for part in np.split(merged.lit_places, [9], axis=1))
     middle = places[:, :3]
@@ -227,7 +227,7 @@ def _placed_by_slope(
 
 
 def roughness(merged: AreaMoments) -> Float64:
-    """Return the variance (n,) of the slopes in groups; 0 where what their members send on has none to speak of."""
+    """Return the variance (n,) of the slopes in groups; 0 where their weights are too small to divide by."""
     slopes = _Slopes.of(merged)
     variance: Float64 = np.trace(slopes.covariance, axis1=1, axis2=2)
     return np.where(slopes.weights > MIN_LIT_SHARE * merged.areas, variance, 0.0)
