@@ -1,4 +1,4 @@
-"""The footprint of a sensor point: the area of the wall that it stands for, a disc or a rectangle around it."""
+"""The footprint of a sensor point, the area that it stands for: a disc or a rectangle of the wall, or a pixel."""
 
 from __future__ import annotations
 
@@ -31,3 +31,15 @@ class Footprint:
             f"disc of radius {self.width / 2:.9g}" if self.is_disc else f"box of {self.width:.9g} x {self.height:.9g}"
         )
         return f"H is the mean over a {shape} m on the wall around each sensor point, with the leg of each place"
+
+
+@dataclass(frozen=True)
+class PixelFootprint:
+    """All that a camera's pixel sees, on any surfaces: directions uniform over the pixel's area in the picture."""
+
+    reach: float  # distance from the point to the farthest place that it stands for [m], as far as a few rays find it
+    area: None = None  # of the surfaces: it depends on what each pixel sees
+    in_words = (
+        "H is the mean over each pixel of the camera, uniform by the pixel's area in the picture, with the leg of each "
+        "place; the sensor point is one of these places, and the laser lights points"
+    )

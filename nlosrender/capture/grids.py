@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from nlosrender.capture.bounces import LINE_OF_SIGHT
 from nlosrender.capture.flash import Flash
-from nlosrender.capture.footprint import Footprint
+from nlosrender.capture.footprint import Footprint, PixelFootprint
 from nlosrender.errors import ConfigError
 from nlosrender.scene.pose import Float64
 from nlosrender.scene.walls.wall import EDGE_TOLERANCE, RectangleWall, RelayWall
@@ -95,7 +95,7 @@ class Capture:
     laser_energy: float  # J per pulse
     laser_spot_radius: float  # m; 0 = a point
     n_unlit_lasers: int = 0  # laser points that a camera sees and the laser does not light
-    footprint: Footprint | None = None  # around each sensor point; None: a point
+    footprint: Footprint | PixelFootprint | None = None  # around each sensor point; None: a point
     # (lasers,) of the laser points of a single capture that one pulse lights at once, sum 1; None: one at a time
     laser_weights: Float64 | None = None
     laser_flash: Flash | None = None  # around the way to the laser point; None: a point or a spot
@@ -261,7 +261,8 @@ def _capture_of_pixels(capture_config: CaptureConfig, wall: RelayWall, pixels: P
         laser_grid = sensor_grid
     laser, eye = (wall.pose.to_local(pixels.frame.to_scene(at)) for at in (pixels.laser, pixels.sensors.origin))
     capture = _capture(capture_config, sensor_grid, laser_grid, laser, eye)
-    return replace(capture, n_unlit_lasers=pixels.lasers.n_hidden)
+    areas = None if pixels.areas is None else PixelFootprint(pixels.areas.reach)
+    return replace(capture, n_unlit_lasers=pixels.lasers.n_hidden, footprint=areas)
 
 
 def _extent(xy: Float64) -> tuple[float, float]:

@@ -49,17 +49,20 @@ class GridConfig(Section):
 
 
 class FootprintConfig(Section):
-    """The area of the wall that each sensor point stands for: H is its mean, as of a detector that sees an area."""
+    """The area that each sensor point stands for: H is its mean, as of a detector that sees an area."""
 
     radius: Length | None = None
     """m, of a disc around the point"""
     box: Sizes2 | None = None
     """m, [width, height] of a rectangle around it along the wall's axes, instead of radius"""
+    pixel: Flag = False
+    """with a camera: all that a pixel sees, on any surfaces, instead of radius"""
 
     def rule_one_shape(self) -> Iterator[ValidationIssue]:
-        """A disc or a rectangle."""
-        if (self.radius is None) == (self.box is None):
-            yield ValidationIssue((), "need one of radius and box, such as {radius: 0.02} or {box: [0.04, 0.03]}.")
+        """A disc, a rectangle or a pixel."""
+        if (self.radius is not None) + (self.box is not None) + self.pixel != 1:
+            message = "need one of radius and box, such as {radius: 0.02} or {box: [0.04, 0.03]}, or with a camera "
+            yield ValidationIssue((), f"{message}pixel: true.")
 
     @property
     def extent(self) -> tuple[float, float]:

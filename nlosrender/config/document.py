@@ -119,6 +119,9 @@ class Config(Section):
                 if getattr(capture, key) is not None:
                     message = "is for scans with a camera; a grid on a relay wall has laser_point or laser_grid."
                     yield ValidationIssue(("capture", key), message, "key")
+            if capture.footprint is not None and capture.footprint.pixel:
+                message = "is for scans with a camera; around points on a relay wall need radius or box."
+                yield ValidationIssue(("capture", "footprint", "pixel"), message, "key")
             return
         if capture.pixel_point is not None and not all(0 <= share <= 1 for share in capture.pixel_point):
             message = mismatch(capture.pixel_point, "two numbers from 0 to 1", "[0.5, 0.5] is the pixel's centre.")
@@ -133,8 +136,9 @@ class Config(Section):
         if capture.laser_spot_radius > 0:
             message = f"got {shown(capture.laser_spot_radius)}, and {needs.replace('need', 'need 0, or')}"
             yield ValidationIssue(("capture", "laser_spot_radius"), message)
-        if capture.footprint is not None:
-            yield ValidationIssue(("capture", "footprint"), f"got one, and {needs}")
+        if capture.footprint is not None and not capture.footprint.pixel:
+            message = f"got one in metres, and {needs} With a camera: {{pixel: true}}."
+            yield ValidationIssue(("capture", "footprint"), message)
         for key in ("laser_spots", "laser_flash"):
             if getattr(capture, key) is not None:
                 yield ValidationIssue(("capture", key), f"got some, and {needs}")

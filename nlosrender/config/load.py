@@ -33,6 +33,7 @@ LEFT_OUT = (  # of the canonical JSON, if empty
     ("capture", "pixel_point"),
     ("capture", "laser_target"),
     ("capture", "laser_targets"),
+    ("capture", "footprint", "pixel"),
     ("capture", "footprint"),
     ("capture", "laser_spots"),
     ("capture", "laser_spot_weights"),
@@ -224,8 +225,8 @@ def config_to_dict(config: Config) -> dict[str, Any]:
     for *sections, key in LEFT_OUT:
         place = dumped
         for section in sections:
-            place = place[section]
-        if not place[key]:
+            place = place[section] or {}
+        if key in place and not place[key]:
             del place[key]
     return dumped
 

@@ -46,6 +46,7 @@ _PIXELS = """\
   # pixel_point: [0.5, 0.5]      # where in its pixel a point is seen, from the lower left corner; default the centre
   # laser_target: [0, 0, 0]      # single: the beam from laser_position to it lights what it meets first
   # laser_targets: [[0, 0, 0]]   # exhaustive: several; default null: the points of the pixels
+  # footprint: {pixel: true}     # H is the mean over all that a pixel sees; default null: over its point alone
 """
 _SENSOR_GRID = """\
   sensor_grid:                   # the measured points: cell centres (i + 0.5) / n

@@ -92,7 +92,7 @@ def _obstacle_close_by(engine: VirtualLightEngine, capture: Capture) -> str | No
 
 def _obstacle(render: RenderConfig, capture: Capture, built: BuiltScene) -> str | None:
     """Return why the virtual lights cannot render a scene; None when they can."""
-    if isinstance(built, SceneWithoutWall):
+    if isinstance(built, SceneWithoutWall):  # pixels with areas, too
         return f"virtual lights need a relay wall: {built.reason}"
     if render.polarized:
         return "only paths carry polarised light"

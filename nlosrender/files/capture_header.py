@@ -52,7 +52,8 @@ class CaptureHeader:
     n_unlit_lasers: int = 0  # that are hidden from the laser
     shared_samples: str = ""  # which samples have errors in common, in words: their variances may not be summed
     point_lists: tuple[str, ...] = ()  # which of "sensor" and "laser" points are a list, see ``layout.POINT_LISTS``
-    footprint: tuple[str, float] | None = None  # what H is the mean over, in words, and its area [m^2]; None: points
+    # what H is the mean over, in words, and its area [m^2], None for pixels of a camera; None: points
+    footprint: tuple[str, float | None] | None = None
     # (spots, 3) positions [m] and (spots,) shares of the pulse, sum 1, of spots that are lit at once;
     # ``laser_positions`` is their weighted middle then
     laser_spots: tuple[Float64, Float64] | None = None

@@ -192,7 +192,8 @@ def root_attributes(header: CaptureHeader) -> dict[str, object]:
     if header.laser_flash:
         attributes[layout.FLASH] = header.laser_flash
     if header.footprint is not None:
-        attributes[layout.FOOTPRINT], attributes[layout.FOOTPRINT_AREA] = header.footprint
+        words, area = header.footprint
+        attributes |= {layout.FOOTPRINT: words} | ({} if area is None else {layout.FOOTPRINT_AREA: area})
     if header.n_channels in layout.CHANNELS:
         attributes["channels"] = layout.CHANNELS[header.n_channels]
     if attributes.get("channels") == layout.STOKES:

@@ -327,7 +327,7 @@ class _Measurement:
                 raise ConfigError.at("sensor.photons_per_pulse", message + "photons; need a relative scale.")
             area = float(np.prod(header.sensor_grid_size or 0.0)) / math.prod(header.sensor_grid)
             seen = header.footprint
-            if seen is not None:
+            if seen is not None and seen[1] is not None:
                 area = seen[1]
             elif config.footprint_area is None and (area <= 0 or header.whose_points):
                 whose = header.whose_points

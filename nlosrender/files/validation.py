@@ -246,7 +246,8 @@ def _lit_and_seen(file: h5py.File, path: Path) -> Iterator[str]:
         if not isinstance(words := attributes.get(name, ""), str):
             yield f"attribute {name!r}: {words}, need text"
     area = attributes.get(layout.FOOTPRINT_AREA)
-    if layout.FOOTPRINT in attributes and not (isinstance(area, (int, float)) and 0 < area < math.inf):
+    needs_area = layout.FOOTPRINT in attributes and layout.EMPTY_POINTS not in attributes  # pixels have none
+    if needs_area and not (isinstance(area, (int, float)) and 0 < area < math.inf):
         yield f"attribute {layout.FOOTPRINT_AREA!r}: {'missing' if area is None else area}, need an area > 0 [m^2]"
 
 

@@ -39,12 +39,22 @@ class FirstHits:
 
 
 @dataclass(frozen=True, eq=False)
+class PixelAreas:
+    """The pixels of a camera on its image plane, as vectors from where it stands [m, frame of the points]."""
+
+    corners: Float64  # (rows, columns, 3) to the lower left corner of each pixel
+    edges: Float64  # (2, 3) along a pixel to the right, and up
+    reach: float  # of all pixels, see ``PixelFootprint``
+
+
+@dataclass(frozen=True, eq=False)
 class PixelPoints:
     """The sensor points of a camera's pixels, and the laser points."""
 
     frame: Pose  # of all positions, in the scene
     sensors: FirstHits
     lasers: FirstHits
+    areas: PixelAreas | None = None  # that sensor points stand for; None: they are points
 
     @property
     def laser(self) -> Float64:

@@ -237,6 +237,8 @@ def test_a_camera_before_a_hidden_scene(tmp_path: Path, scan: str) -> None:
     else:
         assert capture.pixel_point == (0, 1)  # the upper left corner, where mitransient's laser looks
     assert capture.n_lasers == (12 if scan == "exhaustive" else 1)
+    assert capture.footprint is not None  # mitransient's pixels see areas
+    assert capture.footprint.pixel
 
 
 SCANNED = '<integer name="laser_scan_width" value="3"/><integer name="laser_scan_height" value="2"/>'

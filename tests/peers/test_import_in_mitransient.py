@@ -108,25 +108,25 @@ def test_an_imported_scene_is_mitransients(peer: Peer, tmp_path: Path, keys: str
     assert noise < 0.02 * total
 
 
-def test_a_camera_before_a_hidden_scene_is_mitransients(peer: Peer, tmp_path: Path) -> None:
-    """What its pixels see is measured: H differs by noise, after one factor, from the mean of ours over each pixel."""
-    width, height, finer = 5, 4, 36
-    for name, times in (("m.xml", 1), ("fine.xml", finer)):
-        sized = CORNER.replace("WIDTH", str(width * times)).replace("HEIGHT", str(height * times))
-        (tmp_path / name).write_text(sized)
-    assert run(tmp_path, "import", "fine.xml", "-o", "z.yaml").returncode == 0
-    assert run(tmp_path, "render", "z.yaml", "-o", "z.hdf5", "--set", "render.spp=900", "-q").returncode == 0
+@pytest.mark.parametrize("scan", ["Single", "Confocal"])
+def test_a_camera_before_a_hidden_scene_is_mitransients(peer: Peer, tmp_path: Path, scan: str) -> None:
+    """What its pixels see is measured: H differs by noise, after one factor for each laser point."""
+    width, height, spp = 5, 4, 1_000_000
+    text = CORNER.replace("WIDTH", str(width)).replace("HEIGHT", str(height))
+    text = text.replace("</integrator>", f'<string name="capture_type" value="{scan}"/></integrator>')
+    (tmp_path / "m.xml").write_text(text)
+    assert run(tmp_path, "import", "m.xml", "-o", "z.yaml").returncode == 0
+    assert run(tmp_path, "render", "z.yaml", "-o", "z.hdf5", "--set", f"render.spp={spp}", "-q").returncode == 0
     with h5py.File(tmp_path / "z.hdf5") as file:
-        data = file["data"][0].sum(axis=1)
-    blocks = data.reshape(60, height, finer, width, finer).mean(axis=(2, 4))
-    ours = blocks[:, ::-1].transpose(1, 2, 0)  # rows go down there
+        data, error = file["data"][0].sum(axis=1), file.attrs["error_estimate"]
+    ours = data.reshape(60, height, width)[:, ::-1].transpose(1, 2, 0)  # rows go down there
     mean, noise = _theirs(peer, tmp_path, 10 * SAMPLES)
-    factor = (mean * ours).sum() / (ours**2).sum()
+    axis = -1 if scan == "Confocal" else None
+    factor = (mean * ours).sum(axis=axis, keepdims=True) / (ours**2).sum(axis=axis, keepdims=True)
     total = np.linalg.norm(mean)
-    # the second bounce of each of our points is in one bin, which the 36 rows of a pixel resolve: measured 0.6 %, of
-    # 12 rows 3.2 %. The columns turned round differ by 50 %
-    assert np.linalg.norm(mean - factor * ours) <= 0.01 * total
-    assert noise < 0.003 * total
+    # heavy tails, see above. The light of the pixels' centres is 40 % off, the columns turned round 50 %
+    assert np.linalg.norm(mean - factor * ours) <= 1.5 * np.hypot(noise, error * total)
+    assert noise < 0.01 * total
 
 
 def _theirs(peer: Peer, folder: Path, samples: int) -> tuple[np.ndarray, float]:

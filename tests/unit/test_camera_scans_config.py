@@ -54,6 +54,9 @@ def test_what_grids_need_has_no_effect_beside_a_camera() -> None:
         (pixels() | {"output": {"ground_truth": ["depth"]}}, "output.ground_truth", "a capture with a camera has none"),
         (pixels() | {"sensor": {"pulses": 9, "photons_per_pulse": {"mean": 1}, "zones": {"nx": 2, "ny": 1}}},
          "sensor.zones", "points that a camera sees have none"),
+        (pixels(footprint={"radius": 0.1}), "capture.footprint", r"got one in metres, .* With a camera: {pixel: true}"),
+        (pixels(footprint={"radius": 0.1, "pixel": True}), "capture.footprint", "or with a camera pixel: true"),
+        (flat_wall(capture={"footprint": {"pixel": True}}), "capture.footprint.pixel", "around points on a relay wall"),
         (flat_wall(capture={"laser_target": [0, 0, 0]}), "capture.laser_target", "is for scans with a camera"),
     ],
 )  # fmt: skip

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nlosrender.capture.bounces import FIRST_BOUNCE, THIRD_BOUNCE
+from nlosrender.capture.footprint import PixelFootprint
 from nlosrender.engine.launch.device_arrays import on_device
 from nlosrender.engine.launch.energy_contrasts import no_contrasts
 from nlosrender.engine.launch.flat_mirrors import FlatMirrors
@@ -23,10 +24,10 @@ from nlosrender.engine.launch.mirror_index import lit_sphere
 from nlosrender.engine.launch.morton import morton_order
 from nlosrender.engine.launch.schedule import DEFAULT_SCHEDULE, ScheduleTuning
 from nlosrender.engine.launch.second_bounce import deposit_second_bounce
-from nlosrender.engine.launch.sensor_footprint import SensorFootprint
+from nlosrender.engine.launch.sensor_footprint import PixelPlaces, SensorFootprint
 from nlosrender.engine.launch.surface_sampler import SurfaceSampler
 from nlosrender.engine.launch.time_gate import CaptureTimeGate, light_leaves_window
-from nlosrender.engine.launch.wall_points import RectanglePoints, laser_points, sensor_points
+from nlosrender.engine.launch.wall_points import MovedPoints, RectanglePoints, laser_points, sensor_points
 
 if TYPE_CHECKING:
     from nlosrender.capture.bounces import BounceAxis
@@ -75,9 +76,9 @@ class DeviceCapture:
 
     @cached_property
     def footprint(self) -> SensorFootprint | None:
-        """The area that sensor points stand for; None: they are points."""
+        """The area of the wall that sensor points stand for; None: they are points, or pixels."""
         capture, built = self.capture, self.built
-        if capture.footprint is None:
+        if capture.footprint is None or isinstance(capture.footprint, PixelFootprint):
             return None
         wall = RectanglePoints(built, capture, self.time_axis, capture.sensor_position)
         return SensorFootprint(capture.footprint, wall, built.metres_per_engine_unit, self.options.seed)
@@ -156,8 +157,17 @@ class DeviceCapture:
             bins_per_unit=dr.opaque(mi.Float, built.metres_per_engine_unit / time_axis.bin_width_opl),
             time_gate=None if gate is None else gate.of_sensors(built, capture, time_axis, index, sensor),
             row_of_lane=row_of_lane,
-            footprint=self.footprint,
+            footprint=self._pixel_places(index, sensor) if self.sees_pixels else self.footprint,
         )
+
+    @property
+    def sees_pixels(self) -> bool:
+        """Whether sensor points stand for all that their pixels see: paths sample the second bounce then, too."""
+        return isinstance(self.capture.footprint, PixelFootprint)
+
+    def _pixel_places(self, index: NDArray[np.integer], lanes: mi.UInt32) -> PixelPlaces:
+        points = MovedPoints(self.built, self.capture, self.time_axis, self.capture.sensor_position)
+        return PixelPlaces(self.built, points, index, lanes)
 
     @cached_property
     def mirrors(self) -> tuple[Mirrors, ...]:
@@ -179,7 +189,7 @@ class DeviceCapture:
         The second bounce, 0 on a planar wall, and the third bounce of laser points reflected by mirrors.
         """
         shape = replace(self.shape(batch, 1), replicas=1)
-        if not self.built.wall.is_planar:
+        if not (self.built.wall.is_planar or self.sees_pixels):
             histogram = DeviceHistogram(shape)
             deposit_second_bounce(self.launch_params(batch, shape), histogram)
             yield FIRST_BOUNCE, histogram.on_host(histogram.total(self.scale))

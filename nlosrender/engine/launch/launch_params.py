@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING, Self
 import drjit as dr
 import mitsuba as mi
 
+from nlosrender.engine.launch.sensor_footprint import PixelPlaces, SensorFootprint
+
 if TYPE_CHECKING:
-    from nlosrender.engine.launch.sensor_footprint import SensorFootprint
     from nlosrender.engine.launch.surface_sampler import SurfaceSampler
     from nlosrender.engine.launch.time_gate import TimeGate
     from nlosrender.engine.launch.wall_points import WallPoints
@@ -32,17 +33,23 @@ class LaunchParams:
     bins_per_unit: mi.Float  # engine unit / bin width, opaque
     time_gate: TimeGate | None  # None: all light arrives before the end of the window
     row_of_lane: mi.UInt32  # per lane: which lane's rows of the histogram it adds to
-    footprint: SensorFootprint | None  # None: sensor points are points
+    footprint: SensorFootprint | PixelPlaces | None  # None: sensor points are points
 
-    def in_footprint(self, key: mi.UInt32) -> Self:
+    def in_footprint(self, key: mi.UInt32, active: mi.Bool) -> Self:
         """Return these with the sensor points of paths, known by their ``key``, at random in the footprint."""
         if self.footprint is None:
             return self
-        return replace(self, sensors=self.footprint.at_random(self.sensors, key))
+        return replace(self, sensors=self.footprint.at_random(self.sensors, key, active))
+
+    def delayed(self, delay_fraction: mi.Float) -> Self:
+        """Return these with the delay of sensor points that ``in_footprint`` has moved."""
+        if self.footprint is None:
+            return self
+        return replace(self, sensors=replace(self.sensors, delay_fraction=delay_fraction))
 
     def at_place(self, place: mi.Point2f) -> Self:
         """Return these with the sensor points at a place (point of the unit square) in the footprint."""
-        if self.footprint is None:
+        if not isinstance(self.footprint, SensorFootprint):
             return self
         moved = self.footprint.moved(self.sensors, place)
         dr.eval(moved.interaction, moved.delay_bins, moved.delay_fraction)

@@ -14,32 +14,32 @@ COINCIDENT = 1e-6  # engine units; a confocal pair has no path between its point
 
 
 @dr.syntax
-def deposit_second_bounce(params: LaunchParams, histogram: DeviceHistogram) -> None:
-    """Deposit, for every lane and each of its lasers, the light that goes from laser point to sensor point.
+def deposit_second_bounce(params: LaunchParams, histogram: DeviceHistogram, active: mi.Bool | bool = True) -> None:
+    """Deposit, for every active lane and each of its lasers, the light that goes from laser point to sensor point.
 
-    The histogram has one slot. Values are per J of pulse and (engine unit)^2, as in ``trace_paths``.
+    It goes to the histogram's first slot. Values are per J of pulse and (engine unit)^2, as in ``trace_paths``.
     """
     built, sensor = params.built, params.sensors.interaction
     context = mi.BSDFContext()
-    lane = dr.arange(mi.UInt32, dr.width(params.sensors.delay_bins))
     laser = mi.UInt32(0)
-    while dr.hint(laser < params.n_lasers, exclude=[params, histogram, built]):
+    while dr.hint(laser < params.n_lasers, exclude=[params, histogram, built, sensor, active]):
         points = params.lasers.gather(params.first_laser + laser)
         lit = points.interaction
         to_laser = lit.p - sensor.p
         distance = dr.norm(to_laser)
-        apart = distance > COINCIDENT
+        apart = (distance > COINCIDENT) & active
         if dr.hint(isinstance(built, SceneWithoutWall), mode="scalar"):
             apart &= ~_on_one_plane(built, sensor, lit, to_laser)
         direction = to_laser / dr.maximum(distance, COINCIDENT)
         received = built.bsdf_at(sensor).eval(context, sensor, sensor.to_local(direction), apart)
         emitted = built.bsdf_at(lit).eval(context, lit, lit.to_local(-direction), apart)
         value = points.shared(received * emitted) / dr.square(dr.maximum(distance, COINCIDENT))
-        active = apart & dr.any(value > 0)
-        active &= ~built.scene.ray_test(
-            connection_segment(built, sensor, direction, lit), coherent=False, active=active
+        is_lit = apart & dr.any(value > 0)
+        is_lit &= ~built.scene.ray_test(
+            connection_segment(built, sensor, direction, lit), coherent=False, active=is_lit
         )
-        histogram.deposit(lane, laser, mi.UInt32(0), params.delay_bin(points, distance), value, active)
+        bins = params.delay_bin(points, distance)
+        histogram.deposit(params.row_of_lane, laser, mi.UInt32(0), bins, value, is_lit)
         laser += 1
 
 

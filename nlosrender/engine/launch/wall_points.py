@@ -52,8 +52,8 @@ class WallPoints:
         return light if self.share is None else light * self.share
 
 
-class RectanglePoints:
-    """Moves laser or sensor points along a rectangle wall: normal, shading frame and BSDF stay the same.
+class MovedPoints:
+    """Moves laser or sensor points, with the leg from each place to its device.
 
     Parameters
     ----------
@@ -66,24 +66,35 @@ class RectanglePoints:
     def __init__(self, built: BuiltScene, capture: Capture, time_axis: TimeAxis, device: Float64):
         unit, counts_legs = built.metres_per_engine_unit, capture.account_first_and_last_bounces
         self.device = mi.Point3f(*(dr.opaque(mi.Float, float(value / unit)) for value in device))
-        lengths = (built.wall.width, built.wall.height)
-        self._uv_per_unit = mi.Vector2f(*(dr.opaque(mi.Float, float(unit / length)) for length in lengths))
         self._bins_per_unit = dr.opaque(mi.Float, float(unit / time_axis.bin_width_opl if counts_legs else 0.0))
 
-    def moved(self, points: WallPoints, shift: mi.Vector2f) -> WallPoints:
-        """Return the points moved by ``shift`` [engine units], with the direction to the device and the leg there."""
-        along = mi.Vector3f(shift.x, shift.y, 0)
-        si = mi.SurfaceInteraction3f(points.interaction)
-        to_device = self.device - si.p
+    def seen_at(self, points: WallPoints, si: mi.SurfaceInteraction3f, along: mi.Vector3f) -> WallPoints:
+        """Return the points at ``si``, moved ``along``, with the direction to the device and the leg there."""
+        to_device = self.device - points.interaction.p
         leg = dr.norm(to_device)
-        si.p = si.p + along
-        si.uv = si.uv + mi.Vector2f(shift.x * self._uv_per_unit.x, shift.y * self._uv_per_unit.y)
         from_place = to_device - along
         new_leg = dr.norm(from_place)
         si.wi = si.to_local(from_place / dr.maximum(new_leg, 1e-30))
         # difference of the legs by their squares: legs of kilometres would cancel in float32
         longer = dr.dot(along, along - 2 * to_device) / dr.maximum(leg + new_leg, 1e-30)
         return replace(points, interaction=si, delay_fraction=points.delay_fraction + longer * self._bins_per_unit)
+
+
+class RectanglePoints(MovedPoints):
+    """Moves points along a rectangle wall: normal, shading frame and BSDF stay the same."""
+
+    def __init__(self, built: BuiltScene, capture: Capture, time_axis: TimeAxis, device: Float64):
+        super().__init__(built, capture, time_axis, device)
+        lengths = built.metres_per_engine_unit / np.array([built.wall.width, built.wall.height])
+        self._uv_per_unit = mi.Vector2f(*(dr.opaque(mi.Float, float(length)) for length in lengths))
+
+    def moved(self, points: WallPoints, shift: mi.Vector2f) -> WallPoints:
+        """Return the points moved by ``shift`` [engine units]."""
+        along = mi.Vector3f(shift.x, shift.y, 0)
+        si = mi.SurfaceInteraction3f(points.interaction)
+        si.p = si.p + along
+        si.uv = si.uv + mi.Vector2f(shift.x * self._uv_per_unit.x, shift.y * self._uv_per_unit.y)
+        return self.seen_at(points, si, along)
 
 
 def sensor_points(built: BuiltScene, capture: Capture, time_axis: TimeAxis, index: NDArray[np.integer]) -> WallPoints:

@@ -11,7 +11,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from nlosrender.capture.bounces import THIRD_BOUNCE
+from nlosrender.capture.bounces import FIRST_BOUNCE, THIRD_BOUNCE
 from nlosrender.capture.plan import Batch, Plan
 from nlosrender.engine.interface import Budget, OmittedWork, PilotSeconds, TimeEstimate
 from nlosrender.engine.launch.accumulation import Accumulation, lane_randomness
@@ -101,6 +101,7 @@ class PathEngine:
             delta_share=self.tuning.delta_share if self.only_specular else 0.0,
             has_mirrors=bool(self.mirrors),
             flashes=self.capture.laser_flash is not None,
+            samples_second_bounce=self.device.sees_pixels,
             # with a mirrored spot every path adds what its sensor point sees of it
             max_tries=0 if has_spot and self.mirrors else self.tuning.max_tries,
         )
@@ -124,13 +125,12 @@ class PathEngine:
     def traces_paths(self) -> bool:
         """Whether any bounce that this engine computes is asked for."""
         highest = self.options.bounces.max_bounces
-        return highest is None or highest >= self.first_bounce
+        return highest is None or highest >= (FIRST_BOUNCE if self.device.sees_pixels else self.first_bounce)
 
     @property
     def n_slots(self) -> int:
-        """Bounce slots that are sampled: all but that of the second bounce, which is computed."""
-        bounces = self.options.bounces
-        return max(1, bounces.n_slots - 1) if bounces.split else 1
+        """Bounce slots that are sampled: all but that of the second bounce where it is computed."""
+        return max(1, self.options.bounces.n_slots - self.settings.first_slot)
 
     def set_up(self) -> None:
         """Make the table of sampled surfaces; see ``Engine.set_up``."""
@@ -203,7 +203,7 @@ class PathEngine:
             advanced, systematic = self.trace(params, histogram, randomness, systematic, more)
             return replace(advanced, systematic=replace(systematic, block=block))
 
-        first = 1 if bounces.split else 0  # the second bounce has slot 0
+        first = self.settings.first_slot
         slots = range(-first, bounces.n_slots - first)
         return Accumulation(shape, points, seed, launch, self.device.scale, slots, self.kernel, row_points)
 

@@ -19,7 +19,8 @@ energy E with f_l; V is visibility. With bounce index b = k + 2 the deposit, in 
 
     H_b += E  T_k  f(x_k) cos  f_l cos_l  V / |x_k - l|^2                     [``laser_connections``]
 
-and the same by one mirror reflection, one bounce later (``connect_by_mirrors``).
+and the same by one mirror reflection, one bounce later (``connect_by_mirrors``). Of pixels that stand for all that they
+see x_0 is connected, too: b = 2, which elsewhere has no noise (``DeviceCapture.exact_light``).
 
 Russian roulette divides T by the survival probability (``_survival``): at every bounce from the first deposited one on
 the albedo, at bounce 3 over the period n (``continuation_period``); and, once, that of the time gate where a path can
@@ -36,6 +37,7 @@ import mitsuba as mi
 from nlosrender.capture.bounces import FIRST_BOUNCE, THIRD_BOUNCE
 from nlosrender.engine.launch.histogram import DeviceHistogram
 from nlosrender.engine.launch.lane_random_state import LaneRandomness
+from nlosrender.engine.launch.second_bounce import deposit_second_bounce
 from nlosrender.engine.launch.sequences import SystematicSequence, first_coordinate, recurrence_steps
 from nlosrender.engine.launch.surface_sampler import SurfaceSample
 from nlosrender.engine.launch.time_gate import time_gate_roulette
@@ -119,14 +121,14 @@ def trace_paths(
     medium = mi.Float(1)  # refractive index along the ray
     is_past_gate = mi.Bool(False)  # the path can only bring light after the window, and has survived that roulette
     is_specular = mi.Bool(False)  # a delta lobe is on the path
-    place = mi.UInt32(0)  # key of the place in the sensor's footprint that the path started from
+    sensor_delay = mi.Float(params.sensors.delay_fraction)  # of the place in the footprint that the path started from
 
     # excluded: arrays that the loop reads but does not change
     while dr.hint(
         alive | (starts.count < n_samples),
         exclude=[settings, params, histogram, built, sampler, time_gate, n_samples, stride],
     ):
-        placed = params.in_footprint(place)
+        placed = params.delayed(sensor_delay)
         # ---- Intersect ----------------------------------------------------------------------------------------------
         there = arrive(settings, params, way, alive)
         opl += medium * there.distance
@@ -153,10 +155,13 @@ def trace_paths(
         go_on = hit & settings.may_go_on(bounce)
         start = ~go_on & (starts.count < n_samples)
         alive = go_on | start
-        place = dr.select(start, starts.seq_v, place)
+        placed = params.in_footprint(starts.seq_v, start)
         starts, numbers, t = starts.begin(stride, steps, start)
-        placed = params.in_footprint(place)
         sensor = placed.sensors.interaction
+        if dr.hint(params.footprint is not None, mode="scalar"):
+            sensor_delay = dr.select(start, placed.sensors.delay_fraction, sensor_delay)
+        if dr.hint(settings.samples_second_bounce, mode="scalar"):
+            deposit_second_bounce(placed, histogram, start)
         vertex = dr.select(start, sensor, there.si) if settings.goes_on else sensor
         throughput = dr.select(start, _at_sensor(sensor), throughput)
         opl, medium = dr.select(start, 0, opl), dr.select(start, 1, medium)

@@ -33,6 +33,7 @@ class PathSettings:
     has_mirrors: bool = False  # vertices are connected to the lasers by way of mirrors, too
     max_tries: int = PathTuning.max_tries  # see ``PathTuning``
     flashes: bool = False  # vertices are connected to random places of the laser's flash
+    samples_second_bounce: bool = False  # sensor points, which are areas of any surfaces, are connected to the lasers
 
     @property
     def goes_on(self) -> bool:
@@ -61,8 +62,9 @@ class PathSettings:
         in_reach: mi.Bool | bool = True
         if self.first_bounce > FIRST_BOUNCE + 1:
             in_reach &= bounce >= self.first_bounce
-        if self.goes_on and self.bounces.max_bounces is not None:
-            in_reach &= bounce <= self.bounces.max_bounces
+        highest = self.bounces.max_bounces
+        if highest is not None and (self.goes_on or highest < THIRD_BOUNCE):
+            in_reach &= bounce <= highest
         return in_reach
 
     def may_go_on(self, bounce: mi.UInt32) -> mi.Bool | bool:
@@ -72,10 +74,16 @@ class PathSettings:
         return True if self.last_vertex is None else bounce < self.last_vertex
 
     def slot(self, bounce: mi.UInt32) -> mi.UInt32:
-        """Return the histogram's slot of a bounce; the second bounce is computed elsewhere and has none."""
+        """Return the histogram's slot of a bounce."""
         if not self.bounces.split:
             return mi.UInt32(0)
-        return dr.minimum(bounce - (FIRST_BOUNCE + 1), mi.UInt32(self.bounces.n_slots - 2))
+        first = self.first_slot
+        return dr.minimum(bounce - (FIRST_BOUNCE + first), mi.UInt32(self.bounces.n_slots - 1 - first))
+
+    @property
+    def first_slot(self) -> int:
+        """The first bounce slot that is sampled: that of the second bounce, or the next where that is computed."""
+        return 1 if self.bounces.split and not self.samples_second_bounce else 0
 
     @property
     def mirrors_spot(self) -> bool:

@@ -67,7 +67,7 @@ def trace_third_bounce(
         if dr.hint(settings.goes_on, mode="scalar"):
             goes_on = phase == 0
             phase = dr.select(goes_on, period, phase) - 1
-        placed = params.in_footprint(seq_v)
+        placed = params.in_footprint(seq_v, mi.Bool(True))
         active = ~turns_away(params, sample, placed.sensors.interaction.p)
         if dr.hint(sampler.dark_behind and params.lasers_per_lane == 1, mode="scalar"):
             active &= goes_on | ~turns_away(params, sample, own_laser)

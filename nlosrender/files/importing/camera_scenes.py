@@ -42,13 +42,10 @@ _LENGTHS = tuple(
 )
 _OF_CAMERAS = ("sensor.type", "sensor.to_world", "sensor.fov_axis", "sensor.focal_length")
 _OF_SCANS = ("film.exhaustive_scan", "film.laser_scan_width", "film.laser_scan_height")
-_PIXELS = (
-    "a pixel's light is the mean over its area there, and its centre's here: a camera with more pixels, summed in "
-    "blocks, comes as near as wanted"
-)
+_PIXELS = "a pixel's light is the mean over its area there, and so is it here (capture.footprint: {pixel: true})"
 _CORNERS = (
-    "the laser lights the upper left corners of the pixels there, and so does it here (capture.pixel_point: [0, 1]), "
-    "with the sensor point in the same place; there a pixel's light is the mean over its area"
+    f"{_PIXELS}; the laser lights the upper left corners of the pixels there, and so does it here "
+    "(capture.pixel_point: [0, 1]), which the file's positions are, too"
 )
 
 
@@ -95,6 +92,7 @@ def translate_pixels(
     if laser is not None:
         translation.refuse("--laser", "", list(laser), "is a point of a relay wall; set capture.laser_target instead")
     keys.drop_all(OF_PROJECTORS)
+    translation.put("capture.footprint", {"pixel": True}, translation.start)
     if not is_aimed:
         translation.put("capture.pixel_point", [0.0, 1.0], translation.start)
     translation.note(_PIXELS if is_aimed else _CORNERS)

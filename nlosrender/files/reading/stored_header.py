@@ -137,10 +137,10 @@ class StoredHeader:
             )
 
     @property
-    def footprint(self) -> tuple[str, float] | None:
-        """What each histogram is the mean over, in words, and its area [m^2]; None: sensor points are points."""
+    def footprint(self) -> tuple[str, float | None] | None:
+        """What each histogram is the mean over, in words, and its area [m^2], if it has one; None: points."""
         words, area = (self.attributes.get(name) for name in (layout.FOOTPRINT, layout.FOOTPRINT_AREA))
-        return (words, float(area)) if isinstance(words, str) and isinstance(area, (int, float)) else None
+        return (words, float(area) if isinstance(area, (int, float)) else None) if isinstance(words, str) else None
 
     @property
     def is_measured(self) -> bool:

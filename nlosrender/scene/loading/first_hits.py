@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import drjit as dr
@@ -11,13 +12,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from nlosrender.errors import ConfigError
-from nlosrender.scene.pixel_points import NO_SHAPE, FirstHits, PixelPoints
+from nlosrender.scene.pixel_points import NO_SHAPE, FirstHits, PixelAreas, PixelPoints
 from nlosrender.scene.pose import Float64
 
 if TYPE_CHECKING:
-    from nlosrender.config.capture import CaptureConfig
+    from nlosrender.config.capture import CaptureConfig, GridConfig
     from nlosrender.scene.view import BuiltView
 
+PROBES = 5  # places along a pixel's sides, its corners included, where a footprint is looked at before the render
 MARGIN = 1e-4  # of a beam's length: what it meets in its last part is the surface that it is aimed at
 
 
@@ -29,18 +31,13 @@ def pixel_points(view: BuiltView, capture_config: CaptureConfig) -> PixelPoints:
     ConfigError
         No pixel sees anything, or a beam meets nothing.
     """
-    plane, grid = view.wall, capture_config.sensor_grid
+    grid = capture_config.sensor_grid
     assert grid is not None  # a camera has pixels
-    shift = np.subtract(capture_config.pixel_point or (0.5, 0.5), 0.5)
-    x, y = (
-        (2 * (np.arange(count) + offset) + 1 - count) / (2 * count) * extent
-        for count, offset, extent in zip((grid.nx, grid.ny), shift, (plane.width, plane.height), strict=True)
-    )
-    on_plane = plane.positions(np.stack(np.meshgrid(x, y), axis=-1))
-    eye, aims = (
-        view.to_engine(local) * view.metres_per_engine_unit for local in (plane.default_device_position, on_plane)
-    )
-    sensors = _first_hits(view, eye, aims)
+    eye = view.to_engine(view.wall.default_device_position) * view.metres_per_engine_unit
+    sensors = _first_hits(view, eye, _aims(view, grid, capture_config.pixel_point or (0.5, 0.5)))
+    areas = None
+    if capture_config.footprint is not None:
+        sensors, areas = _with_areas(view, grid, sensors)
     if sensors.is_empty.all():
         message = "none of its pixels sees a surface. Check position, look_at and fov_deg."
         raise ConfigError.at("capture.camera", message)
@@ -52,7 +49,39 @@ def pixel_points(view: BuiltView, capture_config: CaptureConfig) -> PixelPoints:
         lasers = _lit(view, laser, targets, [f"capture.laser_targets.{number}" for number in range(len(targets))])
     else:
         lasers = _followed(view, laser, sensors)
-    return PixelPoints(view.frame, sensors, lasers)
+    return PixelPoints(view.frame, sensors, lasers, areas)
+
+
+def _aims(view: BuiltView, grid: GridConfig, place: Sequence[float]) -> Float64:
+    """Return a place of each pixel (in pixels from its lower left corner) on the image plane (rows, columns, 3) [m]."""
+    plane = view.wall
+    x, y = (
+        (2 * (np.arange(count) + along - 0.5) + 1 - count) / (2 * count) * extent
+        for count, along, extent in zip((grid.nx, grid.ny), place, (plane.width, plane.height), strict=True)
+    )
+    return view.to_engine(plane.positions(np.stack(np.meshgrid(x, y), axis=-1))) * view.metres_per_engine_unit
+
+
+def _with_areas(view: BuiltView, grid: GridConfig, sensors: FirstHits) -> tuple[FirstHits, PixelAreas]:
+    """Return the pixels' areas, and the sensor points: of pixels that see nothing there, another place that they see.
+
+    A pixel of which no place of ``PROBES`` x ``PROBES`` sees a surface is empty.
+    """
+    eye, sides = sensors.origin, np.linspace(0, 1, PROBES)
+    probes = [_first_hits(view, eye, _aims(view, grid, (x, y))) for y in sides for x in sides]
+    for probe in probes:
+        is_other = sensors.is_empty & probe.is_reached
+        parts = {
+            name: np.where(is_other.reshape(is_other.shape + (1,) * (own.ndim - 2)), getattr(probe, name), own)
+            for name, own in vars(sensors).items()
+            if isinstance(own, np.ndarray) and own.ndim > 1
+        }
+        interactions = dr.select(mi.Bool(is_other.ravel()), probe.interactions, sensors.interactions)
+        sensors = replace(sensors, interactions=interactions, **parts)
+    ways = [np.where(probe.is_reached[..., None], probe.positions - sensors.positions, 0.0) for probe in probes]
+    corners, right, up = (_aims(view, grid, place) for place in ((0, 0), (1, 0), (0, 1)))
+    reach = float(np.linalg.norm(ways, axis=-1).max())
+    return sensors, PixelAreas(corners - eye, np.stack([right[0, 0], up[0, 0]]) - corners[0, 0], reach)
 
 
 def _first_hits(view: BuiltView, origin: Float64, targets: Float64) -> FirstHits:

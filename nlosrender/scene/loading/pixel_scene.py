@@ -45,6 +45,8 @@ def build_pixel_scene(scene_config: SceneConfig, capture_config: CaptureConfig) 
     """
     view = build_view(scene_config, capture_config)
     pixels = pixel_points(view, capture_config)
+    if pixels.areas is not None:
+        return _scene_without_wall(view, pixels, "sensor points stand for all that their pixels see")
     try:
         built = _scene_with_wall(view, scene_config, pixels)
     except _NoWallError as obstacle:

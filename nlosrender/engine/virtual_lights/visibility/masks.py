@@ -21,6 +21,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from nlosrender.capture.footprint import Footprint
 from nlosrender.capture.grids import Capture
 from nlosrender.capture.plan import Batch
 from nlosrender.engine.launch.device_arrays import on_device
@@ -86,7 +87,7 @@ class WallTiles:
 
 def footprint_margin(built: BuiltScene, capture: Capture) -> Float64:
     """Return how far the footprints of sensor points reach along the wall's axes (2,) [engine units]."""
-    seen = capture.footprint
+    seen = capture.footprint if isinstance(capture.footprint, Footprint) else None
     return np.zeros(2) if seen is None else np.array([seen.width, seen.height]) / (2 * built.metres_per_engine_unit)
 
 

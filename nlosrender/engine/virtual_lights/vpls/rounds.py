@@ -23,6 +23,7 @@ from nlosrender.engine.launch.histogram import DeviceHistogram, Histogram, Histo
 from nlosrender.engine.launch.launch_params import LaunchParams
 from nlosrender.engine.launch.passes import Passes, PassSize, Snapshot
 from nlosrender.engine.launch.pilot_points import Pilot, spread
+from nlosrender.engine.launch.sensor_footprint import SensorFootprint
 from nlosrender.engine.launch.wall_points import laser_points
 from nlosrender.engine.virtual_lights.visibility.masks import VisibilityMasks, WallTiles
 from nlosrender.engine.virtual_lights.vpls.gather import NO_SLOT, VplTable, gather_contributions
@@ -311,7 +312,7 @@ class VplBounces:
 
     def _placed(self, params: LaunchParams, shape: HistogramShape, number: int) -> LaunchParams:
         """Return these with the sensor points at places in their footprints, another one per round and replica."""
-        if params.footprint is None:
+        if not isinstance(params.footprint, SensorFootprint):
             return params
         places = params.footprint.places(number * shape.replicas + np.arange(shape.replicas))
         replica = dr.arange(mi.UInt32, shape.lanes) // shape.sensors
