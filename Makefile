@@ -1,5 +1,5 @@
 # Two commands do everything on a fresh machine: `make render` and `make test`.
-PYTHON ?= $(shell command -v python3.11 || command -v python3.12 || command -v python3.13 || command -v python3)
+PYTHON ?= $(shell for name in python3.11 python3.12 python3.13 python3; do $$name -c '' 2>/dev/null && command -v $$name && break; done)
 VENV := .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
@@ -90,15 +90,8 @@ wheel: $(VENV)/.dev ## Build the package: dist/nlosrender-VERSION-py3-none-any.w
 	$(PIP) wheel --no-deps --no-build-isolation --wheel-dir dist .
 	@ls -s --block-size=KiB dist/*.whl
 
-pythons: wheel ## Install the wheel for every Python from 3.11 to 3.13 that is here, and test it: unit tests, commands from Python, docs.
-	@for version in 3.11 3.12 3.13; do \
-		python$$version -c '' 2>/dev/null || { echo "python$$version is not here: left out"; continue; }; \
-		rm -rf .venv-$$version && python$$version -m venv .venv-$$version \
-		&& .venv-$$version/bin/python -m pip --disable-pip-version-check --quiet install $(PINS) \
-			"$$(ls dist/*.whl)[llvm,xarray]" pytest hypothesis 'setuptools>=77' \
-		&& echo "python$$version" && .venv-$$version/bin/pytest -q -p no:cacheprovider tests/unit tests/cli/test_python_api.py tests/paths \
-		|| exit 1; \
-	done
+pythons: wheel ## Test the wheel with every other Python from 3.11 to 3.13 that is here: unit tests, commands from Python, docs.
+	.ci/pythons $(BIN)/python
 
 clean: ## Remove what make made, but not out/.
 	rm -rf $(VENV) .venv-* build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache
