@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 from nlosrender.errors import OptionError
 from nlosrender.files.atomic_write import replacing
 from nlosrender.files.file_kinds import PICTURES, FileKind
+from nlosrender.files.path_argument import path_argument
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -40,7 +41,7 @@ class Picture:
         """
         from matplotlib import rc_context
 
-        path = Path(path)
+        path = path_argument("path", path)
         # TrueType: publishers refuse matplotlib's own Type 3 fonts
         with replacing(path, picture_kind(path), sources) as partial, rc_context({"pdf.fonttype": 42}):
             self.figure.savefig(partial, format=path.suffix[1:].lower(), dpi=self.dots_per_inch)

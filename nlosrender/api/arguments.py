@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
+from numbers import Real
 from operator import index
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -12,6 +13,7 @@ import numpy as np
 
 from nlosrender.analysis.laser_view import Point, check_point
 from nlosrender.errors import OptionError
+from nlosrender.files.path_argument import path_argument
 from nlosrender.files.reading.reader import Part, StoredCapture, read_header
 from nlosrender.files.reading.scan import read_scan
 from nlosrender.files.reading.stored_header import StoredHeader
@@ -23,14 +25,19 @@ if TYPE_CHECKING:
 def sensor_for(
     path: Path, sensor: str | os.PathLike[str] | Mapping[str, object] | None, changes: Sequence[str]
 ) -> SensorConfig | None:
-    """Return the sensor that is described; None: that of the capture file, as it is. Errors as of ``load_sensor``."""
+    """Return the sensor that is described; None: that of the capture file, as it is.
+
+    Errors are those of ``load_sensor``, and OptionError for an argument of another type.
+    """
     from nlosrender.config.sensor_load import load_sensor
     from nlosrender.files.measured import sensor_of
 
     if sensor is None and not changes:
         return None
     known = sensor_of(read_header(path)) if sensor is None else None
-    return load_sensor(os.fspath(sensor) if isinstance(sensor, os.PathLike) else sensor, known, changes)
+    if sensor is not None and not isinstance(sensor, Mapping):
+        sensor = str(path_argument("sensor", sensor, "a mapping, a profile or the name of a YAML file"))
+    return load_sensor(sensor, known, changes)
 
 
 def bounce_indices(header: StoredHeader, bounces: int | Sequence[int] | None) -> tuple[int, ...] | None:
@@ -70,8 +77,8 @@ def check_parts(name: str, parts: tuple[Part, Part] | None) -> None:
 
 def nearest_point(stored: StoredCapture, x: float | None, y: float | None) -> Point:
     """Return row and column of the sensor point nearest to a place on a flat wall [m]."""
-    if x is None or y is None:
-        raise OptionError("histogram: need x and y [m], or pixel=(row, column)")
+    if not (isinstance(x, Real) and isinstance(y, Real)):
+        raise OptionError(f"x, y: got {x!r:.60}, {y!r:.60}, need two numbers [m], or pixel=(row, column)")
     scan = None if stored.header.has_pixels else read_scan(stored)
     if scan is None or not scan.planar:
         what = "a camera" if scan is None else "a curved wall"

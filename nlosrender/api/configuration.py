@@ -14,6 +14,7 @@ from nlosrender.config.overrides import apply_overrides
 from nlosrender.config.sweep_load import Sweep, sweep_of
 from nlosrender.config.warnings import config_warnings
 from nlosrender.config.yaml_tree import Document
+from nlosrender.files.path_argument import path_argument
 from nlosrender.scene.item_bounds import item_bounds
 
 if TYPE_CHECKING:
@@ -82,6 +83,8 @@ def load(source: Source, changes: Changes | Iterable[str] = ()) -> Configuration
     ------
     ConfigError
         With every mistake found; ``issues`` has the key of each.
+    OptionError
+        An argument is of another type.
     """
     if isinstance(source, Configuration):
         document, file = source.document.copy(), source.file
@@ -90,7 +93,7 @@ def load(source: Source, changes: Changes | Iterable[str] = ()) -> Configuration
         document, file = mapping_document(source), None
         apply_overrides(document, change_texts(changes))
     else:
-        file = Path(source)
+        file = path_argument("source", source, "a mapping, a Configuration, or the name of a YAML file")
         document = load_document(file, change_texts(changes))
     sweep = sweep_of(document, item_bounds)
     return Configuration(document, file, sweep, config_of(document) if sweep is None else None)

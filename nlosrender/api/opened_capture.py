@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import html
 import os
-from collections.abc import Iterable, Mapping, Sequence
-from pathlib import Path
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from numbers import Real
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
@@ -19,6 +19,7 @@ from nlosrender.config.mapping_load import Changes, change_texts
 from nlosrender.constants import SPEED_OF_LIGHT, opl_to_seconds
 from nlosrender.errors import OptionError
 from nlosrender.files.attributes import json_object
+from nlosrender.files.path_argument import path_argument
 from nlosrender.files.reading.reader import Part, open_capture, read_header
 from nlosrender.files.reading.stored_header import StoredHeader
 
@@ -49,11 +50,11 @@ class Capture:
     FileError
         Here and in all methods: the file is missing, damaged or not a capture.
     OptionError
-        In methods: it has no such part.
+        It has no such part, or an argument is of another type.
     """
 
     def __init__(self, path: str | os.PathLike[str], report: RenderReport | None = None):
-        self.path = Path(path)
+        self.path = path_argument("path", path)
         self.report = report
         read_header(self.path)
 
@@ -144,7 +145,7 @@ class Capture:
         with open_capture(self.path) as stored:
             header = stored.header
             start, end = opl_to_seconds(header.start_opl), opl_to_seconds(header.end_opl)
-            if not start <= t < end:
+            if not (isinstance(t, Real) and start <= t < end):
                 raise OptionError(f"t: got {t!r}, need a time from {start:.6g} to below {end:.6g} s")
             position = (t * SPEED_OF_LIGHT - header.start_opl) / header.bin_width_opl
             index = min(max(int(position), 0), header.n_bins - 1)
@@ -218,7 +219,8 @@ class Capture:
         from nlosrender.analysis.plots import capture_picture
 
         look = PictureStyle(theme, size, dpi, shared_scale)
-        return capture_picture(self.path, laser, pixel, None if ideal is None else Path(ideal), look)
+        source = None if ideal is None else path_argument("ideal", ideal)
+        return capture_picture(self.path, laser, pixel, source, look)
 
     def measure(
         self,
@@ -255,9 +257,9 @@ class Capture:
         """
         from nlosrender.files.measured import CORRECTABLE, measure_capture
 
-        if unknown := [name for name in correct if name not in CORRECTABLE]:
-            raise OptionError(f"correct: got {unknown[0]!r}, need some of {', '.join(CORRECTABLE)}")
-        target, config = Path(out), sensor_for(self.path, sensor, change_texts(changes))
+        if not isinstance(correct, Collection) or any(name not in CORRECTABLE for name in correct):
+            raise OptionError(f"correct: got {correct!r:.60}, need a list of some of {', '.join(CORRECTABLE)}")
+        target, config = path_argument("out", out), sensor_for(self.path, sensor, change_texts(changes))
         with reported(progress, "measure") as told:
             measure_capture(
                 self.path, target, config, told, warn_caller, corrections=tuple(correct), overwrite=overwrite

@@ -15,6 +15,7 @@ from nlosrender.config.mapping_load import Changes, change_texts
 from nlosrender.errors import OptionError, RenderError
 from nlosrender.files.atomic_write import refuse_sources
 from nlosrender.files.packages.package import pack
+from nlosrender.files.path_argument import path_argument
 from nlosrender.pipeline import render_capture
 from nlosrender.rendering.sweep_render import SweepReport, render_sweep
 
@@ -63,7 +64,7 @@ def render(
     ConfigError
         The configuration has mistakes, or is a sweep (:func:`render_all`), or ``strict``.
     OptionError
-        ``overwrite`` and ``resume`` exclude each other.
+        ``overwrite`` and ``resume`` exclude each other, or an argument is of another type.
     BackendError, FileError, RenderError, IncompleteRender, InterruptedRender
         As ``nlosrender render`` ends.
     """
@@ -159,7 +160,7 @@ def refuse_failed(report: SweepReport) -> None:
 
 
 def _output(out: str | os.PathLike[str] | None) -> Iterable[str]:
-    return () if out is None else output_change(Path(out))
+    return () if out is None else output_change(path_argument("out", out))
 
 
 def output_change(output: Path) -> Iterable[str]:

@@ -47,9 +47,9 @@ def change_texts(changes: Changes | Iterable[str]) -> tuple[str, ...]:
         An item is no text.
     """
     if not isinstance(changes, Mapping):
-        texts = (changes,) if isinstance(changes, str) else tuple(changes)
+        texts = (changes,) if isinstance(changes, str) or not isinstance(changes, Iterable) else tuple(changes)
         if other := [text for text in texts if not isinstance(text, str)]:
-            raise OptionError(f"changes: got {other[0]!r}, need texts KEY=VALUE, or a mapping of keys and values")
+            raise OptionError(f"changes: got {other[0]!r:.60}, need texts KEY=VALUE, or a mapping of keys and values")
         return texts
     document = Document("changes", Path.cwd(), "", places={(): Place("changes", "changes")})
     values = {str(key): _plain(value, tuple(str(key).split(".")), document) for key, value in changes.items()}

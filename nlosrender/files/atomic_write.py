@@ -18,6 +18,7 @@ from pathlib import Path
 
 from nlosrender.errors import DiskError, FileError
 from nlosrender.files.file_kinds import PICTURES, FileKind
+from nlosrender.files.path_argument import path_argument
 from nlosrender.interruption import uninterrupted
 from nlosrender.readable import readable_size
 
@@ -42,6 +43,7 @@ def check_writable(path: str | Path, kind: FileKind, sources: Iterable[str | Pat
         The folder is missing, is not a folder or cannot be written to, or the path is taken by something that is
         not a file, by one of ``sources``, or by a file of another kind.
     """
+    path = path_argument("path", path)
     try:
         target = Path(os.path.realpath(path))
         if target.is_dir():

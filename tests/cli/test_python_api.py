@@ -278,14 +278,14 @@ def test_listed_points_have_places_of_their_own(tmp_path: Path) -> None:
         (lambda capture: capture.frame(1.0), "t: got 1.0, need a time from 5.00346e-09 to below 1.50104e-08 s"),
         (lambda capture: capture.frame(float("nan")), "t: got nan"),
         (lambda capture: capture.frame(6e-9, laser=(4, 0)), "laser: got 4,0, need a row from 0 to 3"),
-        (lambda capture: capture.histogram(), "need x and y"),
+        (lambda capture: capture.histogram(), r"need two numbers \[m\], or pixel"),
         (lambda capture: capture.histogram(0.0, 0.9), "x, y: got 0, 0.9, off the sensor grid"),
         (lambda capture: capture.histogram(float("nan"), 0), "off the sensor grid"),
         (lambda capture: capture.histogram(pixel=(-1, 0)), "pixel: got -1,0"),
         (lambda capture: capture.plot(laser=(0, 2)), "--laser: got 0,2"),
         (lambda capture: capture.plot(theme="lite"), "--theme: got 'lite'"),
         (lambda capture: capture.reconstruct(bounces=5), "--bounces: got '5'"),
-        (lambda capture: capture.measure("m.hdf5", "spad-532", correct=["noise"]), "correct: got 'noise'"),
+        (lambda capture: capture.measure("m.hdf5", "spad-532", correct=["noise"]), r"correct: got \['noise'\]"),
         (lambda capture: capture.reconstruct("fk"), "--method: got 'fk'"),
     ],
 )
@@ -349,3 +349,30 @@ def test_what_is_no_capture_is_not_opened(tmp_path: Path) -> None:
     """At once, with the reader's words."""
     with pytest.raises(FileError, match="there is no such file"):
         nr.open(tmp_path / "none.hdf5")
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda capture: nr.load(3), "source: got 3, need a mapping, a Configuration, or the name of a YAML"),
+        (lambda capture: nr.plan(None), "source: got None"),
+        (lambda capture: nr.load(SCENE, 5), "changes: got 5, need texts KEY=VALUE"),
+        (lambda capture: nr.open(capture), "path: got <nlosrender.Capture .*, need the name of a file: text or"),
+        (lambda capture: nr.open(b"z.hdf5"), "path: got b'z.hdf5'"),
+        (lambda capture: nr.render(SCENE, {"render.seed": 3}), "out: got {'render.seed': 3}, need the name of a file"),
+        (lambda capture: capture.plot(ideal=5), "ideal: got 5"),
+        (lambda capture: capture.plot().save(None), "path: got None"),
+        (lambda capture: capture.reconstruct(voxels=4).save(5), "path: got 5"),
+        (lambda capture: capture.measure(5, "spad-532"), "out: got 5"),
+        (lambda capture: capture.measure("m.hdf5", 5), "sensor: got 5, need a mapping, a profile or"),
+        (lambda capture: capture.measure("m.hdf5", correct=5), "correct: got 5, need a list of some of pile_up"),
+        (lambda capture: capture.reconstruct(voxels=4.5), "--voxels: got 4.5, need an integer >= 1"),
+        (lambda capture: capture.frame("6e-9"), "t: got '6e-9', need a time"),
+        (lambda capture: capture.histogram("0", 0), "x, y: got '0', 0, need two numbers"),
+        (lambda capture: nr.start_backend("gpu"), "wanted: got 'gpu', need one of auto, llvm, cuda"),
+    ],
+)
+def test_arguments_of_another_type_are_refused(rendered: nr.Capture, call: Any, message: str) -> None:
+    """By the argument's name and what it has to be, as other mistakes are."""
+    with pytest.raises(OptionError, match=message):
+        call(rendered)

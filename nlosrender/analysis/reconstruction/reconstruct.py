@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass
+from numbers import Integral
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -57,8 +58,8 @@ class ReconstructionSettings:
             raise OptionError(f"--bounces: got {self.bounces!r}, need 3 or all")
         if self.voxels is not None and self.voxel_size is not None:
             raise OptionError("--voxels and --voxel-size: give one of them, the other follows from the volume")
-        if self.voxels is not None and self.voxels < 1:
-            raise OptionError(f"--voxels: got {self.voxels}, need an integer >= 1")
+        if self.voxels is not None and not (isinstance(self.voxels, Integral) and self.voxels >= 1):
+            raise OptionError(f"--voxels: got {self.voxels!r}, need an integer >= 1")
         for option, lengths, counts in (
             ("voxel-size", None if self.voxel_size is None else (self.voxel_size,), (1,)),
             ("volume-size", self.volume_size, (1, 3)),

@@ -9,10 +9,10 @@ import ctypes
 import os
 import sys
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, get_args
 
 from nlosrender.engine.backend import llvm
-from nlosrender.errors import BackendError, ConfigError
+from nlosrender.errors import BackendError, ConfigError, OptionError
 from nlosrender.interruption import uninterrupted
 
 BackendName = Literal["auto", "llvm", "cuda"]
@@ -64,12 +64,16 @@ def start_backend(wanted: BackendName = "auto", *, colored: bool = False, polari
 
     Raises
     ------
+    OptionError
+        ``wanted`` is none of these names.
     BackendError
         There is no GPU although ``cuda`` is wanted, or no LLVM that works, or no current folder. The message says what
         to do.
     KeyboardInterrupt
         Ctrl-C was pressed meanwhile.
     """
+    if wanted not in get_args(BackendName):
+        raise OptionError(f"wanted: got {wanted!r}, need one of {', '.join(get_args(BackendName))}")
     with uninterrupted():  # an import that Ctrl-C cuts off ends in errors of its own, or a crash
         return _started(wanted, colored, polarized)
 
