@@ -35,6 +35,7 @@ class Budget:
     # of the virtual lights: the difference of their two resolutions over the error of the finer one; None: a bound
     difference_divisor: float | None = None
     rounds: int | None = None  # of the virtual lights: rounds of VPL subpaths
+    bins_per_step: int | None = None  # of the virtual lights: bins in a time step of the light of VPLs
     footprint_places: int | None = None  # of the virtual lights: places in the footprint of a sensor point
 
     @property

@@ -163,11 +163,16 @@ class DeviceHistogram:
 
         ``known_squares`` is the sum of squares of the part of H that is known from elsewhere.
         """
+        noise, energy = self.squares(samples_per_lane)
+        return relative_l2_error(noise, energy + known_squares)
+
+    def squares(self, samples_per_lane: int) -> tuple[float, float]:
+        """Return the sum of variances, and that of the squared estimate, inside the time window."""
         mean, variance = self.statistics(samples_per_lane)
         inside = dr.arange(mi.UInt32, dr.width(mean)) % self.shape.row < self.shape.n_bins
         noise = dr.sum(dr.select(inside, variance, 0))
         energy = dr.sum(dr.select(inside, dr.square(mean), 0))
-        return relative_l2_error(float(noise[0]), float(energy[0]) + known_squares)
+        return float(noise[0]), float(energy[0])
 
 
 @dataclass(frozen=True, eq=False)

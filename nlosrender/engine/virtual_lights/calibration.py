@@ -58,28 +58,35 @@ def calibrated_lights(
     refined = refined_to(share * target, third.tessellator, gather, known_squares)
     if further is None:
         return _with_patches(budget, refined), (refined.error / target) ** 2 + share_of_places**2
+    if further.shares_subpaths:
+        pilot = few
     gathered, more = refined.gathered, pilot.sensors.size / few.sensors.size
     goal, squares = tuning.rest_share_of_many * target, gathered.squares * more
     squares += device.exact_squares(pilot)
     histogram = further.histogram(pilot, further.pilot_replicas(pilot.sensors.size))
     done, error = 0, math.inf
     while done < tuning.max_pilot_rounds and error > tuning.max_pilot_error * goal:
-        further.accumulate(pilot, histogram, done)
-        done += 1
+        further.accumulate(pilot, histogram, done, units=further.pilot_units)
+        done += further.pilot_units
         mixed = 0.0  # in the square of the sum of all bounces
         if few is pilot and not device.options.bounces.split:
             mean = histogram.on_host(histogram.statistics(done)[0])
             mixed = 2 * float(np.einsum("csltb,csltb->", mean[..., :-1], gathered.values[..., :-1]))
         error = histogram.relative_error(done, squares + mixed)
-    finer = further.share_of_third(gathered.n_patches, share, share_squares, error * math.sqrt(done) / target)
+    steps = further.time_steps(histogram, done, squares + mixed, target)
+    error, of_steps = steps.error, (steps.change / target) ** 2
+    share_squares -= of_steps
+    finer = further.share_of_third(
+        gathered.n_patches, share, share_squares, error * math.sqrt(done) / target, steps.bins
+    )
     if finer < share:
         share = finer
         refined = refined_to(share * target, third.tessellator, gather, known_squares, refined.patch_scale)
     # patches come in steps: what they leave of their share is spent on rounds
     third_squares = min(share, refined.error / target) ** 2 + share_of_places**2
     rounds = further.rounds_needed(error, done, math.sqrt(share_squares - third_squares) * target)
-    used = third_squares + (error / target) ** 2 * done / rounds
-    return replace(_with_patches(budget, refined), rounds=rounds), min(used, share_squares)
+    used = min(third_squares + (error / target) ** 2 * done / rounds, share_squares) + of_steps
+    return replace(_with_patches(budget, refined), rounds=rounds, bins_per_step=steps.bins), used
 
 
 def _places_of_footprint(third: ThirdBounce, few: Pilot, target: float, known_squares: float) -> int:

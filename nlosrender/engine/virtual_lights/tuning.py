@@ -151,15 +151,25 @@ class VirtualLightTuning:
     # 10.4 / 8.3 at 16 / 64 / 256 (bunny, principled), 23.7 / 10.9 / 8.0 (GGX 0.2).
     max_glossy_subpaths: int = 256
     # Single-laser captures: VPLs that share subpaths, all replicas together, 1 to ``max_units`` times as many a round.
-    # Room 25 / 17 / 17, plates 3.5 / 2.5 / 2.6, bunny 370 / 246 / 187 at 1 / 4 / 8 units: large rounds err less.
-    sharing_vpls: int = 512
-    max_units: int = 8
+    # Variance times CPU seconds of 2 / 4 / 8 / 16 units: room 25 / 19 / 20 / 20 in steps of 4 bins.
+    sharing_vpls: int = 256
+    max_units: int = 16
+    pilot_units: int = 2
+    # Power of the units of a round by which the error falls. Room, steps of 4 bins: 11.6 / 7.7 / 5.3 / 3.7 % at 2 / 4 /
+    # 8 / 16 units.
+    order_of_units: float = 0.55
     # Subpaths of such a VPL, one per 8 sensor points. Room 18.9 / 18.3 / 19.0 at 128 / 192 / 256; before 64 x 64
     # points 56 / 51 / 52, bunny 231 / 202 / 219 at 128 / 256 / 512.
     max_shared_subpaths: int = 256
-    groups_at_once: int = 4  # of a replica: 256 histograms
+    # Bins of the time steps that their light is added in: the first that changes no more than this part of the target.
+    # Variance times CPU seconds of 4 units of 512 VPLs, room: 61 / 39 / 20 / 9 at 1 / 2 / 4 / 8 bins.
+    bins_per_step: tuple[int, ...] = (8, 4, 2)
+    share_of_steps: float = 0.25
+    groups_at_once: int = 4  # of a replica: 256 histograms; as many times more as a step has bins
     max_histogram_values: int = 2**24  # of them together: 0.13 GB
-    histogram_cost: int = 16  # for a sensor point to add one, in patches: 0.2 us and 15 ns (room)
+    # For a sensor point to add a histogram, in patches: 0.2 us and 15 ns in steps of one bin, 0.1 us in steps of 4.
+    connection_cost: int = 4
+    histogram_cost: int = 12  # over the bins of a step
     max_contribution_values: int = 2**24  # of a round, times lasers: 0.3 GB
     # Of the target: paths of light that delta lobes reflect, beside VPLs, which take far less time (plastic bunny, 5
     # bounces, 2 %: 77,000 paths per sensor point at 0.3).

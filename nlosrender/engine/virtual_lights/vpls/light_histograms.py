@@ -15,23 +15,18 @@ import mitsuba as mi
 import numpy as np
 
 from nlosrender.engine.launch.device_arrays import on_device
-from nlosrender.engine.launch.histogram import DeviceHistogram, HistogramShape
+from nlosrender.engine.launch.histogram import DeviceHistogram
 from nlosrender.engine.launch.launch_params import LaunchParams
 from nlosrender.engine.launch.ray_offsets import offset_origin
 from nlosrender.engine.virtual_lights.gather.device_patches import normal_reflectance, surface_at
 from nlosrender.engine.virtual_lights.visibility.masks import WallTiles
 from nlosrender.engine.virtual_lights.vpls.gather import VplTable, connect_to_vpl
 from nlosrender.engine.virtual_lights.vpls.sampler import Vpls
+from nlosrender.engine.virtual_lights.vpls.step_sums import BLOCK, BLOCK_BITS, PARTS, PARTS_BITS, StepSums, divided
 from nlosrender.engine.virtual_lights.vpls.subpaths import FirstHit, VplContributions
 from nlosrender.scene.build import BuiltScene
 
 GROUP = 64  # VPLs that share their subpaths: bits of a mask. Room 10.6 / 7.5 / 5.8 / 4.7 % at 1 / 4 / 16 / 64
-PARTS_BITS, BLOCK_BITS = 1, 3
-PARTS = 2**PARTS_BITS  # of a bin, which delays are rounded to: light moves by at most half of one, by none on average
-BLOCK = 2**BLOCK_BITS  # bins that are added at once: 0.50 ns a bin; 0.59 at 4
-# Of the VPLs' light, the last is added for some of the VPLs only: it takes most of the bins. Variance times CPU time of
-# the room 24.6 / 23.3 / 23.2 at 0.9, 1/8 / 0.95, 1/4 / 0.98, 1/8.
-TAIL, TAIL_SHARE = 0.05, 1 / 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,10 +106,11 @@ def deposit_shared(
     number: mi.UInt32,
     shared: SharedContributions,
     bins_per_unit: mi.Float,
+    parts_per_bin: mi.Float,
     lowest: mi.UInt32,
     histogram: DeviceHistogram,
 ) -> None:
-    """Deposit what VPLs receive of their group, by parts of bins from the laser point on: a lane per VPL.
+    """Deposit what VPLs receive of their group, by parts of steps from the laser point on: a lane per VPL.
 
     ``number``: of the VPL in the round. ``lowest``: bounce of the histogram's first slot.
     """
@@ -124,13 +120,25 @@ def deposit_shared(
     contribution, end = dr.gather(mi.UInt32, shared.bounds, group), dr.gather(mi.UInt32, shared.bounds, group + GROUP)
     while dr.hint(
         contribution < end,
-        exclude=[receivers, shared, contributions, bins_per_unit, lowest, histogram, shape, lane, bit, end],
+        exclude=[
+            receivers,
+            shared,
+            contributions,
+            bins_per_unit,
+            parts_per_bin,
+            lowest,
+            histogram,
+            shape,
+            lane,
+            bit,
+            end,
+        ],
     ):
         density, distance = receivers.density(dr.gather(FirstHit, contributions.firsts, contribution))
         share = density / dr.gather(mi.Float, shared.densities, contribution)
         value = receivers.reflectance * dr.gather(mi.Spectrum, contributions.values, contribution) * share
         delay = dr.gather(mi.Float, contributions.delays, contribution) + distance * bins_per_unit
-        bins = mi.Int32(dr.floor(dr.minimum(delay, 1e8) * PARTS))
+        bins = mi.Int32(dr.floor(dr.minimum(delay, 1e8) * parts_per_bin))
         slot = dr.minimum(dr.gather(mi.UInt32, contributions.bounces, contribution) - lowest, shape.slots - 1)
         sees = ((dr.gather(mi.UInt64, shared.seen_by, contribution) >> bit) & 1) == 1
         histogram.deposit(lane, mi.UInt32(0), slot, bins, value, sees)
@@ -139,67 +147,38 @@ def deposit_shared(
 
 @dataclass(frozen=True, eq=False)
 class LightHistograms:
-    """Light that leaves VPLs over time, once for every part of a bin that a delay may begin with."""
+    """Light that leaves VPLs over time, once for every part of a step that a delay may begin with."""
 
-    bins: mi.Float  # (VPL, row, part, bin): light that falls into each bin after a delay of so many parts
-    later: mi.Float  # (VPL, row, part of a bin): light from there on, behind the histogram included
-    spans: mi.UInt32  # (VPL, row, 2): the first bin that holds light, and the one behind the last
+    bins: mi.Float  # (VPL, row, part, step): light that falls into each step after a delay of so many parts
+    later: mi.Float  # (VPL, row, part of a step): light from there on, behind the histogram included
+    spans: mi.UInt32  # (VPL, row, 2): the first step that holds light, and the one behind the last
     n_bins: int
 
     @classmethod
-    def of(cls, histogram: DeviceHistogram, generator: np.random.Generator) -> LightHistograms:
-        """Return those of VPLs, a lane each; of a random part of them the ``TAIL`` of the light counts the more."""
+    def of(cls, histogram: DeviceHistogram) -> LightHistograms:
+        """Return those of VPLs, a lane each."""
         shape = histogram.shape
         row, rows, n_bins = shape.row, shape.rows_per_lane, shape.n_bins // PARTS
         lines = shape.lanes * rows
-        line, part = _divided(dr.arange(mi.UInt32, lines * row), row)
-        vpl, row_of_vpl = _divided(line, rows)
+        line, part = divided(dr.arange(mi.UInt32, lines * row), row)
+        vpl, row_of_vpl = divided(line, rows)
         light = mi.Float(dr.gather(mi.Float64, histogram.sums, vpl * shape.entries_per_lane + row_of_vpl * row + part))
-        later = dr.block_prefix_reduce(dr.ReduceOp.Add, light, row, exclusive=False, reverse=True)
-        dr.eval(light, later)
-        is_tail = later < TAIL * dr.gather(mi.Float, later, line * row)
-        tail = dr.block_reduce(dr.ReduceOp.Max, dr.select(is_tail, later, 0), row)
-        kept = on_device(mi.Float, (generator.random(shape.lanes) < TAIL_SHARE) / TAIL_SHARE)
-        factor = dr.gather(mi.Float, kept, vpl)
-        light = dr.select(is_tail, factor, 1) * light
-        later = dr.select(is_tail, later * factor, later + dr.gather(mi.Float, tail, line) * (factor - 1))
         is_lit = (light > 0) & (part < n_bins * PARTS)
-        first = dr.block_reduce(dr.ReduceOp.Min, dr.select(is_lit, part // PARTS, n_bins), row)
-        # light of the last part of a bin falls into the next one where the delay begins with a part
-        end = dr.block_reduce(dr.ReduceOp.Max, dr.select(is_lit, (part + PARTS - 1) // PARTS + 1, 0), row)
-        dr.eval(light, later, first, end)
-        rest, entry = _divided(dr.arange(mi.UInt32, lines * PARTS * n_bins), n_bins)
-        line, part = _divided(rest, PARTS)
+        first = dr.select(is_lit, part // PARTS, n_bins)
+        # light of the last part of a step falls into the next one where the delay begins with a part
+        end = dr.select(is_lit, (part + PARTS - 1) // PARTS + 1, 0)
+        dr.eval(light, first, end)
+        later = dr.block_prefix_reduce(dr.ReduceOp.Add, light, row, exclusive=False, reverse=True)
+        first, end = dr.block_reduce(dr.ReduceOp.Min, first, row), dr.block_reduce(dr.ReduceOp.Max, end, row)
+        rest, entry = divided(dr.arange(mi.UInt32, lines * PARTS * n_bins), n_bins)
+        line, part = divided(rest, PARTS)
         bins = mi.Float(0)
         for k in range(PARTS):
             place = mi.Int32(entry * PARTS + k) - mi.Int32(part)
             bins += dr.gather(mi.Float, light, line * row + mi.UInt32(place), place >= 0)
         spans = dr.ravel(mi.Vector2u(first, dr.minimum(end, n_bins)))
-        dr.eval(bins, spans)
+        dr.eval(bins, spans, later)
         return cls(bins, later, spans, n_bins)
-
-
-class BlockSums:
-    """Sums of a batch by blocks of bins, float32: of one chunk of VPLs."""
-
-    def __init__(self, shape: HistogramShape):
-        self.shape, self.blocks = shape, -(-shape.n_bins // BLOCK)
-        lines = shape.lanes * shape.rows_per_lane
-        self.sums, self.outside = dr.zeros(mi.Float, lines * self.blocks * BLOCK), dr.zeros(mi.Float, lines)
-        dr.make_opaque(self.sums, self.outside)
-
-    def add_to(self, histogram: DeviceHistogram) -> None:
-        """Add them to ``histogram``."""
-        shape = self.shape
-        dr.eval(self.sums, self.outside)
-        lane, place = _divided(dr.arange(mi.UInt32, shape.size), shape.entries_per_lane)
-        row, entry = _divided(place, shape.row)
-        owns, is_last, line = row < shape.rows_per_lane, entry == shape.n_bins, lane * shape.rows_per_lane + row
-        added = dr.gather(mi.Float, self.sums, line * (self.blocks * BLOCK) + entry, owns & ~is_last)
-        added += dr.gather(mi.Float, self.outside, line, owns & is_last)
-        histogram.sums += mi.Float64(added)
-        dr.eval(histogram.sums)
-        dr.sync_thread()
 
 
 @dr.syntax
@@ -211,9 +190,9 @@ def gather_histograms(
     first_vpl: mi.UInt32,
     size: int,
     light: LightHistograms,
-    block_sums: BlockSums,
+    step_sums: StepSums,
 ) -> None:
-    """Add the histograms of a chunk of VPLs to ``block_sums``: a lane loops over the VPLs of its replica.
+    """Add the histograms of a chunk of VPLs to ``step_sums``: a lane loops over the VPLs of its replica.
 
     Parameters
     ----------
@@ -223,15 +202,19 @@ def gather_histograms(
         Of each lane, the first VPL of the chunk, numbered in the round; VPLs of the chunk, of each replica.
     light
         Their histograms, replica by replica.
-    block_sums
+    step_sums
         Of the lanes.
     """
-    sensors, shape, sums, outside = params.sensors, block_sums.shape, block_sums.sums, block_sums.outside
+    sensors, shape, sums, outside = params.sensors, step_sums.shape, step_sums.sums, step_sums.outside
     lane, chunk = dr.arange(mi.UInt32, shape.lanes), dr.opaque(mi.UInt32, size)
     n_bins, n_parts = dr.opaque(mi.UInt32, light.n_bins), dr.opaque(mi.Int32, light.n_bins * PARTS)
-    blocks, stop = dr.opaque(mi.Int32, block_sums.blocks), dr.opaque(mi.Int32, shape.n_bins * PARTS)
+    blocks, stop = dr.opaque(mi.Int32, step_sums.blocks), dr.opaque(mi.Int32, shape.n_bins * PARTS)
     own_laser = params.lasers.gather(params.first_laser)
     legs, fraction = own_laser.delay_bins + sensors.delay_bins, own_laser.delay_fraction + sensors.delay_fraction
+    bins_per_step = dr.opaque(mi.Int32, step_sums.bins_per_step)
+    whole = dr.select(legs >= 0, legs * PARTS, legs * PARTS - (bins_per_step - 1)) // bins_per_step  # rounded down
+    fraction += mi.Float(legs * PARTS - whole * bins_per_step) / PARTS
+    parts_per_bin = PARTS / mi.Float(bins_per_step)
     tile = wall_tiles.tile_bit(mi.UInt32(0), sensors.interaction.p)
     vpl, entry = mi.UInt32(first_vpl), lane // dr.opaque(mi.UInt32, shape.sensors) * chunk
     end = entry + chunk
@@ -246,8 +229,9 @@ def gather_histograms(
             sums,
             outside,
             end,
-            legs,
+            whole,
             fraction,
+            parts_per_bin,
             tile,
             lane,
             blocks,
@@ -258,8 +242,8 @@ def gather_histograms(
     ):
         connection = connect_to_vpl(params, needs_visibility, table, vpl, tile)
         active = connection.active
-        parts = dr.floor(dr.minimum(connection.distance * params.bins_per_unit + fraction, 1e8) * PARTS + 0.5)
-        delay = mi.Int32(parts) + legs * PARTS
+        parts = dr.floor(dr.minimum(connection.distance * params.bins_per_unit + fraction, 1e8) * parts_per_bin + 0.5)
+        delay = mi.Int32(parts) + whole
         moved_by, part = delay >> PARTS_BITS, mi.UInt32(delay & (PARTS - 1))
         for row in range(shape.rows_per_lane):
             weight = connection.weight[row % shape.channels]
@@ -289,10 +273,3 @@ def gather_histograms(
                 block += 1
         entry += 1
         vpl += 1
-
-
-def _divided(index: mi.UInt32, by: int) -> tuple[mi.UInt32, mi.UInt32]:
-    """Return quotient and rest."""
-    divisor = dr.opaque(mi.UInt32, by)
-    quotient = index // divisor
-    return quotient, index - quotient * divisor

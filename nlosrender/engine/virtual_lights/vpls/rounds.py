@@ -29,8 +29,6 @@ from nlosrender.engine.virtual_lights.visibility.masks import VisibilityMasks, W
 from nlosrender.engine.virtual_lights.vpls.gather import NO_SLOT, VplTable, gather_contributions
 from nlosrender.engine.virtual_lights.vpls.light_histograms import (
     GROUP,
-    PARTS,
-    BlockSums,
     LightHistograms,
     SharedContributions,
     VplReceivers,
@@ -38,6 +36,7 @@ from nlosrender.engine.virtual_lights.vpls.light_histograms import (
     gather_histograms,
 )
 from nlosrender.engine.virtual_lights.vpls.sampler import Vpls, VplSampler
+from nlosrender.engine.virtual_lights.vpls.step_sums import PARTS, StepSums, TimeSteps
 from nlosrender.engine.virtual_lights.vpls.subpaths import (
     ProposalLasers,
     SubpathPlan,
@@ -105,12 +104,13 @@ class VplBounces:
         )
         most = tuning.max_subpaths if is_diffuse else tuning.max_glossy_subpaths
         self.subpaths = int(min(max(pairs / 32, tuning.min_subpaths), most))
-        self.max_units = 1  # of ``vpls_per_round`` VPLs, in one round
+        self.max_units = self.pilot_units = 1  # of ``vpls_per_round`` VPLs, in one round
         # of few sensor points every replica has few VPLs
         has_groups = GROUP * self.options.replicas <= tuning.sharing_vpls * tuning.max_units
         self.shares_subpaths = may_share and has_groups and self._groups_in_memory(self.options.replicas) > 0
         if self.shares_subpaths:
             self.vpls_per_round, self.max_units = tuning.sharing_vpls, tuning.max_units
+            self.pilot_units = tuning.pilot_units
             self.subpaths = int(min(max(pairs / 8, tuning.min_subpaths), tuning.max_shared_subpaths))
 
     @cached_property
@@ -146,7 +146,9 @@ class VplBounces:
         """Return the replicas of a pilot of so many sensor points; groups that share must be as in the render."""
         return self.options.replicas if self.shares_subpaths else max(2, self.tuning.pilot_lanes // sensors // 2 * 2)
 
-    def share_of_third(self, patches: int, largest: float, share_squares: float, noise: float) -> float:
+    def share_of_third(
+        self, patches: int, largest: float, share_squares: float, noise: float, bins_per_step: int = 1
+    ) -> float:
         """Return the one of ``third_shares`` that takes the fewest rays in all (docs/virtual-lights.md, 8).
 
         Parameters
@@ -157,6 +159,8 @@ class VplBounces:
             Part of the target's square that third bounce and VPLs share.
         noise
             Error of one round over the target error.
+        bins_per_step
+            Of the time steps of a round.
         """
         tuning = self.tuning
         shares, rays_per_round = (
@@ -164,7 +168,7 @@ class VplBounces:
             self.vpls_per_round * (1 + self.contributions_per_vpl * self.is_confocal),
         )
         if self.shares_subpaths:
-            rays_per_round *= tuning.histogram_cost
+            rays_per_round *= tuning.connection_cost + tuning.histogram_cost // bins_per_step
 
         def rays(share: float) -> float:
             finer = patches * (largest / share) ** (4 / 3)
@@ -172,13 +176,27 @@ class VplBounces:
 
         return min((share for share in shares if share <= largest), key=rays)
 
-    def rounds_needed(self, error: float, done: int, target: float) -> int:
-        """Return how many rounds bring the ``error`` after ``done`` rounds to ``target``: it falls as 1 / sqrt(rounds).
+    def time_steps(self, pilot: DeviceHistogram, done: int, known_squares: float, target: float) -> TimeSteps:
+        """Return the longest time steps that a ``target`` error allows, by a pilot of ``done`` rounds."""
+        tuning = self.tuning
+        lengths = tuning.bins_per_step if self.shares_subpaths else ()
+        return TimeSteps.longest(pilot, done, known_squares, tuning.share_of_steps * target, lengths)
 
-        At most ``max_rounds``, where no light has been found as well.
+    def rounds_needed(self, error: float, done: int, target: float) -> int:
+        """Return how many units bring the ``error`` of a pilot of ``done`` units to ``target``.
+
+        It falls as 1 / sqrt(rounds), and faster with the units of one round, where VPLs are stratified. At most
+        ``max_rounds``, where no light has been found as well.
         """
-        most = self.tuning.max_rounds
-        return min(max(1, math.ceil(done * (error / target) ** 2)), most) if math.isfinite(error) else most
+        tuning = self.tuning
+        if not math.isfinite(error):
+            return tuning.max_rounds
+        largest = self.max_units / self.pilot_units
+        of_round = error * math.sqrt(done / self.pilot_units)
+        units = self.pilot_units * min((of_round / target) ** (1 / tuning.order_of_units), largest)
+        of_largest = of_round * largest**-tuning.order_of_units
+        units *= max((of_largest / target) ** 2, 1)
+        return min(max(1, math.ceil(units)), tuning.max_rounds)
 
     def histogram(self, batch: Batch | Pilot, replicas: int) -> DeviceHistogram:
         """Return an empty histogram of a batch: bounce slots from the fourth bounce on."""
@@ -212,7 +230,7 @@ class VplBounces:
         while True:
             if not skipped:
                 units = self._units(budget, done, time.perf_counter() - begun)
-            self.accumulate(batch, histogram, done, report_progress, skipped, units)
+            self.accumulate(batch, histogram, done, report_progress, skipped, units, budget.bins_per_step or 1)
             done, skipped = done + units, 0
             if budget.rounds is not None:
                 share = done / budget.rounds
@@ -255,6 +273,7 @@ class VplBounces:
         report_progress: Callable[[int], None] = lambda done: None,
         skipped: int = 0,
         units: int = 1,
+        bins_per_step: int = 1,
     ) -> None:
         """Add a round to ``histogram``, the same for every batch of a capture, ``units`` times what it estimates.
 
@@ -268,6 +287,8 @@ class VplBounces:
             VPLs that every replica is done with already.
         units
             Size of the round: VPLs of one round are stratified, and the error falls faster than with their number.
+        bins_per_step
+            Of the time steps in which light that VPLs share is added.
         """
         shape = histogram.shape
         plan = self.plan(shape.replicas, units)
@@ -287,7 +308,7 @@ class VplBounces:
         table = VplTable.of(self.built, vpls, first_vpls, contributions, self.masks, wall_tiles)
         if self.shares_subpaths:
             views = params, self.masks is not None, wall_tiles, table
-            self._add_shared(views, vpls, contributions, plan, histogram, report_progress, skipped, int(state[1]))
+            self._add_shared(views, vpls, contributions, plan, histogram, report_progress, skipped, bins_per_step)
             return
         # straight, and by way of the mirror one bounce later
         by_mirrors = [None] if mirror is None else [None, mirror]
@@ -328,14 +349,17 @@ class VplBounces:
         histogram: DeviceHistogram,
         report_progress: Callable[[int], None],
         skipped: int,
-        seed: int,
+        bins_per_step: int,
     ) -> None:
         """Add VPLs that share subpaths, in chunks that are the same for every batch (docs/virtual-lights.md, 7.7)."""
         (params, needs_visibility, *_), shape = scene, histogram.shape
         receivers = VplReceivers.of(self.built, vpls)
         shared = SharedContributions.of(self.built, receivers, contributions, needs_visibility)
         lowest = dr.opaque(mi.UInt32, THIRD_BOUNCE + 1)
-        chunk = GROUP * min(self.tuning.groups_at_once, self._groups_in_memory(plan.replicas))
+        chunk = GROUP * min(
+            self.tuning.groups_at_once * bins_per_step, self._groups_in_memory(plan.replicas, bins_per_step)
+        )
+        parts_per_bin = dr.opaque(mi.Float, PARTS / bins_per_step)
         for begin in range(skipped, plan.vpls, chunk):
             size = min(chunk, plan.vpls - begin)
             numbers = np.arange(plan.replicas)[:, None] * plan.vpls + begin + np.arange(size)
@@ -343,31 +367,35 @@ class VplBounces:
             chosen = dr.gather(VplReceivers, receivers, index)
             dr.eval(chosen)
             sums = DeviceHistogram(
-                HistogramShape(1, numbers.size, 1, shape.slots, shape.channels, self._bins_of_vpls * PARTS)
+                HistogramShape(
+                    1, numbers.size, 1, shape.slots, shape.channels, self._steps_of_vpls(bins_per_step) * PARTS
+                )
             )
-            deposit_shared(chosen, index, shared, params.bins_per_unit, lowest, sums)
+            deposit_shared(chosen, index, shared, params.bins_per_unit, parts_per_bin, lowest, sums)
             dr.eval(sums.sums)
-            light = LightHistograms.of(sums, np.random.default_rng([seed, begin]))
-            first, block_sums = on_device(mi.UInt32, np.repeat(numbers[:, 0], shape.sensors)), BlockSums(shape)
-            gather_histograms(*scene, first, size, light, block_sums)
-            block_sums.add_to(histogram)
+            light = LightHistograms.of(sums)
+            first = on_device(mi.UInt32, np.repeat(numbers[:, 0], shape.sensors))
+            step_sums = StepSums(shape, bins_per_step)
+            gather_histograms(*scene, first, size, light, step_sums)
+            step_sums.add_to(histogram)
             if begin + size < plan.vpls:
                 report_progress(begin + size)
 
-    @property
-    def _bins_of_vpls(self) -> int:
-        """Bins of a VPL's histogram: later light falls behind the window, whatever the sensor point.
+    def _steps_of_vpls(self, bins_per_step: int) -> int:
+        """Time steps of a VPL's histogram: later light falls behind the window, whatever the sensor point.
 
-        Whole windows: another start of the window need not be another kernel.
+        Rounded up by an eighth at most: another start of the window need not be another kernel.
         """
         capture, time_axis = self.device.capture, self.device.time_axis
         legs = capture.sensor_legs.min() + capture.laser_legs.min() - capture.blur
-        before = math.ceil((time_axis.start_opl - legs) / time_axis.bin_width_opl) + 2
-        return max(1, 1 + math.ceil(before / time_axis.n_bins)) * time_axis.n_bins
+        bins = time_axis.n_bins + math.ceil((time_axis.start_opl - legs) / time_axis.bin_width_opl)
+        steps = max(bins, 0) // bins_per_step + 2
+        unit = 2 ** max(steps.bit_length() - 4, 0)
+        return -(-steps // unit) * unit
 
-    def _groups_in_memory(self, replicas: int) -> int:
+    def _groups_in_memory(self, replicas: int, bins_per_step: int = 1) -> int:
         """Return how many groups of VPLs of every replica have histograms that memory holds."""
-        values = GROUP * replicas * self._bins_of_vpls * PARTS * self._n_slots * self.options.channels
+        values = GROUP * replicas * self._steps_of_vpls(bins_per_step) * PARTS * self._n_slots * self.options.channels
         return self.tuning.max_histogram_values // values
 
     def _slots(self, bounces: mi.UInt32, shape: HistogramShape) -> mi.UInt32:

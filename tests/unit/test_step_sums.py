@@ -1,0 +1,116 @@
+"""Time steps of several bins (docs/virtual-lights.md, 7.7): what they keep of the light, and what they change."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from nlosrender.engine.backend.start import start_backend
+
+start_backend("llvm")
+import drjit as dr  # noqa: E402
+import mitsuba as mi  # noqa: E402
+
+from nlosrender.engine.launch.device_arrays import on_device  # noqa: E402
+from nlosrender.engine.launch.histogram import DeviceHistogram, HistogramShape  # noqa: E402
+from nlosrender.engine.virtual_lights.vpls.step_sums import (  # noqa: E402
+    StepSums,
+    TimeSteps,
+    in_steps,
+    squares_of_change,
+)
+
+
+def histogram_of(light: NDArray[np.float64], replicas: int = 1) -> DeviceHistogram:
+    """Return a histogram with rows of ``light`` (replica and sensor point, slot, bin), and none outside the window."""
+    lanes, slots, n_bins = light.shape
+    shape = HistogramShape(replicas, lanes // replicas, 1, slots, 1, n_bins)
+    rows = np.zeros((lanes, shape.entries_per_lane))
+    rows[:, : slots * shape.row] = np.pad(light, ((0, 0), (0, 0), (0, 1))).reshape(lanes, -1)
+    result = DeviceHistogram(shape)
+    result.sums = on_device(mi.Float64, rows.ravel())
+    return result
+
+
+def rows_of(histogram: DeviceHistogram) -> NDArray[np.float64]:
+    """Return the sums (lane, slot, bin), the entry outside the window last."""
+    shape = histogram.shape
+    lanes = histogram.sums.numpy().reshape(shape.lanes, -1)
+    return lanes[:, : shape.slots * shape.row].reshape(shape.lanes, shape.slots, shape.row)
+
+
+def smooth_light(n_bins: int) -> NDArray[np.float64]:
+    """Return light of 3 lanes and 2 slots, a parabola over time each, nowhere negative."""
+    time = np.arange(n_bins) / n_bins
+    bends = np.array([[-1.0, 0.0], [0.5, 1.0], [2.0, -0.3]])
+    return 3 + bends[..., None] * (time - 0.4) ** 2 + np.arange(3)[:, None, None] * time
+
+
+@pytest.mark.parametrize("bins_per_step", [2, 4, 8])
+def test_light_that_is_quadratic_in_time_is_kept(bins_per_step: int) -> None:
+    """Roundings to half a step spread it by a variance that is taken back, and parabolas have the mean of each bin.
+
+    Steps of one bin have that variance, too, 1 / 24: in the comparison it is taken back as well. But for three steps at
+    either end of the window, where a neighbour is missing; 1e-6: float32 sums of a step.
+    """
+    light = smooth_light(96)
+    found = rows_of(in_steps(histogram_of(light), bins_per_step))[..., :-1]
+    expected = light[..., 1:-1] - np.diff(light, 2) / 48
+    inner = slice(3 * bins_per_step, -3 * bins_per_step)
+    np.testing.assert_allclose(found[..., 1:-1][..., inner], expected[..., inner], rtol=1e-6)
+
+
+def test_light_of_steps_is_kept_where_the_window_ends_within_one() -> None:
+    """101 bins in steps of 8: what the last step holds after the window is counted as outside, and nothing is lost."""
+    histogram = histogram_of(np.zeros((3, 2, 101)))
+    sums, generator = StepSums(histogram.shape, 8), np.random.default_rng(4)
+    assert sums.shape.n_bins == 13
+    steps = np.zeros((6, sums.blocks * 8))
+    steps[:, :13] = generator.exponential(size=(6, 13))
+    sums.sums = on_device(mi.Float, steps.ravel())
+    sums.outside = on_device(mi.Float, np.arange(6.0))
+    sums.add_to(histogram)
+    found = rows_of(histogram).reshape(6, -1)
+    assert found.min() >= 0
+    np.testing.assert_allclose(found.sum(axis=1), steps.sum(axis=1) + np.arange(6), rtol=1e-6)
+    last = steps[:, 12] * 3 / 8  # three of eight bins lie behind the window; a line or parabola moves less than half
+    assert (np.abs(found[:, -1] - np.arange(6) - last) < last / 2 + 0.1 * steps[:, 11]).all()
+
+
+def test_steps_of_one_bin_change_nothing() -> None:
+    light = np.random.default_rng(5).exponential(size=(3, 2, 37))
+    histogram = histogram_of(np.zeros_like(light))
+    sums = StepSums(histogram.shape, 1)
+    padded = np.zeros((3, 2, sums.blocks * 8))
+    padded[..., :37] = light
+    sums.sums = on_device(mi.Float, padded.ravel())
+    sums.add_to(histogram)
+    np.testing.assert_array_equal(rows_of(histogram)[..., :-1], light.astype(np.float32))
+
+
+def test_change_is_told_from_noise() -> None:
+    """Noise of the replicas has no expected part in it: 400 rows of noise twice as strong as a step of light.
+
+    The estimate's standard deviation is that of a mean of 400 products of independent noise, far below a tenth.
+    """
+    generator = np.random.default_rng(6)
+    light = np.where(np.arange(64) < 29, 0.0, 10.0)
+    exact = histogram_of(np.broadcast_to(light, (1, 1, 64)))
+    change = np.square(rows_of(in_steps(exact, 4)) - rows_of(exact))[..., :-1].sum()
+    assert change > 1
+    noisy = histogram_of(np.maximum(light + generator.normal(0, 2, (400, 1, 64)), -1e9), replicas=2)
+    found = squares_of_change(noisy, in_steps(noisy, 4)) / 200
+    assert found == pytest.approx(change, rel=0.1)
+
+
+def test_the_longest_steps_are_taken_whose_change_is_allowed() -> None:
+    light = np.tile(np.where(np.arange(64) < 29, 0.0, 10.0), (4, 1, 1))
+    pilot = histogram_of(light, replicas=2)
+    changes = [TimeSteps.longest(pilot, 1, 0.0, 1.0, (bins,)).change for bins in (8, 4, 2)]
+    assert changes == sorted(changes, reverse=True)
+    for allowed, bins in ((1.0, 8), ((changes[0] + changes[1]) / 2, 4), (changes[2] / 2, 1)):
+        assert TimeSteps.longest(pilot, 1, 0.0, allowed, (8, 4, 2)).bins == bins
+    more = TimeSteps.longest(pilot, 1, 3 * np.square(light[:2]).sum(), 1.0, (8,))  # four times the squares in all
+    assert more.change == pytest.approx(changes[0] / 2)
+    dr.sync_thread()
