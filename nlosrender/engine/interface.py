@@ -36,6 +36,7 @@ class Budget:
     difference_divisor: float | None = None
     rounds: int | None = None  # of the virtual lights: rounds of VPL subpaths
     bins_per_step: int | None = None  # of the virtual lights: bins in a time step of the light of VPLs
+    steps_variance: float | None = None  # of the virtual lights: what these change, squared, over the variance of VPLs
     footprint_places: int | None = None  # of the virtual lights: places in the footprint of a sensor point
 
     @property

@@ -104,13 +104,15 @@ def test_change_is_told_from_noise() -> None:
     assert found == pytest.approx(change, rel=0.1)
 
 
-def test_the_longest_steps_are_taken_whose_change_is_allowed() -> None:
+def test_longer_steps_change_more() -> None:
+    """Of light that begins at once; the change is that of the whole H, of which more is known from elsewhere."""
     light = np.tile(np.where(np.arange(64) < 29, 0.0, 10.0), (4, 1, 1))
     pilot = histogram_of(light, replicas=2)
-    changes = [TimeSteps.longest(pilot, 1, 0.0, 1.0, (bins,)).change for bins in (8, 4, 2)]
-    assert changes == sorted(changes, reverse=True)
-    for allowed, bins in ((1.0, 8), ((changes[0] + changes[1]) / 2, 4), (changes[2] / 2, 1)):
-        assert TimeSteps.longest(pilot, 1, 0.0, allowed, (8, 4, 2)).bins == bins
-    more = TimeSteps.longest(pilot, 1, 3 * np.square(light[:2]).sum(), 1.0, (8,))  # four times the squares in all
-    assert more.change == pytest.approx(changes[0] / 2)
+    steps = [TimeSteps.of_pilot(pilot, bins, 1, 0.0) for bins in (2, 4, 8)]
+    assert 0 < steps[0].change < steps[1].change < steps[2].change
+    assert all(one.error == 0 for one in steps)  # replicas are the same
+    more = TimeSteps.of_pilot(pilot, 8, 1, 3 * np.square(light[:2]).sum())  # four times the squares in all
+    assert more.change == pytest.approx(steps[2].change / 2)
+    doubled = histogram_of(2 * light, replicas=2)  # by two units
+    assert TimeSteps.of_pilot(doubled, 8, 2, 0.0).change == pytest.approx(steps[2].change)
     dr.sync_thread()

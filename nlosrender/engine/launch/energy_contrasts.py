@@ -53,7 +53,9 @@ def contrasts_of_points(
 
 
 class RoundContrasts:
-    """Contrasts of sensor points that share VPL subpaths: one sign per replica and group of rounds, for all points.
+    """Contrasts of sensor points that share VPL subpaths: a sign per replica and group of rounds, or part of a round.
+
+    It is that of all points.
 
     Parameters
     ----------
@@ -80,11 +82,20 @@ class RoundContrasts:
         every = 2 ** max(0, math.floor(math.log2(done / self._wanted)))
         if not (is_last or done % every == 0):
             return
-        energies = np.einsum("wks,rsbc->wkrbc", self._weights, self._histogram.energies().sum(axis=2), optimize=True)
-        added = energies - self.grouped
+        energies = self._weighted(self._histogram.energies().sum(axis=2))
+        self._add(energies - self.grouped)
         self.grouped = energies
-        pairs = added.shape[2] // 2
-        differences = added[:, :, 0 : 2 * pairs : 2] - added[:, :, 1 : 2 * pairs : 2]
+
+    def add_part(self, energies: NDArray[np.float64]) -> None:
+        """Add the ``energies`` (replica, sensor, slot, channel) of a part of a round, independent of its others."""
+        self._add(self._weighted(energies))
+
+    def _weighted(self, energies: NDArray[np.float64]) -> NDArray[np.float64]:
+        return np.asarray(np.einsum("wks,rsbc->wkrbc", self._weights, energies, optimize=True))
+
+    def _add(self, energies: NDArray[np.float64]) -> None:
+        pairs = energies.shape[2] // 2
+        differences = energies[:, :, 0 : 2 * pairs : 2] - energies[:, :, 1 : 2 * pairs : 2]
         signs = random_signs(np.arange(pairs) * 2**32 + self.groups)
         self.sums += np.einsum("kp,wkpbc->wkcb", signs, differences)
         self.groups += 1

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from nlosrender.engine.interface import Budget
-from nlosrender.engine.launch.pilot_points import SENSORS_PER_AXIS, Pilot, pilot_of
+from nlosrender.engine.launch.pilot_points import SENSORS_PER_AXIS, Pilot, pilot_of, scattered
 from nlosrender.engine.launch.schedule import DEFAULT_TARGET
 from nlosrender.engine.virtual_lights.refinement import (
     Gathered,
@@ -73,20 +73,19 @@ def calibrated_lights(
             mean = histogram.on_host(histogram.statistics(done)[0])
             mixed = 2 * float(np.einsum("csltb,csltb->", mean[..., :-1], gathered.values[..., :-1]))
         error = histogram.relative_error(done, squares + mixed)
-    steps = further.time_steps(histogram, done, squares + mixed, target)
-    error, of_steps = steps.error, (steps.change / target) ** 2
-    share_squares -= of_steps
-    finer = further.share_of_third(
-        gathered.n_patches, share, share_squares, error * math.sqrt(done) / target, steps.bins
-    )
+    steps = further.time_steps(histogram, done, squares + mixed)
+    finer, step = further.split(gathered.n_patches, share, share_squares, steps, done, target)
     if finer < share:
         share = finer
         refined = refined_to(share * target, third.tessellator, gather, known_squares, refined.patch_scale)
     # patches come in steps: what they leave of their share is spent on rounds
-    third_squares = min(share, refined.error / target) ** 2 + share_of_places**2
-    rounds = further.rounds_needed(error, done, math.sqrt(share_squares - third_squares) * target)
-    used = min(third_squares + (error / target) ** 2 * done / rounds, share_squares) + of_steps
-    return replace(_with_patches(budget, refined), rounds=rounds, bins_per_step=steps.bins), used
+    third_squares, of_steps = min(share, refined.error / target) ** 2 + share_of_places**2, (step.change / target) ** 2
+    goal_squares = share_squares - third_squares - of_steps
+    rounds = further.rounds_needed(step.error, done, math.sqrt(goal_squares) * target)
+    of_vpls = (further.error_after(step.error, done, rounds) / target) ** 2
+    steps_variance = of_steps / max(of_vpls, 1e-12) if of_steps else 0.0
+    budget = replace(budget, rounds=rounds, bins_per_step=step.bins, steps_variance=steps_variance)
+    return _with_patches(budget, refined), third_squares + of_steps + min(of_vpls, goal_squares)
 
 
 def _places_of_footprint(third: ThirdBounce, few: Pilot, target: float, known_squares: float) -> int:
@@ -116,7 +115,7 @@ def _pilot_of_patches(third: ThirdBounce, pilot: Pilot) -> Pilot:
     few, grid = third.tuning.patch_pilot_sensors, third.device.capture.sensor_grid.lattice
     if not is_far and max(grid.nx, grid.ny) >= 4 * SENSORS_PER_AXIS:
         return pilot
-    return pilot_of(third.device.capture, few if is_far else max(few, -(-max(grid.nx, grid.ny) // 4)))
+    return pilot_of(third.device.capture, few if is_far else max(few, -(-max(grid.nx, grid.ny) // 4)), scattered)
 
 
 def _patch_scale_in_time(third: ThirdBounce, time_limit_s: float, target: float) -> float:

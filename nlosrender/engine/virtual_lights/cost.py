@@ -109,7 +109,8 @@ def _light_seconds(engine: VirtualLightEngine, plan: Plan, pilot: Batch, calibra
     if further is not None and rounds > 1:
 
         def one_round(batch: Batch) -> None:
-            further.accumulate(batch, further.histogram(batch, plan.replicas), 0)
+            histogram, steps = further.histogram(batch, plan.replicas), calibrated.bins_per_step or 1
+            further.accumulate(batch, histogram, 0, bins_per_step=steps)
             dr.sync_thread()
 
         seconds += (rounds - 1) * extrapolated(one_round)

@@ -129,6 +129,11 @@ class VirtualLightTuning:
     # Of all replicas together. Plates 4.9 / 3.0 / 2.4, room 42 / 29 / 28 at half / as is / twice: what a round costs
     # besides; more would make a round too long to stop in time.
     vpls_per_round: int = 4096
+    # Sensor points along each side of the grid that the density of VPLs is made for, and the part of VPLs that have a
+    # density by distance alone. Variance times CPU seconds at 1 / 0.7 / 0.5 / 0.3: room 18 / 12 / 12 / 14, plates 6.7 /
+    # 7.3 / 7.1 / 8.0, letters 9.3 / 9.6 / 9.4 / 9.6, bunny 40 / 39 / 37 / 38; room 12 at 16 x 16 points.
+    density_sensors_per_axis: int = 8
+    nearness_share: float = 0.6
     # Kept per VPL. Plates 3.5 / 3.8 / 3.3, room 43 / 30 / 34 at half / as is / twice; more in 7.6.
     contributions_per_vpl: int = 8
     # The same of confocal captures, where each takes a ray to the sensor point's own laser. Plates 14 / 7.3 / 8.1, room
@@ -161,10 +166,10 @@ class VirtualLightTuning:
     # Subpaths of such a VPL, one per 8 sensor points. Room 18.9 / 18.3 / 19.0 at 128 / 192 / 256; before 64 x 64
     # points 56 / 51 / 52, bunny 231 / 202 / 219 at 128 / 256 / 512.
     max_shared_subpaths: int = 256
-    # Bins of the time steps that their light is added in: the first that changes no more than this part of the target.
+    # Bins of the time steps that their light may be added in, and the part of the target that these may change.
     # Variance times CPU seconds of 4 units of 512 VPLs, room: 61 / 39 / 20 / 9 at 1 / 2 / 4 / 8 bins.
-    bins_per_step: tuple[int, ...] = (8, 4, 2)
-    share_of_steps: float = 0.25
+    bins_per_step: tuple[int, ...] = (2, 4, 8)
+    share_of_steps: float = 0.4
     groups_at_once: int = 4  # of a replica: 256 histograms; as many times more as a step has bins
     max_histogram_values: int = 2**24  # of them together: 0.13 GB
     # For a sensor point to add a histogram, in patches: 0.2 us and 15 ns in steps of one bin, 0.1 us in steps of 4.

@@ -189,6 +189,7 @@ def gather_histograms(
     table: VplTable,
     first_vpl: mi.UInt32,
     size: int,
+    cut: range,
     light: LightHistograms,
     step_sums: StepSums,
 ) -> None:
@@ -200,6 +201,8 @@ def gather_histograms(
         As for ``gather_contributions``.
     first_vpl, size
         Of each lane, the first VPL of the chunk, numbered in the round; VPLs of the chunk, of each replica.
+    cut
+        Those of them that are added.
     light
         Their histograms, replica by replica.
     step_sums
@@ -207,6 +210,7 @@ def gather_histograms(
     """
     sensors, shape, sums, outside = params.sensors, step_sums.shape, step_sums.sums, step_sums.outside
     lane, chunk = dr.arange(mi.UInt32, shape.lanes), dr.opaque(mi.UInt32, size)
+    skipped, count = dr.opaque(mi.UInt32, cut.start), dr.opaque(mi.UInt32, len(cut))
     n_bins, n_parts = dr.opaque(mi.UInt32, light.n_bins), dr.opaque(mi.Int32, light.n_bins * PARTS)
     blocks, stop = dr.opaque(mi.Int32, step_sums.blocks), dr.opaque(mi.Int32, shape.n_bins * PARTS)
     own_laser = params.lasers.gather(params.first_laser)
@@ -216,8 +220,8 @@ def gather_histograms(
     fraction += mi.Float(legs * PARTS - whole * bins_per_step) / PARTS
     parts_per_bin = PARTS / mi.Float(bins_per_step)
     tile = wall_tiles.tile_bit(mi.UInt32(0), sensors.interaction.p)
-    vpl, entry = mi.UInt32(first_vpl), lane // dr.opaque(mi.UInt32, shape.sensors) * chunk
-    end = entry + chunk
+    vpl, entry = first_vpl + skipped, lane // dr.opaque(mi.UInt32, shape.sensors) * chunk + skipped
+    end = entry + count
 
     while dr.hint(
         entry < end,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import time
 from collections.abc import Callable
@@ -12,6 +13,7 @@ from typing import TYPE_CHECKING
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from numpy.typing import NDArray
 
 from nlosrender.capture.bounces import THIRD_BOUNCE
 from nlosrender.capture.plan import Batch
@@ -46,6 +48,9 @@ from nlosrender.engine.virtual_lights.vpls.subpaths import (
 
 if TYPE_CHECKING:
     from nlosrender.engine.virtual_lights.elements.tessellator import Tessellator
+
+
+PARTS_OF_ENERGY = 8  # of the VPLs that are added at once, whose energies are compared: as ``FEW_PAIRS``
 
 
 class VplBounces:
@@ -146,10 +151,18 @@ class VplBounces:
         """Return the replicas of a pilot of so many sensor points; groups that share must be as in the render."""
         return self.options.replicas if self.shares_subpaths else max(2, self.tuning.pilot_lanes // sensors // 2 * 2)
 
-    def share_of_third(
-        self, patches: int, largest: float, share_squares: float, noise: float, bins_per_step: int = 1
-    ) -> float:
-        """Return the one of ``third_shares`` that takes the fewest rays in all (docs/virtual-lights.md, 8).
+    def time_steps(self, pilot: DeviceHistogram, done: int, known_squares: float) -> list[TimeSteps]:
+        """Return what a pilot of ``done`` units says of the time steps that may be taken; one bin first."""
+        lengths = self.tuning.bins_per_step if self.shares_subpaths else ()
+        longer = [TimeSteps.of_pilot(pilot, bins, done, known_squares) for bins in lengths]
+        return [TimeSteps(1, pilot.relative_error(done, known_squares)), *longer]
+
+    def split(
+        self, patches: int, largest: float, share_squares: float, steps: list[TimeSteps], done: int, target: float
+    ) -> tuple[float, TimeSteps]:
+        """Return the one of ``third_shares``, and time steps, that take the fewest rays in all.
+
+        docs/virtual-lights.md, 8.
 
         Parameters
         ----------
@@ -157,30 +170,24 @@ class VplBounces:
             That the ``largest`` share takes: their number goes with the error to the power of -4/3.
         share_squares
             Part of the target's square that third bounce and VPLs share.
-        noise
-            Error of one round over the target error.
-        bins_per_step
-            Of the time steps of a round.
+        steps
+            What a pilot of ``done`` units says of time steps.
+        target
+            Target error.
         """
-        tuning = self.tuning
-        shares, rays_per_round = (
-            tuning.third_shares,
-            self.vpls_per_round * (1 + self.contributions_per_vpl * self.is_confocal),
-        )
-        if self.shares_subpaths:
-            rays_per_round *= tuning.connection_cost + tuning.histogram_cost // bins_per_step
+        tuning, rays_per_vpl = self.tuning, 1 + self.contributions_per_vpl * self.is_confocal
 
-        def rays(share: float) -> float:
-            finer = patches * (largest / share) ** (4 / 3)
-            return finer * 4 / 3 + rays_per_round * max(1, math.ceil(noise**2 / (share_squares - share**2)))
+        def rays(of_third: float, step: TimeSteps) -> float:
+            left = share_squares - of_third**2 - (step.change / target) ** 2
+            if left <= 0 or step.change > tuning.share_of_steps * target:
+                return math.inf
+            cost = tuning.connection_cost + tuning.histogram_cost / step.bins if self.shares_subpaths else rays_per_vpl
+            finer = patches * (largest / of_third) ** (4 / 3)
+            rounds = self.rounds_needed(step.error, done, math.sqrt(left) * target)
+            return finer * 4 / 3 + self.vpls_per_round * cost * rounds
 
-        return min((share for share in shares if share <= largest), key=rays)
-
-    def time_steps(self, pilot: DeviceHistogram, done: int, known_squares: float, target: float) -> TimeSteps:
-        """Return the longest time steps that a ``target`` error allows, by a pilot of ``done`` rounds."""
-        tuning = self.tuning
-        lengths = tuning.bins_per_step if self.shares_subpaths else ()
-        return TimeSteps.longest(pilot, done, known_squares, tuning.share_of_steps * target, lengths)
+        shares = [share for share in tuning.third_shares if share <= largest]
+        return min(itertools.product(shares, steps), key=lambda both: rays(*both))
 
     def rounds_needed(self, error: float, done: int, target: float) -> int:
         """Return how many units bring the ``error`` of a pilot of ``done`` units to ``target``.
@@ -197,6 +204,12 @@ class VplBounces:
         of_largest = of_round * largest**-tuning.order_of_units
         units *= max((of_largest / target) ** 2, 1)
         return min(max(1, math.ceil(units)), tuning.max_rounds)
+
+    def error_after(self, error: float, done: int, units: int) -> float:
+        """Return the error after so many ``units``, by the law of ``rounds_needed``."""
+        in_round = min(units, self.max_units) / self.pilot_units
+        of_round = error * math.sqrt(done / self.pilot_units) * in_round**-self.tuning.order_of_units
+        return of_round * math.sqrt(in_round * self.pilot_units / units)
 
     def histogram(self, batch: Batch | Pilot, replicas: int) -> DeviceHistogram:
         """Return an empty histogram of a batch: bounce slots from the fourth bounce on."""
@@ -230,7 +243,8 @@ class VplBounces:
         while True:
             if not skipped:
                 units = self._units(budget, done, time.perf_counter() - begun)
-            self.accumulate(batch, histogram, done, report_progress, skipped, units, budget.bins_per_step or 1)
+            steps = budget.bins_per_step or 1
+            self.accumulate(batch, histogram, done, report_progress, skipped, units, steps, contrasts.add_part)
             done, skipped = done + units, 0
             if budget.rounds is not None:
                 share = done / budget.rounds
@@ -240,11 +254,12 @@ class VplBounces:
                     goal = self.tuning.rest_share_of_many * budget.target_error
                     error = histogram.relative_error(done, known_squares) / goal
                     share = max(share, 1 / max(error, 1e-9) ** 2)
-            contrasts.add(done, share >= 1)
+            if not self.shares_subpaths:
+                contrasts.add(done, share >= 1)
             if share >= 1:
                 break
             report_progress(0)
-        return self._result(batch, histogram, contrasts, done)
+        return self._result(batch, histogram, contrasts, done, budget.steps_variance or 0.0)
 
     def _units(self, budget: Budget, done: int, seconds: float) -> int:
         """Return the units of the next round: all that are left, as many as before, or fewer if time is short."""
@@ -253,13 +268,15 @@ class VplBounces:
             left = int(done * min(budget.time_limit_s / max(seconds, 1e-9) - 1, 1))
         return min(max(left, 1), self.max_units)
 
-    def _result(self, batch: Batch, histogram: DeviceHistogram, contrasts: RoundContrasts, done: int) -> Histogram:
+    def _result(
+        self, batch: Batch, histogram: DeviceHistogram, contrasts: RoundContrasts, done: int, steps_variance: float
+    ) -> Histogram:
         bounces, scale = self.options.bounces, self.device.scale
         first = bounces.slot(THIRD_BOUNCE + 1)
         slots = range(-first, bounces.n_slots - first)
         statistics = histogram.statistics(done, scale, slots)
         errors = contrasts.result(scale / (done * self.options.replicas), slots)
-        mean, variance = (histogram.on_host(values) for values in statistics)
+        mean, variance = histogram.on_host(statistics[0]), histogram.on_host(statistics[1] * (1 + steps_variance))
         result = Histogram.of_rows(mean, variance, done * self.contributions_per_round, errors)
         if self.with_delta:
             self.device.add_exact_light(batch, result)
@@ -274,6 +291,7 @@ class VplBounces:
         skipped: int = 0,
         units: int = 1,
         bins_per_step: int = 1,
+        add_part: Callable[[NDArray[np.float64]], None] = lambda energies: None,
     ) -> None:
         """Add a round to ``histogram``, the same for every batch of a capture, ``units`` times what it estimates.
 
@@ -289,6 +307,8 @@ class VplBounces:
             Size of the round: VPLs of one round are stratified, and the error falls faster than with their number.
         bins_per_step
             Of the time steps in which light that VPLs share is added.
+        add_part
+            Called with the energies of independent parts of it; see ``RoundContrasts.add_part``.
         """
         shape = histogram.shape
         plan = self.plan(shape.replicas, units)
@@ -308,7 +328,8 @@ class VplBounces:
         table = VplTable.of(self.built, vpls, first_vpls, contributions, self.masks, wall_tiles)
         if self.shares_subpaths:
             views = params, self.masks is not None, wall_tiles, table
-            self._add_shared(views, vpls, contributions, plan, histogram, report_progress, skipped, bins_per_step)
+            reports = report_progress, add_part
+            self._add_shared(views, vpls, contributions, plan, histogram, reports, skipped, bins_per_step)
             return
         # straight, and by way of the mirror one bounce later
         by_mirrors = [None] if mirror is None else [None, mirror]
@@ -347,12 +368,13 @@ class VplBounces:
         contributions: VplContributions,
         plan: SubpathPlan,
         histogram: DeviceHistogram,
-        report_progress: Callable[[int], None],
+        reports: tuple[Callable[[int], None], Callable[[NDArray[np.float64]], None]],
         skipped: int,
         bins_per_step: int,
     ) -> None:
         """Add VPLs that share subpaths, in chunks that are the same for every batch (docs/virtual-lights.md, 7.7)."""
         (params, needs_visibility, *_), shape = scene, histogram.shape
+        report_progress, add_part = reports
         receivers = VplReceivers.of(self.built, vpls)
         shared = SharedContributions.of(self.built, receivers, contributions, needs_visibility)
         lowest = dr.opaque(mi.UInt32, THIRD_BOUNCE + 1)
@@ -376,7 +398,13 @@ class VplBounces:
             light = LightHistograms.of(sums)
             first = on_device(mi.UInt32, np.repeat(numbers[:, 0], shape.sensors))
             step_sums = StepSums(shape, bins_per_step)
-            gather_histograms(*scene, first, size, light, step_sums)
+            part = GROUP * math.ceil(size / (GROUP * PARTS_OF_ENERGY))
+            before = np.zeros(1)
+            for begun in range(0, size, part):
+                gather_histograms(*scene, first, size, range(begun, min(begun + part, size)), light, step_sums)
+                energies = step_sums.energies()
+                add_part(energies - before)
+                before = energies
             step_sums.add_to(histogram)
             if begin + size < plan.vpls:
                 report_progress(begin + size)

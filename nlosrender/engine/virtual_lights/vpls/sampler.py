@@ -1,9 +1,9 @@
 """Virtual point lights (VPLs): random points of the hidden geometry whose light the sensor points gather.
 
-The probability of an element goes with its area over d (d + R), with d its distance from the nearest sensor or laser
-point and R half the extent of the sensor grid: the density that minimises the L2 error over all sensor points. In that
-norm all VPLs count about the same; a single sensor point receives at most 9 (1 + R / d) times as much of one:
-docs/virtual-lights.md, 7.2 and 7.3.
+The probability of an element goes with its area and with the root mean square, over some sensor points, of what they
+receive of it: the density that minimises the L2 error over all of them. A part of the VPLs goes with the area over
+d (d + R) instead, d its distance from the nearest sensor or laser point and R half the extent of the sensor grid: that
+bounds what a single sensor point receives of one. docs/virtual-lights.md, 7.2 and 7.3.
 """
 
 from __future__ import annotations
@@ -11,9 +11,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 
+from nlosrender.engine.launch.device_arrays import columns, on_device
 from nlosrender.engine.launch.morton import morton_order
+from nlosrender.engine.launch.pilot_points import spread
 from nlosrender.engine.launch.sequences import recurrence_steps
 from nlosrender.engine.launch.time_gate import CaptureTimeGate
 from nlosrender.engine.virtual_lights.elements.patches import SurfacePoints
@@ -36,7 +40,7 @@ class Vpls(SurfacePoints):
     """VPLs, sorted along the elements they lie on."""
 
     areas: Float64  # (n,) area that a VPL stands for: the reciprocal of n times its density
-    importance: Float64  # (n,) area over d (d + R), see above
+    importance: Float64  # (n,) area times the density of its element without a time gate, see above
 
 
 class VplSampler:
@@ -70,9 +74,9 @@ class VplSampler:
             centres[seen] = mirror.images(centres[seen])
         # an element is no longer than its distance; half its size stands for the distance where it touches a point
         distances = np.maximum(tessellator.distance(centres), longest_edges(self._corners) / 2)
-        self._reach = distances * (distances + tessellator.reach)
+        self._density = self._densities(tessellator, centres, 1 / (distances * (distances + tessellator.reach)))
         order = np.lexsort((morton_order(centres), self._shapes))  # shape by shape, neighbours together
-        importance = (self._areas / self._reach)[order]
+        importance = (self._areas * self._density)[order]
         if capture_gate is not None:
             importance *= 1 - (1 - capture_gate.survival) * self._late_shares(capture_gate)[order]
         self._order = order
@@ -80,6 +84,20 @@ class VplSampler:
         if not self.is_empty:
             self._probability = importance / importance.sum()
             self._cumulative = np.cumsum(self._probability)
+
+    def _densities(self, tessellator: Tessellator, centres: Float64, nearness: Float64) -> Float64:
+        """Return the density of elements at ``centres`` without a time gate; ``nearness``: 1 / (d (d + R))."""
+        grid, tuning = tessellator.capture.sensor_grid, tessellator.tuning
+        some = list(spread(grid, tuning.density_sensors_per_axis).indices)
+        sensors = grid.positions.reshape(-1, 3)[some] / tessellator.built.metres_per_engine_unit
+        place = mi.Point3f(*columns(centres)), mi.Normal3f(*columns(self._normals))
+        least = on_device(mi.Float, np.square(longest_edges(self._corners) / 2))
+        points = mi.Point3f(*columns(sensors)), mi.Normal3f(*columns(grid.normals.reshape(-1, 3)[some]))
+        squares = _squared_responses(*place, least, *points, dr.opaque(mi.UInt32, len(some)))
+        response = np.sqrt(squares.numpy().astype(np.float64))
+        near_share = tuning.nearness_share if response.any() else 1.0
+        totals = (max(float(density @ self._areas), 1e-300) for density in (nearness, response))
+        return near_share * nearness / next(totals) + (1 - near_share) * response / next(totals)
 
     def _late_shares(self, capture_gate: CaptureTimeGate) -> Float64:
         """Return the part of each element beyond ``capture_gate``, by a few of its points: any value is unbiased."""
@@ -109,5 +127,25 @@ class VplSampler:
             primitives=self._primitives[element],
             barycentric=np.einsum("nk,nkb->nb", weights, self._weights[element])[:, 1:],
             areas=areas,
-            importance=areas / self._reach[element],
+            importance=areas * self._density[element],
         )
+
+
+@dr.syntax
+def _squared_responses(
+    centres: mi.Point3f,
+    normals: mi.Normal3f,
+    least: mi.Float,
+    sensors: mi.Point3f,
+    facing: mi.Normal3f,
+    count: mi.UInt32,
+) -> mi.Float:
+    """Return the summed squares of both cosines over the squared distance, or ``least``; 0 behind a sensor point."""
+    number, total = mi.UInt32(0), mi.Float(0)
+    while dr.hint(number < count, exclude=[centres, normals, least, sensors, facing, count]):
+        away = centres - dr.gather(mi.Point3f, sensors, number)
+        distance2 = dr.maximum(dr.squared_norm(away), least)
+        cosines = dr.maximum(dr.dot(away, dr.gather(mi.Normal3f, facing, number)), 0) * dr.dot(away, normals)
+        total += dr.square(cosines / dr.square(distance2))
+        number += 1
+    return total

@@ -61,6 +61,12 @@ class StepSums:
         dr.eval(histogram.sums)
         dr.sync_thread()
 
+    def energies(self) -> NDArray[np.float64]:
+        """Return the sums over the time window (replica, sensor, slot, channel)."""
+        dr.eval(self.sums)
+        sums, shape = dr.block_sum(self.sums, self.blocks * BLOCK).numpy(), self.shape
+        return np.asarray(sums, np.float64).reshape(shape.replicas, shape.sensors, shape.slots, shape.channels)
+
     def _step(self, line: mi.UInt32, step: mi.Int32, active: mi.Bool) -> mi.Float:
         """Return the light of steps; before the first and after the last as much as in these."""
         step = mi.UInt32(dr.clip(step, 0, self.shape.n_bins - 1))
@@ -93,28 +99,22 @@ class StepSums:
 
 @dataclass(frozen=True)
 class TimeSteps:
-    """Time steps that light is added in, and what a pilot says of them."""
+    """Time steps that light may be added in, and what a pilot says of them."""
 
     bins: int  # in a step
     error: float  # of the pilot, relative to H
-    change: float  # that they bring about, relative to H
+    change: float = 0.0  # that they bring about, relative to H
 
     @classmethod
-    def longest(
-        cls, pilot: DeviceHistogram, done: int, known_squares: float, allowed: float, lengths: tuple[int, ...]
-    ) -> TimeSteps:
-        """Return the first of ``lengths`` whose change is allowed, or steps of one bin.
+    def of_pilot(cls, pilot: DeviceHistogram, bins: int, done: int, known_squares: float) -> TimeSteps:
+        """Return those of so many ``bins``.
 
         ``pilot``: sums over ``done`` units in steps of one bin; ``known_squares``: of what else H holds.
         """
         noise, energy = pilot.squares(done)
-        truth = max(energy - noise, 0.0) + known_squares
-        for bins in lengths:
-            stepped = in_steps(pilot, bins)
-            change = math.sqrt(max(squares_of_change(pilot, stepped), 0.0) / max(truth, 1e-300)) / done
-            if change <= allowed:
-                return cls(bins, stepped.relative_error(done, known_squares), change)
-        return cls(1, pilot.relative_error(done, known_squares), 0.0)
+        stepped, truth = in_steps(pilot, bins), max(energy - noise, 0.0) + known_squares
+        change = math.sqrt(max(squares_of_change(pilot, stepped), 0.0) / max(truth, 1e-300)) / done
+        return cls(bins, stepped.relative_error(done, known_squares), change)
 
 
 def in_steps(histogram: DeviceHistogram, bins_per_step: int) -> DeviceHistogram:
