@@ -15,10 +15,10 @@ import mitsuba as mi  # noqa: E402
 from nlosrender.engine.launch.device_arrays import on_device  # noqa: E402
 from nlosrender.engine.launch.histogram import DeviceHistogram, HistogramShape  # noqa: E402
 from nlosrender.engine.virtual_lights.vpls.step_sums import (  # noqa: E402
+    StepKernel,
     StepSums,
     TimeSteps,
     in_steps,
-    squares_of_change,
 )
 
 
@@ -78,6 +78,31 @@ def test_light_of_steps_is_kept_where_the_window_ends_within_one() -> None:
     assert (np.abs(found[:, -1] - np.arange(6) - last) < last / 2 + 0.1 * steps[:, 11]).all()
 
 
+@pytest.mark.parametrize("bins_per_step", [2, 5, 16])
+def test_smoothed_rows_keep_their_light(bins_per_step: int) -> None:
+    """Every step its sum, bins behind the last whole step and the entry outside the window as they are; none negative.
+
+    Light that is linear in time comes out as it is, but in the first and the last step, which have one neighbour.
+    """
+    generator, n_bins = np.random.default_rng(8), 83
+    light = generator.exponential(size=(3, 2, n_bins + 1)) * (generator.random((3, 2, n_bins + 1)) < 0.2)
+    light[2] = 1 + np.arange(n_bins + 1) / 7
+    kernel = StepKernel(bins_per_step)
+    found = kernel.smoothed(on_device(mi.Float64, light.ravel()), n_bins + 1).numpy().reshape(light.shape)
+    whole = n_bins // bins_per_step * bins_per_step
+    assert found.min() >= 0
+    np.testing.assert_array_equal(found[..., whole:], light[..., whole:])
+    sums = (rows[..., :whole].reshape(3, 2, -1, bins_per_step).sum(axis=-1) for rows in (found, light))
+    np.testing.assert_allclose(next(sums), next(sums), rtol=1e-12, atol=1e-12)
+    inner = slice(bins_per_step, whole - bins_per_step)
+    np.testing.assert_allclose(found[2][:, inner], light[2][:, inner], rtol=1e-12)
+
+
+def test_a_window_of_few_steps_is_not_smoothed() -> None:
+    values = on_device(mi.Float64, np.random.default_rng(9).random(2 * 32))
+    np.testing.assert_array_equal(StepKernel(8).smoothed(values, 32).numpy(), values.numpy())
+
+
 def test_steps_of_one_bin_change_nothing() -> None:
     light = np.random.default_rng(5).exponential(size=(3, 2, 37))
     histogram = histogram_of(np.zeros_like(light))
@@ -90,7 +115,7 @@ def test_steps_of_one_bin_change_nothing() -> None:
 
 
 def test_change_is_told_from_noise() -> None:
-    """Noise of the replicas has no expected part in it: 400 rows of noise twice as strong as a step of light.
+    """Noise of the replicas has no expected part in the change: 400 rows of noise twice as strong as a step of light.
 
     The estimate's standard deviation is that of a mean of 400 products of independent noise, far below a tenth.
     """
@@ -99,20 +124,26 @@ def test_change_is_told_from_noise() -> None:
     exact = histogram_of(np.broadcast_to(light, (1, 1, 64)))
     change = np.square(rows_of(in_steps(exact, 4)) - rows_of(exact))[..., :-1].sum()
     assert change > 1
-    noisy = histogram_of(np.maximum(light + generator.normal(0, 2, (400, 1, 64)), -1e9), replicas=2)
-    found = squares_of_change(noisy, in_steps(noisy, 4)) / 200
-    assert found == pytest.approx(change, rel=0.1)
+    noisy = histogram_of(light + generator.normal(0, 2, (400, 1, 64)), replicas=2)
+    steps = TimeSteps.of_pilot(noisy, (4,), 1, 0.0, is_rounded=True)
+    assert steps[1].change ** 2 * np.square(light).sum() == pytest.approx(change, rel=0.1)
+    # the mean of two has a variance of 2; steps of four bins leave a quarter of it, and what they spread it by less
+    assert steps[0].error == pytest.approx(np.sqrt(2 * 64 / np.square(light).sum()), rel=0.05)
+    assert steps[0].error / 3 < steps[1].error < steps[0].error / 2
 
 
-def test_longer_steps_change_more() -> None:
+@pytest.mark.parametrize("is_rounded", [True, False])
+def test_longer_steps_change_more(is_rounded: bool) -> None:
     """Of light that begins at once; the change is that of the whole H, of which more is known from elsewhere."""
     light = np.tile(np.where(np.arange(64) < 29, 0.0, 10.0), (4, 1, 1))
     pilot = histogram_of(light, replicas=2)
-    steps = [TimeSteps.of_pilot(pilot, bins, 1, 0.0) for bins in (2, 4, 8)]
-    assert 0 < steps[0].change < steps[1].change < steps[2].change
-    assert all(one.error == 0 for one in steps)  # replicas are the same
-    more = TimeSteps.of_pilot(pilot, 8, 1, 3 * np.square(light[:2]).sum())  # four times the squares in all
-    assert more.change == pytest.approx(steps[2].change / 2)
+    steps = TimeSteps.of_pilot(pilot, (2, 4, 8), 1, 0.0, is_rounded=is_rounded)
+    assert [step.bins for step in steps] == [1, 2, 4, 8]
+    changes = [step.change for step in steps]
+    assert changes[0] == 0 < changes[1] < changes[2] < changes[3]
+    assert all(step.error == 0 for step in steps)  # replicas are the same
+    known = 3 * np.square(light[:2]).sum()  # four times the squares in all
+    assert TimeSteps.of_pilot(pilot, (8,), 1, known, is_rounded=is_rounded)[1].change == pytest.approx(changes[3] / 2)
     doubled = histogram_of(2 * light, replicas=2)  # by two units
-    assert TimeSteps.of_pilot(doubled, 8, 2, 0.0).change == pytest.approx(steps[2].change)
+    assert TimeSteps.of_pilot(doubled, (8,), 2, 0.0, is_rounded=is_rounded)[1].change == pytest.approx(changes[3])
     dr.sync_thread()

@@ -9,6 +9,7 @@ deposit 4.3 ns of CPU time; a pair is one load, addition and store, 1.7 ns.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Protocol
 
 import drjit as dr
 import mitsuba as mi
@@ -16,7 +17,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nlosrender.capture.relative_error import relative_l2_error
-from nlosrender.engine.launch.temporal_kernel import TemporalKernel
 from nlosrender.errors import RenderError
 
 PAIR = 2  # sums that are added at once; 4 and 8 take 1.9 and 2.5 ns
@@ -62,6 +62,13 @@ class HistogramShape:
         return self.lanes * self.entries_per_lane
 
 
+class Kernel(Protocol):
+    """Spreads light over time; see ``TemporalKernel.smoothed``."""
+
+    def smoothed(self, values: mi.Float64, row: int) -> mi.Float64:
+        """Return rows of ``row`` entries, the last of each for light outside the window."""
+
+
 class DeviceHistogram:
     """Deposits of a batch, summed per lane in float64.
 
@@ -73,7 +80,7 @@ class DeviceHistogram:
         Spreads what was summed over time before statistics are taken; None: nothing is spread.
     """
 
-    def __init__(self, shape: HistogramShape, kernel: TemporalKernel | None = None):
+    def __init__(self, shape: HistogramShape, kernel: Kernel | None = None):
         self.shape, self.kernel = shape, kernel
         self.sums = dr.zeros(mi.Float64, shape.size)
         dr.make_opaque(self.sums)
@@ -163,16 +170,18 @@ class DeviceHistogram:
 
         ``known_squares`` is the sum of squares of the part of H that is known from elsewhere.
         """
-        noise, energy = self.squares(samples_per_lane)
-        return relative_l2_error(noise, energy + known_squares)
-
-    def squares(self, samples_per_lane: int) -> tuple[float, float]:
-        """Return the sum of variances, and that of the squared estimate, inside the time window."""
         mean, variance = self.statistics(samples_per_lane)
         inside = dr.arange(mi.UInt32, dr.width(mean)) % self.shape.row < self.shape.n_bins
         noise = dr.sum(dr.select(inside, variance, 0))
         energy = dr.sum(dr.select(inside, dr.square(mean), 0))
-        return float(noise[0]), float(energy[0])
+        return relative_l2_error(float(noise[0]), float(energy[0]) + known_squares)
+
+    def halves(self, samples_per_lane: int) -> list[mi.Float64]:
+        """Return the means of the even and of the odd replicas, of which there are as many; see ``statistics``."""
+        replicas = self._replicas(2.0 / (samples_per_lane * self.shape.replicas), None)
+        halves = [sum(replicas[first + 2 :: 2], replicas[first]) for first in (0, 1)]
+        dr.eval(halves)
+        return halves
 
 
 @dataclass(frozen=True, eq=False)

@@ -73,7 +73,7 @@ def calibrated_lights(
             mean = histogram.on_host(histogram.statistics(done)[0])
             mixed = 2 * float(np.einsum("csltb,csltb->", mean[..., :-1], gathered.values[..., :-1]))
         error = histogram.relative_error(done, squares + mixed)
-    steps = further.time_steps(histogram, done, squares + mixed)
+    steps = further.time_steps(histogram, done, squares + mixed, math.sqrt(share_squares - share**2) * target)
     finer, step = further.split(gathered.n_patches, share, share_squares, steps, done, target)
     if finer < share:
         share = finer

@@ -170,6 +170,9 @@ class VirtualLightTuning:
     # Variance times CPU seconds of 4 units of 512 VPLs, room: 61 / 39 / 20 / 9 at 1 / 2 / 4 / 8 bins.
     bins_per_step: tuple[int, ...] = (2, 4, 8)
     share_of_steps: float = 0.4
+    # The same of light that is added contribution by contribution, and smoothed afterwards. Trying one takes a pilot of
+    # 256 points and 1000 bins 0.1 s CPU.
+    bins_smoothed: tuple[int, ...] = (4, 16)
     groups_at_once: int = 4  # of a replica: 256 histograms; as many times more as a step has bins
     max_histogram_values: int = 2**24  # of them together: 0.13 GB
     # For a sensor point to add a histogram, in patches: 0.2 us and 15 ns in steps of one bin, 0.1 us in steps of 4.

@@ -38,7 +38,7 @@ from nlosrender.engine.virtual_lights.vpls.light_histograms import (
     gather_histograms,
 )
 from nlosrender.engine.virtual_lights.vpls.sampler import Vpls, VplSampler
-from nlosrender.engine.virtual_lights.vpls.step_sums import PARTS, StepSums, TimeSteps
+from nlosrender.engine.virtual_lights.vpls.step_sums import MIN_STEPS, PARTS, StepKernel, StepSums, TimeSteps
 from nlosrender.engine.virtual_lights.vpls.subpaths import (
     ProposalLasers,
     SubpathPlan,
@@ -151,16 +151,21 @@ class VplBounces:
         """Return the replicas of a pilot of so many sensor points; groups that share must be as in the render."""
         return self.options.replicas if self.shares_subpaths else max(2, self.tuning.pilot_lanes // sensors // 2 * 2)
 
-    def time_steps(self, pilot: DeviceHistogram, done: int, known_squares: float) -> list[TimeSteps]:
-        """Return what a pilot of ``done`` units says of the time steps that may be taken; one bin first."""
-        lengths = self.tuning.bins_per_step if self.shares_subpaths else ()
-        longer = [TimeSteps.of_pilot(pilot, bins, done, known_squares) for bins in lengths]
-        return [TimeSteps(1, pilot.relative_error(done, known_squares)), *longer]
+    def time_steps(self, pilot: DeviceHistogram, done: int, known_squares: float, goal: float) -> list[TimeSteps]:
+        """Return what a pilot of ``done`` units says of the time steps that may be taken; one bin first.
+
+        ``goal``: the error that they are to reach. Smoothing saves nothing where one round does.
+        """
+        lengths = self.tuning.bins_per_step if self.shares_subpaths else self.tuning.bins_smoothed
+        if not self.shares_subpaths and pilot.relative_error(done, known_squares) * math.sqrt(done) <= goal:
+            lengths = ()
+        lengths = tuple(bins for bins in lengths if bins * MIN_STEPS <= self.device.time_axis.n_bins)
+        return TimeSteps.of_pilot(pilot, lengths, done, known_squares, is_rounded=self.shares_subpaths)
 
     def split(
         self, patches: int, largest: float, share_squares: float, steps: list[TimeSteps], done: int, target: float
     ) -> tuple[float, TimeSteps]:
-        """Return the one of ``third_shares``, and time steps, that take the fewest rays in all.
+        """Return the one of ``third_shares``, and time steps, that take the fewest rays in all, then the least error.
 
         docs/virtual-lights.md, 8.
 
@@ -177,17 +182,18 @@ class VplBounces:
         """
         tuning, rays_per_vpl = self.tuning, 1 + self.contributions_per_vpl * self.is_confocal
 
-        def rays(of_third: float, step: TimeSteps) -> float:
+        def rays_and_squares(of_third: float, step: TimeSteps) -> tuple[float, float]:
             left = share_squares - of_third**2 - (step.change / target) ** 2
             if left <= 0 or step.change > tuning.share_of_steps * target:
-                return math.inf
+                return math.inf, math.inf
             cost = tuning.connection_cost + tuning.histogram_cost / step.bins if self.shares_subpaths else rays_per_vpl
             finer = patches * (largest / of_third) ** (4 / 3)
             rounds = self.rounds_needed(step.error, done, math.sqrt(left) * target)
-            return finer * 4 / 3 + self.vpls_per_round * cost * rounds
+            squares = self.error_after(step.error, done, rounds) ** 2 + step.change**2
+            return finer * 4 / 3 + self.vpls_per_round * cost * rounds, squares
 
         shares = [share for share in tuning.third_shares if share <= largest]
-        return min(itertools.product(shares, steps), key=lambda both: rays(*both))
+        return min(itertools.product(shares, steps), key=lambda both: rays_and_squares(*both))
 
     def rounds_needed(self, error: float, done: int, target: float) -> int:
         """Return how many units bring the ``error`` of a pilot of ``done`` units to ``target``.
@@ -225,6 +231,8 @@ class VplBounces:
         if budget.rounds is None and budget.target_error is not None:
             known_squares += self.device.exact_squares(batch)
         histogram = self.histogram(batch, self.options.replicas)
+        if not self.shares_subpaths:
+            histogram.kernel = StepKernel(budget.bins_per_step or 1)
         places = self.device.capture.sensor_grid.places[self.device.sensor_indices(batch)]
         contrasts = RoundContrasts(histogram, places)
         done, skipped, units, before = 0, 0, 1, 0.0
