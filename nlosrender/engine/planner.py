@@ -5,6 +5,7 @@ from __future__ import annotations
 import mitsuba as mi
 
 from nlosrender.capture.bounces import THIRD_BOUNCE
+from nlosrender.capture.footprint import PixelFootprint
 from nlosrender.capture.grids import Capture
 from nlosrender.capture.time_axis import TimeAxis
 from nlosrender.config.render import RenderConfig
@@ -92,8 +93,12 @@ def _obstacle_close_by(engine: VirtualLightEngine, capture: Capture) -> str | No
 
 def _obstacle(render: RenderConfig, capture: Capture, built: BuiltScene) -> str | None:
     """Return why the virtual lights cannot render a scene; None when they can."""
-    if isinstance(built, SceneWithoutWall):  # pixels with areas, too
-        return f"virtual lights need a relay wall: {built.reason}"
+    if isinstance(capture.footprint, PixelFootprint):
+        return "virtual lights look from points, and sensor points stand for all that their pixels see"
+    if isinstance(built, SceneWithoutWall) and any(
+        bool(shape.bsdf().flags() & mi.BSDFFlags.Delta) for shape in built.scene.shapes()
+    ):
+        return f"a surface has a mirror lobe, and virtual lights need a relay wall before it: {built.reason}"
     if render.polarized:
         return "only paths carry polarised light"
     if render.spp is not None:
@@ -114,7 +119,7 @@ def _obstacle(render: RenderConfig, capture: Capture, built: BuiltScene) -> str 
         return "there is no hidden geometry"
     if not can_tessellate(built):
         return "a hidden shape is neither a mesh nor a sphere or cylinder"
-    if bool(built.wall_bsdf.flags() & mi.BSDFFlags.Delta):
+    if built.wall_shape is not None and bool(built.wall_bsdf.flags() & mi.BSDFFlags.Delta):
         return "the relay wall has a mirror lobe"
     hard = mi.BSDFFlags.Transmission | mi.BSDFFlags.Null
     if any(bool(shape.bsdf().flags() & hard) for shape in built.hidden_shapes):

@@ -280,14 +280,22 @@ def test_a_laser_that_hits_nothing_is_refused(scan: str, key: str) -> None:
         corner(scan, aim)
 
 
-def test_confocal_points_hidden_from_the_laser_stay_dark() -> None:
+@pytest.mark.parametrize(
+    "engine",
+    [
+        {"engine": "path", "spp": 256, "max_bounces": 4},
+        {"engine": "virtual_lights", "spp": None, "target_error": 0.1, "max_bounces": 3},
+    ],
+    ids=["path", "virtual_lights"],
+)
+def test_confocal_points_hidden_from_the_laser_stay_dark(engine: dict[str, Any]) -> None:
     """A plate before the laser hides part of the wall: dark and counted there, elsewhere as without the plate."""
     plate = {"type": "rectangle", "width": 0.02, "height": 0.02, "center": [-0.6, 0.01, 1.18], "normal": [1, 0, 0]}
     black = {"bsdf": {"type": "diffuse", "reflectance": 0.0}}
     near = {"laser_position": [-0.7, 0, 1.2]}
     camera = {**EYE, "position": [-0.5, 0.2, 1.1]}
-    free = corner("confocal", near, camera=camera, max_bounces=4, spp=256)
-    shaded = corner("confocal", near, {**plate, **black, "up": [0, 0, 1]}, camera=camera, max_bounces=4, spp=256)
+    free = corner("confocal", near, camera=camera, **engine)
+    shaded = corner("confocal", near, {**plate, **black, "up": [0, 0, 1]}, camera=camera, **engine)
     n_unlit = shaded.capture.n_unlit_lasers
     assert free.capture.n_unlit_lasers == 0
     assert 0 < n_unlit < 12
@@ -329,7 +337,7 @@ def test_a_rectangle_of_a_mitsuba_scene_is_a_wall(tmp_path: Path, turned: str) -
     theirs = render(config, folder=tmp_path)
     assert theirs.samples == 0
     config["scene"]["hidden_geometry"] = [BEHIND]  # and without wall, by paths
-    pathwise = render(config, ["render.target_error=0.05"], folder=tmp_path)
+    pathwise = render(config, ["render.target_error=0.05", "render.engine=path"], folder=tmp_path)
     assert pathwise.samples > 0
     assert relative_l2(pathwise.total - own.total, own.total) < 0.1
     np.testing.assert_allclose(theirs.capture.sensor_grid.positions, own.capture.sensor_grid.positions, atol=1e-6)

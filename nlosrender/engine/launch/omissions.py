@@ -6,6 +6,7 @@ from collections.abc import Iterator
 
 from nlosrender.engine.interface import OmittedWork
 from nlosrender.engine.launch.device_capture import DeviceCapture
+from nlosrender.scene.build import count_triangles
 
 
 def omitted_visibility() -> OmittedWork:
@@ -15,7 +16,7 @@ def omitted_visibility() -> OmittedWork:
 
 def omitted_triangles(device: DeviceCapture) -> Iterator[OmittedWork]:
     """Yield the number of triangles that are not sampled, if any."""
-    total = device.built.n_triangles
+    total = count_triangles(device.built.sampled_shapes)  # others are not sampled because points lie on them
     if dark := total - device.sampler.n_triangles:
         why = "they face away from the whole wall or lie behind it: no ray is sent to them"
         yield OmittedWork(f"{dark} of {total} triangles", why)

@@ -29,7 +29,7 @@ def deposit_second_bounce(params: LaunchParams, histogram: DeviceHistogram, acti
         distance = dr.norm(to_laser)
         apart = (distance > COINCIDENT) & active
         if dr.hint(isinstance(built, SceneWithoutWall), mode="scalar"):
-            apart &= ~_on_one_plane(built, sensor, lit, to_laser)
+            apart &= ~on_one_plane(built, sensor, lit.n, to_laser)
         direction = to_laser / dr.maximum(distance, COINCIDENT)
         received = built.bsdf_at(sensor).eval(context, sensor, sensor.to_local(direction), apart)
         emitted = built.bsdf_at(lit).eval(context, lit, lit.to_local(-direction), apart)
@@ -43,12 +43,14 @@ def deposit_second_bounce(params: LaunchParams, histogram: DeviceHistogram, acti
         laser += 1
 
 
-def _on_one_plane(
-    built: BuiltScene, sensor: mi.SurfaceInteraction3f, lit: mi.SurfaceInteraction3f, to_laser: mi.Vector3f
+def on_one_plane(
+    built: BuiltScene, point: mi.SurfaceInteraction3f, normal: mi.Normal3f, to_other: mi.Vector3f
 ) -> mi.Bool:
     """Return whether points lie in each other's tangent plane, as far as float32 knows: no light goes between them.
 
+    ``normal``: unit, of the other point, which is ``to_other`` away.
+
     On a tilted plane their cosines are not 0 exactly, and the light of a point very close has no bound.
     """
-    height = dr.maximum(dr.abs(dr.dot(sensor.n, to_laser)), dr.abs(dr.dot(lit.n, to_laser)))
-    return height < ray_offset_at(built, sensor.p, sensor.shape)
+    height = dr.maximum(dr.abs(dr.dot(point.n, to_other)), dr.abs(dr.dot(normal, to_other)))
+    return height < ray_offset_at(built, point.p, point.shape)

@@ -31,6 +31,7 @@ from nlosrender.engine.virtual_lights.refinement import difference_divisor
 from nlosrender.engine.virtual_lights.third_bounce import ThirdBounce
 from nlosrender.engine.virtual_lights.tuning import DEFAULT_TUNING, VirtualLightTuning
 from nlosrender.engine.virtual_lights.vpls.rounds import VplBounces
+from nlosrender.scene.build import SceneWithoutWall
 
 
 class VirtualLightEngine:
@@ -70,7 +71,7 @@ class VirtualLightEngine:
             is_multiplexed=capture.laser_weights is not None,
             laser_rays=tuning.laser_rays,
         )
-        all_lambertian = self.settings.is_diffuse and is_lambertian(built.wall_shape.bsdf())
+        all_lambertian = self.settings.is_diffuse and all(is_lambertian(shape.bsdf()) for shape in built.lit_shapes)
         has_vpls = self.has_further_bounces and self._mirrors_once
         mirror = device.lone_mirror if has_vpls else None
         bin_width = self.time_axis.bin_width_opl / built.metres_per_engine_unit
@@ -98,7 +99,8 @@ class VirtualLightEngine:
         surfaces = "Lambertian" if self.settings.is_diffuse else "diffuse and rough"
         surfaces += " surfaces and a mirror" if mirror is not None else " surfaces"
         surfaces += " (light of mirrors by paths)" if self.traces_paths else ""
-        self.reason = f"{surfaces} before a {'planar' if built.wall.is_planar else 'curved'} wall"
+        before = f"before a {'planar' if built.wall.is_planar else 'curved'} wall"
+        self.reason = f"{surfaces} {'that a camera sees' if isinstance(built, SceneWithoutWall) else before}"
         self._calibrated: dict[Budget, Budget] = {}
 
     @property

@@ -10,6 +10,7 @@ import mitsuba as mi
 import numpy as np
 
 from nlosrender.engine.virtual_lights.elements.patches import Patches, split_weights
+from nlosrender.engine.virtual_lights.elements.surface_distance import SurfaceDistance
 from nlosrender.scene.loading.round_surfaces import RoundSurface
 from nlosrender.scene.pose import Float64
 
@@ -42,10 +43,12 @@ class RoundShape:
         length = np.linalg.norm(self.axis)
         return np.concatenate([self.centre, [self.radius], self.axis / length if length > 0 else self.axis])
 
-    def nearest(self, distance: WallDistance) -> float:
-        """Return the distance from the nearest laser or sensor point, of spheres exactly."""
+    def nearest(self, distance: WallDistance | SurfaceDistance) -> float:
+        """Return the distance from the nearest laser or sensor point, of spheres exactly; not from points on itself."""
         along = np.linspace(0, 1, 33)[:, None] * self.axis if self.axis.any() else np.zeros((1, 3))
-        return abs(float(distance(self.centre + along).min()) - abs(self.radius))
+        places = self.centre + along
+        apart = distance.apart(places, self.index) if isinstance(distance, SurfaceDistance) else distance(places)
+        return abs(float(apart.min()) - abs(self.radius))
 
     def count(self, across: float, along: float) -> int:
         """Return how many patches it takes of sizes up to ``across``, and ``along`` the axis of a cylinder."""

@@ -17,6 +17,7 @@ from nlosrender.capture.grids import Capture, PointGrid
 from nlosrender.engine.launch.facing_triangles import facing_triangles
 from nlosrender.engine.launch.flat_mirrors import FlatMirrors
 from nlosrender.engine.virtual_lights.elements.struct_of_arrays import StructOfArrays
+from nlosrender.engine.virtual_lights.elements.surface_distance import SurfaceDistance
 from nlosrender.engine.virtual_lights.elements.triangles import (
     centroids,
     longest_edges,
@@ -172,7 +173,7 @@ def wall_elements(built: BuiltScene) -> Elements:
 
 
 def partition_by_size(
-    elements: Elements, distance: WallDistance, wall_index: int | None, min_size: float = 0.0
+    elements: Elements, distance: WallDistance | SurfaceDistance, wall_index: int | None, min_size: float = 0.0
 ) -> tuple[Elements, Elements]:
     """Return the elements that ``subdivide`` leaves as they are, with their distances, and those that it quarters."""
     distances = _distances(elements, distance, wall_index)
@@ -180,7 +181,9 @@ def partition_by_size(
     return replace(elements, distances=distances).select(~large), elements.select(large)
 
 
-def subdivide(elements: Elements, distance: WallDistance, wall_index: int | None, min_size: float = 0.0) -> Elements:
+def subdivide(
+    elements: Elements, distance: WallDistance | SurfaceDistance, wall_index: int | None, min_size: float = 0.0
+) -> Elements:
     """Quarter elements until none is longer than its distance from the nearest point, found anew, or than ``min_size``.
 
     On the wall, shape ``wall_index`` of the scene, only points in the planes of other triangles count.
@@ -213,7 +216,9 @@ def _shading_normals(mesh: mi.Mesh, corners: Float64, primitives: NDArray[np.uin
     return at_vertices[np.asarray(parameters["faces"]).reshape(-1, 3)[primitives]]
 
 
-def _distances(elements: Elements, distance: WallDistance, wall_index: int | None) -> Float64:
+def _distances(elements: Elements, distance: WallDistance | SurfaceDistance, wall_index: int | None) -> Float64:
+    if isinstance(distance, SurfaceDistance):
+        return distance.of_elements(elements)
     centres = centroids(elements.corners)
     distances = np.empty(len(centres))
     on_wall = elements.shapes == (-1 if wall_index is None else wall_index)

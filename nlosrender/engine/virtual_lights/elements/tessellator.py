@@ -23,10 +23,13 @@ from nlosrender.engine.virtual_lights.elements.round_shapes import RoundShape
 from nlosrender.engine.virtual_lights.elements.sensor_regions import regions_of
 from nlosrender.engine.virtual_lights.elements.size_field import SizedElements, SizeField
 from nlosrender.engine.virtual_lights.elements.subdivision import Elements, WallDistance, elements_of_mesh, subdivide
+from nlosrender.engine.virtual_lights.elements.surface_distance import SurfaceDistance
+from nlosrender.engine.virtual_lights.elements.triangles import centroids
 from nlosrender.engine.virtual_lights.tuning import DEFAULT_TUNING, VirtualLightTuning
-from nlosrender.scene.build import BuiltScene
+from nlosrender.scene.build import BuiltScene, SceneWithoutWall
 from nlosrender.scene.loading.mitsuba_shapes import WALL_ID
 from nlosrender.scene.loading.round_surfaces import ROUND_PLUGINS
+from nlosrender.scene.pixel_points import FirstHits
 
 N_KEPT = 2  # scales: that of the gather, and one coarser for its error
 
@@ -64,15 +67,19 @@ class Tessellator:
         tuning: VirtualLightTuning = DEFAULT_TUNING,
     ):
         self.built, self.capture, self.tuning = built, capture, tuning
-        self.distance = WallDistance(capture, built.metres_per_engine_unit)
-        self.reach = max(capture.sensor_grid.lattice.size) / (
-            2 * built.metres_per_engine_unit
-        )  # half the sensor grid's extent [engine units]
+        unit = built.metres_per_engine_unit
+        self.distance: WallDistance | SurfaceDistance = WallDistance(capture, unit)
+        size = max(capture.sensor_grid.lattice.size)
+        if isinstance(built, SceneWithoutWall):
+            self.distance = surface_distance(built, built.pixels.sensors, built.pixels.lasers)
+            size = float(np.ptp(capture.sensor_grid.positions.reshape(-1, 3), axis=0).max())
+            may_divide = False
+        self.reach = size / (2 * unit)  # half the sensor grid's extent [engine units]
         triangles: list[Elements] = []
         self.round_shapes: list[RoundShape] = []
         self.wall_index: int | None = None  # of the wall among the scene's shapes, where it is cut as well
         for index, shape in enumerate(built.scene.shapes()):
-            if shape.id() == WALL_ID:
+            if shape.id() == WALL_ID and not isinstance(built, SceneWithoutWall):
                 if not wall_sees_itself(built):
                     continue
                 self.wall_index = index
@@ -87,9 +94,9 @@ class Tessellator:
         joined = Elements.joined(triangles or [Elements.none()])
         self.elements = subdivide(joined, self.distance, self.wall_index)
         whole = SizedElements(self.elements, self.size_field)
-        self.regions = (
-            regions_of(capture, built.metres_per_engine_unit, self.distance, joined, whole) if may_divide else None
-        )
+        self.regions = None
+        if may_divide and isinstance(self.distance, WallDistance):
+            self.regions = regions_of(capture, unit, self.distance, joined, whole)
         self.shared = whole if self.regions is None else self.regions.shared
         self._is_hidden = whole.is_hidden
         self._kept: dict[float, Patches] = {}  # by patch_scale, the last used at the end
@@ -157,12 +164,18 @@ class Tessellator:
     @cached_property
     def nearest_to_laser(self) -> float:
         """Distance from the laser points to the nearest hidden element's centroid, or round shape [engine units]."""
-        lasers = WallDistance(
-            replace(self.capture, sensor_grid=self.capture.laser_grid), self.built.metres_per_engine_unit
-        )
+        hidden = self.elements.select(self._is_hidden)
+        if isinstance(self.built, SceneWithoutWall):
+            of_lasers = surface_distance(self.built, self.built.pixels.lasers)
+            lasers: WallDistance | SurfaceDistance = of_lasers
+            distances = of_lasers.of_elements(hidden)
+        else:
+            lasers = WallDistance(
+                replace(self.capture, sensor_grid=self.capture.laser_grid), self.built.metres_per_engine_unit
+            )
+            distances = lasers(centroids(hidden.corners)) if len(hidden) else np.zeros(0)
         on_round = [shape.nearest(lasers) for shape in self.round_shapes if shape.index != self.wall_index]
-        centres = self.elements.corners[self._is_hidden].mean(axis=1)
-        return min([float(lasers(centres).min(initial=np.inf)) if len(centres) else math.inf, *on_round])
+        return min([float(distances.min(initial=np.inf)), *on_round])
 
     @property
     def n_round_elements(self) -> int:
@@ -196,7 +209,19 @@ def is_mirror(bsdf: mi.BSDF) -> bool:
     return not bool(bsdf.flags() & mi.BSDFFlags.Smooth)
 
 
+def surface_distance(built: SceneWithoutWall, *hits: FirstHits) -> SurfaceDistance:
+    """Return the distance from points that a camera sees."""
+    shapes = enumerate(built.scene.shapes())
+    is_round = frozenset(index for index, shape in shapes if shape.class_name() in ROUND_PLUGINS)
+    return SurfaceDistance(hits, built.metres_per_engine_unit, is_round)
+
+
 def wall_sees_itself(built: BuiltScene) -> bool:
-    """Return whether light may go from the wall to the wall: not on a plane, nor outside a sphere or cylinder."""
+    """Return whether light may go from the wall to the wall: not on a plane, nor outside a sphere or cylinder.
+
+    Without relay wall all surfaces are hidden ones.
+    """
+    if isinstance(built, SceneWithoutWall):
+        return False
     wall = built.wall_shape
     return not built.wall.is_planar and (wall.is_mesh() or wall.has_flipped_normals())

@@ -20,10 +20,12 @@ from nlosrender.engine.launch.device_arrays import on_device
 from nlosrender.engine.launch.flat_mirrors import FlatMirrors, image_in, turned_in
 from nlosrender.engine.launch.launch_params import LaunchParams
 from nlosrender.engine.launch.passes import Passes, PassSize, Snapshot
+from nlosrender.engine.launch.second_bounce import on_one_plane
 from nlosrender.engine.launch.wall_points import WallPoints
 from nlosrender.engine.virtual_lights.gather.delay_distribution import Delays, PatchDelays, deposit_patch
 from nlosrender.engine.virtual_lights.gather.lighting import ROWS, GatherSettings, PackedPatches
 from nlosrender.engine.virtual_lights.visibility.shadow_rays import is_visible, mirrored_share
+from nlosrender.scene.build import SceneWithoutWall
 
 if TYPE_CHECKING:
     from nlosrender.engine.virtual_lights.gather.block_histogram import BlockHistogram
@@ -118,7 +120,7 @@ def gather_third_bounce(
         By way of which the sensor points see the patches of Lambertian surfaces; None: straight.
     """
     built, sensors = params.built, params.sensors
-    sensor, wall_bsdf = sensors.interaction, built.wall_bsdf
+    sensor, sensor_bsdf = sensors.interaction, built.bsdf_at(sensors.interaction)
     context = mi.BSDFContext()
     n_lasers, count = params.n_lasers, packed.count
     own_laser = params.lasers.gather(params.first_laser)
@@ -140,7 +142,7 @@ def gather_third_bounce(
             built,
             sensors,
             sensor,
-            wall_bsdf,
+            sensor_bsdf,
             own_laser,
             tile,
             mirror,
@@ -159,9 +161,11 @@ def gather_third_bounce(
             to_patch = from_sensor + turned_in(mirror, _rounding_residual(packed, patch))
         distance2 = dr.squared_norm(to_patch)
         direction = to_patch * dr.rsqrt(distance2)
-        received = wall_bsdf.eval(context, sensor, sensor.to_local(direction))
+        received = sensor_bsdf.eval(context, sensor, sensor.to_local(direction))
         weight = received * (dr.abs(dr.dot(areas, direction)) / distance2)
         active = dr.any(weight > 0)
+        if dr.hint(isinstance(built, SceneWithoutWall), mode="scalar"):
+            active &= ~on_one_plane(built, sensor, dr.normalize(areas), to_patch)
         cosine = mi.Float(0)
         if dr.hint(settings.is_diffuse, mode="scalar"):
             cosine = -dr.dot(turned_in(mirror, dr.gather(mi.Normal3f, packed.shading, patch)), direction)
@@ -185,7 +189,9 @@ def gather_third_bounce(
         delays = PatchDelays.from_point(sensor.p, centre, (a, b, c), params.bins_per_unit)
         seen = _SeenPatch(patch, weight, is_cluster, to_patch - from_sensor, active)
         if dr.hint(settings.is_confocal, mode="scalar"):
-            light = wall_bsdf.eval(context, sensor, sensor.to_local(direction)) / distance2
+            # of the laser point: the laser stands elsewhere than the sensor, and may not see it
+            lit = own_laser.interaction
+            light = built.bsdf_at(lit).eval(context, lit, lit.to_local(direction)) / distance2
             if dr.hint(settings.is_diffuse, mode="scalar"):
                 light *= dr.gather(mi.Spectrum, packed.reflectance, patch) * cosine
             delays += delays

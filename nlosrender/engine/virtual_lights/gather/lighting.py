@@ -12,11 +12,12 @@ import numpy as np
 from nlosrender.engine.launch.device_arrays import on_device
 from nlosrender.engine.launch.flat_mirrors import FlatMirrors, image_in, turned_in
 from nlosrender.engine.launch.launch_params import LaunchParams
+from nlosrender.engine.launch.second_bounce import on_one_plane
 from nlosrender.engine.launch.wall_points import WallPoints
 from nlosrender.engine.virtual_lights.gather.delay_distribution import PatchDelays
 from nlosrender.engine.virtual_lights.tuning import DEFAULT_TUNING
 from nlosrender.engine.virtual_lights.visibility.shadow_rays import is_visible, mirrored_share
-from nlosrender.scene.build import BuiltScene
+from nlosrender.scene.build import BuiltScene, SceneWithoutWall
 
 if TYPE_CHECKING:
     from nlosrender.engine.virtual_lights.gather.device_patches import DevicePatches
@@ -218,9 +219,11 @@ def _light_by_lasers(
     distance2 = dr.squared_norm(to_patch)
     direction = to_patch * dr.rsqrt(distance2)
     sent = lit.to_local(turned_in(mirror, direction))
-    laser_light = points.shared(built.wall_bsdf.eval(mi.BSDFContext(), lit, sent) / distance2)
+    laser_light = points.shared(built.bsdf_at(lit).eval(mi.BSDFContext(), lit, sent) / distance2)
     cosine = -dr.dot(dr.gather(mi.Normal3f, patches.interaction.sh_frame.n, patch), direction)
     active = dr.any(laser_light > 0)
+    if isinstance(built, SceneWithoutWall):
+        active &= ~on_one_plane(built, lit, dr.gather(mi.Normal3f, patches.interaction.n, patch), to_patch)
     if settings.is_diffuse:
         laser_light *= dr.maximum(cosine, 0) * dr.gather(mi.Spectrum, patches.reflectance, patch) * dr.inv_pi
         active &= dr.any(laser_light > 0)
@@ -290,7 +293,7 @@ def _corners(patches: DevicePatches, index: mi.UInt32) -> tuple[mi.Point3f, mi.P
 
 def irradiance(built: BuiltScene, laser: WallPoints, point: mi.Point3f, shading: mi.Normal3f) -> mi.Spectrum:
     """Return the irradiance at a point from a laser point that it sees [1 / (engine unit)^2 per J]."""
-    emitted, direction, distance2 = _emitted(built, laser, point)
+    emitted, direction, distance2 = _emitted(built, laser, point, shading)
     return emitted * (dr.maximum(-dr.dot(shading, direction), 0) / distance2)
 
 
@@ -301,14 +304,20 @@ def reflected_light(
 
     In 1 / (sr engine unit^2) per J, by Mitsuba's ``eval`` of their BSDF.
     """
-    emitted, direction, distance2 = _emitted(built, laser, si.p)
+    emitted, direction, distance2 = _emitted(built, laser, si.p, si.n)
     return emitted * si.bsdf().eval(mi.BSDFContext(), si, si.to_local(-direction), active) / distance2
 
 
-def _emitted(built: BuiltScene, laser: WallPoints, point: mi.Point3f) -> tuple[mi.Spectrum, mi.Vector3f, mi.Float]:
+def _emitted(
+    built: BuiltScene, laser: WallPoints, point: mi.Point3f, normal: mi.Normal3f
+) -> tuple[mi.Spectrum, mi.Vector3f, mi.Float]:
     """Return the wall's BSDF towards points, the direction there, and the squared distance."""
     to_point = point - laser.interaction.p
     distance2 = dr.squared_norm(to_point)
     direction = to_point * dr.rsqrt(distance2)
-    emitted = built.wall_bsdf.eval(mi.BSDFContext(), laser.interaction, laser.interaction.to_local(direction))
+    lit = laser.interaction
+    is_lit: mi.Bool | bool = True
+    if isinstance(built, SceneWithoutWall):
+        is_lit = ~on_one_plane(built, lit, normal, to_point)
+    emitted = built.bsdf_at(lit).eval(mi.BSDFContext(), lit, lit.to_local(direction), is_lit)
     return emitted, direction, distance2

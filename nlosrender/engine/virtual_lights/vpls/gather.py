@@ -15,11 +15,12 @@ from nlosrender.engine.launch.flat_mirrors import FlatMirrors, image_in, turned_
 from nlosrender.engine.launch.histogram import DeviceHistogram, HistogramShape
 from nlosrender.engine.launch.launch_params import LaunchParams
 from nlosrender.engine.launch.ray_offsets import WALL_OFFSET, off_the_surface
+from nlosrender.engine.launch.second_bounce import on_one_plane
 from nlosrender.engine.virtual_lights.gather.device_patches import surface_at, to_points
 from nlosrender.engine.virtual_lights.gather.lighting import irradiance, reflected_light
 from nlosrender.engine.virtual_lights.visibility.masks import Surface, VisibilityMasks, WallTiles
 from nlosrender.engine.virtual_lights.visibility.shadow_rays import is_visible, mirrored_share
-from nlosrender.scene.build import BuiltScene
+from nlosrender.scene.build import BuiltScene, SceneWithoutWall
 
 if TYPE_CHECKING:
     from nlosrender.engine.virtual_lights.vpls.sampler import Vpls
@@ -72,7 +73,8 @@ class VplTable:
         shading = mi.Normal3f(to_points(vpls.normals[used]))
         positions = vpls.positions[used]
         offset = off_the_surface(built, positions, vpls.normals[used], vpls.shapes[used]) - positions
-        offset[:, 2] = np.where(positions[:, 2] == 0, WALL_OFFSET, offset[:, 2])  # of a planar wall
+        if built.wall.is_planar:  # VPLs on it
+            offset[:, 2] = np.where(positions[:, 2] == 0, WALL_OFFSET, offset[:, 2])
         mask = mi.UInt64(0)
         if masks is not None:
             surface = Surface(to_points(vpls.positions[used]), mi.Vector3f(shading), mi.Vector3f(shading))
@@ -112,10 +114,12 @@ def connect_to_vpl(
     distance2 = dr.squared_norm(to_vpl)
     distance = dr.sqrt(distance2)
     direction = to_vpl / distance
-    weight = built.wall_bsdf.eval(mi.BSDFContext(), sensor, sensor.to_local(direction))
+    weight = built.bsdf_at(sensor).eval(mi.BSDFContext(), sensor, sensor.to_local(direction))
     facing = -dr.dot(turned_in(mirror, areas), direction)
     if table.interaction is not None:
         facing = dr.abs(facing)
+    if isinstance(built, SceneWithoutWall):
+        facing = dr.select(on_one_plane(built, sensor, dr.normalize(areas), to_vpl), 0, facing)
     weight *= dr.maximum(facing, 0) / distance2
     active = dr.any(weight > 0)
     if mirror is not None:

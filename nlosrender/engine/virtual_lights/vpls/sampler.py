@@ -23,6 +23,7 @@ from nlosrender.engine.launch.time_gate import CaptureTimeGate
 from nlosrender.engine.virtual_lights.elements.patches import SurfacePoints
 from nlosrender.engine.virtual_lights.elements.round_shapes import onto_round_shapes
 from nlosrender.engine.virtual_lights.elements.subdivision import Elements, wall_elements
+from nlosrender.engine.virtual_lights.elements.surface_distance import SurfaceDistance
 from nlosrender.engine.virtual_lights.elements.triangles import longest_edges, normals_and_areas
 from nlosrender.scene.pose import Float64
 from nlosrender.scene.triangle_point import triangle_weights
@@ -73,7 +74,11 @@ class VplSampler:
             seen = slice(len(elements), len(flat))
             centres[seen] = mirror.images(centres[seen])
         # an element is no longer than its distance; half its size stands for the distance where it touches a point
-        distances = np.maximum(tessellator.distance(centres), longest_edges(self._corners) / 2)
+        distances = tessellator.distance(centres)
+        if isinstance(tessellator.distance, SurfaceDistance):  # from points that may see them
+            of_round = (tessellator.distance.apart(part.centres, shape.index) for shape, part in on_round)
+            distances = np.concatenate([flat.distances, *of_round])
+        distances = np.maximum(distances, longest_edges(self._corners) / 2)
         self._density = self._densities(tessellator, centres, 1 / (distances * (distances + tessellator.reach)))
         order = np.lexsort((morton_order(centres), self._shapes))  # shape by shape, neighbours together
         importance = (self._areas * self._density)[order]

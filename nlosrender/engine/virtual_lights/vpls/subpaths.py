@@ -468,7 +468,7 @@ def _connect(
         by_mirror = dr.gather(mi.Bool, ends.by_mirror, end) & mirror.may_reflect(number, si.p, lit.p)
         found = mirror.reflected(built, number, si, lit.p, off_the_wall(built, lit), by_mirror)
         carried *= found.value * (dr.maximum(dr.dot(facing, found.direction), 0) * dr.gather(mi.Float, scale, entry))
-        carried *= built.wall_bsdf.eval(mi.BSDFContext(), lit, lit.to_local(found.from_lit))
+        carried *= built.bsdf_at(lit).eval(mi.BSDFContext(), lit, lit.to_local(found.from_lit))
         value = dr.select(found.active, lasers.shared(carried), value)
         distance = dr.select(found.active, found.distance, distance)
         active = dr.any(value > 0)
