@@ -87,6 +87,15 @@ def test_a_surface_without_wall_is_gathered_as_a_wall_is() -> None:
     assert not results[1].bounce(2).any()  # nor does the plane see itself
 
 
+def test_light_between_an_edge_and_a_laser_spot_beside_it_is_told() -> None:
+    """Half of the light of a spot goes to the surface beside it: the third bounce is right, what is missed is said."""
+    config = seen(*CORNER)
+    config["capture"] |= {"laser_target": [0.999, 0, 0.0005]}
+    engine = Stage.of(config).engine
+    assert any("goes to and fro" in text for text in engine.warnings())
+    assert not any("goes to and fro" in text for text in Stage.of(seen(*CORNER)).engine.warnings())
+
+
 def test_auto_takes_virtual_lights_and_leaves_mirrors_to_paths() -> None:
     """Each says why."""
     config = seen(*CORNER, engine="auto")

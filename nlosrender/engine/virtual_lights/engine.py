@@ -143,10 +143,12 @@ class VirtualLightEngine:
         Between a laser point and a surface almost on it, light goes to and fro in an area of about the distance
         squared. Subpaths begin anywhere and end there by chance.
         """
-        sampler = self.device.sampler
-        if not self.has_further_bounces or self.capture.scan_type == "confocal" or sampler.is_empty:
+        if not self.has_further_bounces or self.capture.scan_type == "confocal":
             return False
-        return math.pi * self.tessellator.nearest_to_laser**2 < self.tessellator.tuning.rare_share * sampler.area
+        # of all surfaces that VPLs lie on: without relay wall the sampler leaves out those with points on them
+        is_seen = isinstance(self.built, SceneWithoutWall)
+        area = float(self.tessellator.shared.areas.sum()) if is_seen else self.device.sampler.area
+        return math.pi * self.tessellator.nearest_to_laser**2 < self.tessellator.tuning.rare_share * area
 
     @property
     def compile_seconds(self) -> float:
