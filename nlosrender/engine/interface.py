@@ -35,8 +35,12 @@ class Budget:
     # of the virtual lights: the difference of their two resolutions over the error of the finer one; None: a bound
     difference_divisor: float | None = None
     rounds: int | None = None  # of the virtual lights: rounds of VPL subpaths
-    bins_per_step: int | None = None  # of the virtual lights: bins in a time step of the light of VPLs
-    steps_variance: float | None = None  # of the virtual lights: what these change, squared, over the variance of VPLs
+    # of the virtual lights: bins in a time step of the light of VPLs, and what such steps change, squared, over its
+    # variance; the same of the paths beside them
+    bins_per_step: int | None = None
+    steps_variance: float | None = None
+    bins_per_step_of_paths: int | None = None
+    steps_variance_of_paths: float | None = None
     footprint_places: int | None = None  # of the virtual lights: places in the footprint of a sensor point
 
     @property

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -14,12 +16,8 @@ import mitsuba as mi  # noqa: E402
 
 from nlosrender.engine.launch.device_arrays import on_device  # noqa: E402
 from nlosrender.engine.launch.histogram import DeviceHistogram, HistogramShape  # noqa: E402
-from nlosrender.engine.virtual_lights.vpls.step_sums import (  # noqa: E402
-    StepKernel,
-    StepSums,
-    TimeSteps,
-    in_steps,
-)
+from nlosrender.engine.launch.time_steps import StepKernel, TimeSteps  # noqa: E402
+from nlosrender.engine.virtual_lights.vpls.step_sums import StepSums, in_steps  # noqa: E402
 
 
 def histogram_of(light: NDArray[np.float64], replicas: int = 1) -> DeviceHistogram:
@@ -125,25 +123,25 @@ def test_change_is_told_from_noise() -> None:
     change = np.square(rows_of(in_steps(exact, 4)) - rows_of(exact))[..., :-1].sum()
     assert change > 1
     noisy = histogram_of(light + generator.normal(0, 2, (400, 1, 64)), replicas=2)
-    steps = TimeSteps.of_pilot(noisy, (4,), 1, 0.0, is_rounded=True)
+    steps = TimeSteps.of_pilot(noisy, (4,), 1, 0.0, in_steps)
     assert steps[1].change ** 2 * np.square(light).sum() == pytest.approx(change, rel=0.1)
     # the mean of two has a variance of 2; steps of four bins leave a quarter of it, and what they spread it by less
     assert steps[0].error == pytest.approx(np.sqrt(2 * 64 / np.square(light).sum()), rel=0.05)
     assert steps[0].error / 3 < steps[1].error < steps[0].error / 2
 
 
-@pytest.mark.parametrize("is_rounded", [True, False])
-def test_longer_steps_change_more(is_rounded: bool) -> None:
+@pytest.mark.parametrize("lengthened", [in_steps, None], ids=["added", "smoothed"])
+def test_longer_steps_change_more(lengthened: Any) -> None:
     """Of light that begins at once; the change is that of the whole H, of which more is known from elsewhere."""
     light = np.tile(np.where(np.arange(64) < 29, 0.0, 10.0), (4, 1, 1))
     pilot = histogram_of(light, replicas=2)
-    steps = TimeSteps.of_pilot(pilot, (2, 4, 8), 1, 0.0, is_rounded=is_rounded)
+    steps = TimeSteps.of_pilot(pilot, (2, 4, 8), 1, 0.0, lengthened)
     assert [step.bins for step in steps] == [1, 2, 4, 8]
     changes = [step.change for step in steps]
     assert changes[0] == 0 < changes[1] < changes[2] < changes[3]
     assert all(step.error == 0 for step in steps)  # replicas are the same
     known = 3 * np.square(light[:2]).sum()  # four times the squares in all
-    assert TimeSteps.of_pilot(pilot, (8,), 1, known, is_rounded=is_rounded)[1].change == pytest.approx(changes[3] / 2)
+    assert TimeSteps.of_pilot(pilot, (8,), 1, known, lengthened)[1].change == pytest.approx(changes[3] / 2)
     doubled = histogram_of(2 * light, replicas=2)  # by two units
-    assert TimeSteps.of_pilot(doubled, (8,), 2, 0.0, is_rounded=is_rounded)[1].change == pytest.approx(changes[3])
+    assert TimeSteps.of_pilot(doubled, (8,), 2, 0.0, lengthened)[1].change == pytest.approx(changes[3])
     dr.sync_thread()

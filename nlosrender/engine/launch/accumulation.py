@@ -14,11 +14,10 @@ from numpy.typing import NDArray
 from nlosrender.capture.plan import MAX_SUMS
 from nlosrender.engine.launch.device_arrays import on_device
 from nlosrender.engine.launch.energy_contrasts import contrasts_of_points
-from nlosrender.engine.launch.histogram import DeviceHistogram, Histogram, HistogramShape
+from nlosrender.engine.launch.histogram import DeviceHistogram, Histogram, HistogramShape, Kernel
 from nlosrender.engine.launch.lane_random_state import LaneRandomness
 from nlosrender.engine.launch.passes import Passes, Snapshot
 from nlosrender.engine.launch.schedule import Schedule
-from nlosrender.engine.launch.temporal_kernel import TemporalKernel
 from nlosrender.errors import RenderError
 
 Launch = Callable[[DeviceHistogram, LaneRandomness, int, range], LaneRandomness]
@@ -55,9 +54,11 @@ class Accumulation:
     launch: Launch
     scale: float = 1.0
     slots: range | None = None
-    kernel: TemporalKernel | None = None
+    kernel: Kernel | None = None
     row_points: NDArray[np.uint32] | None = None
     compile_seconds: float = 0.0
+    histogram: DeviceHistogram | None = None  # of the last run, and the samples of each of its lanes
+    done: int = 0
 
     def run(self, schedule: Schedule, passes: Passes) -> Histogram:
         """Launch until ``schedule`` has enough.
@@ -68,7 +69,7 @@ class Accumulation:
             The batch is too large for 32-bit indices, or the result is not finite.
         """
         refuse_many_sums(self.shape.size)
-        histogram = DeviceHistogram(self.shape, self.kernel)
+        histogram = self.histogram = DeviceHistogram(self.shape, self.kernel)
         if (earlier := passes.resumed("sums")) is None:
             randomness = lane_randomness(self.shape, self.points, self.seed)
             done, before = 0, 0.0
@@ -98,6 +99,7 @@ class Accumulation:
                 return Snapshot({"sums": np.asarray(histogram.sums.numpy()), **own.arrays}, numbers)
 
             passes.between(schedule.fraction(done, seconds), take)
+        self.done = done
         return self._result(histogram, done)
 
     def _result(self, histogram: DeviceHistogram, done: int) -> Histogram:

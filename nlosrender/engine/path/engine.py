@@ -10,6 +10,7 @@ from typing import Any
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from nlosrender.capture.bounces import FIRST_BOUNCE, THIRD_BOUNCE
 from nlosrender.capture.plan import Batch, Plan
@@ -27,9 +28,10 @@ from nlosrender.engine.launch.omissions import omitted_by_time_gate, omitted_tri
 from nlosrender.engine.launch.passes import Passes
 from nlosrender.engine.launch.pilot_points import Pilot, pilot_of
 from nlosrender.engine.launch.plain_diffuse import is_plain_diffuse
-from nlosrender.engine.launch.schedule import Schedule, calibrated_by_pilot, pilot_replicas
+from nlosrender.engine.launch.schedule import DEFAULT_TARGET, Schedule, calibrated_by_pilot, pilot_replicas
 from nlosrender.engine.launch.sequences import SystematicSequence
 from nlosrender.engine.launch.temporal_kernel import TemporalKernel
+from nlosrender.engine.launch.time_steps import StepKernel, TimeSteps
 from nlosrender.engine.path.continuation_period import best_continuation_period, first_phases
 from nlosrender.engine.path.full_loop import trace_paths
 from nlosrender.engine.path.laser_flash import LaserFlash
@@ -153,6 +155,7 @@ class PathEngine:
         lanes, tuning = shape.lanes * shape.lasers, self.options.schedule
         schedule = Schedule(budget, shape.replicas, known_squares, lanes, tuning)
         result = accumulation.run(schedule, passes or Passes())
+        np.multiply(result.variance, 1 + (budget.steps_variance_of_paths or 0.0), out=result.variance)
         self.compile_seconds += accumulation.compile_seconds
         self.device.add_exact_light(batch, result)
         return result
@@ -168,7 +171,31 @@ class PathEngine:
         replicas = options.replicas, shape.replicas
         calibrated = calibrated_by_pilot(budget, replicas, accumulation.run, known_squares, seconds, options.schedule)
         self.compile_seconds += accumulation.compile_seconds
+        if self.only_specular and self.kernel is None and calibrated.spp is not None:
+            return self._in_time_steps(calibrated, accumulation, known_squares)
         return calibrated
+
+    def _in_time_steps(self, budget: Budget, pilot: Accumulation, known_squares: float) -> Budget:
+        """Return ``budget`` with the time steps that need the fewest paths, and these; see ``TimeSteps``."""
+        tuning, histogram = self.tuning, pilot.histogram
+        if histogram is None or budget.spp is None:
+            return budget
+        target = budget.target_error or DEFAULT_TARGET
+        goal = self.options.schedule.aim * target
+        steps = TimeSteps.of_pilot(histogram, tuning.bins_smoothed, pilot.done, known_squares)
+        allowed = [step for step in steps if step.change <= tuning.share_of_steps * target]
+
+        def share_of_paths(step: TimeSteps) -> float:
+            return (step.error / steps[0].error) ** 2 / (1 - (step.change / goal) ** 2)
+
+        if not 0 < steps[0].error < math.inf:
+            return budget
+        best = min(allowed, key=share_of_paths)
+        spp = max(
+            math.ceil(budget.spp * share_of_paths(best)), self.options.schedule.first_samples * self.options.replicas
+        )
+        variance = best.change**2 / (goal**2 - best.change**2)
+        return replace(budget, spp=spp, bins_per_step_of_paths=best.bins, steps_variance_of_paths=variance)
 
     def trace(
         self,
@@ -205,7 +232,8 @@ class PathEngine:
 
         first = self.settings.first_slot
         slots = range(-first, bounces.n_slots - first)
-        return Accumulation(shape, points, seed, launch, self.device.scale, slots, self.kernel, row_points)
+        kernel = StepKernel(budget.bins_per_step_of_paths) if budget.bins_per_step_of_paths else self.kernel
+        return Accumulation(shape, points, seed, launch, self.device.scale, slots, kernel, row_points)
 
     def _path_params(self, batch: Batch | Pilot, shape: HistogramShape, period: int) -> PathParams:
         params = self.device.launch_params(batch, shape, self.device.lane_order(batch))

@@ -172,7 +172,12 @@ class VirtualLightEngine:
                 ).squares
                 goal = math.sqrt(tuning.share_squares - used) * (budget.target_error or DEFAULT_TARGET)
                 paths = self.paths.calibrate(replace(budget, target_error=goal), seconds, squares)
-                calibrated = replace(calibrated, spp=paths.spp)
+                calibrated = replace(
+                    calibrated,
+                    spp=paths.spp,
+                    bins_per_step_of_paths=paths.bins_per_step_of_paths,
+                    steps_variance_of_paths=paths.steps_variance_of_paths,
+                )
             if math.isfinite(seconds):
                 return calibrated
             self._calibrated[budget] = calibrated

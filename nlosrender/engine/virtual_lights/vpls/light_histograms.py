@@ -18,11 +18,12 @@ from nlosrender.engine.launch.device_arrays import on_device
 from nlosrender.engine.launch.histogram import DeviceHistogram
 from nlosrender.engine.launch.launch_params import LaunchParams
 from nlosrender.engine.launch.ray_offsets import offset_origin
+from nlosrender.engine.launch.time_steps import divided
 from nlosrender.engine.virtual_lights.gather.device_patches import normal_reflectance, surface_at
 from nlosrender.engine.virtual_lights.visibility.masks import WallTiles
 from nlosrender.engine.virtual_lights.vpls.gather import VplTable, connect_to_vpl
 from nlosrender.engine.virtual_lights.vpls.sampler import Vpls
-from nlosrender.engine.virtual_lights.vpls.step_sums import BLOCK, BLOCK_BITS, PARTS, PARTS_BITS, StepSums, divided
+from nlosrender.engine.virtual_lights.vpls.step_sums import BLOCK, BLOCK_BITS, PARTS, PARTS_BITS, StepSums
 from nlosrender.engine.virtual_lights.vpls.subpaths import FirstHit, VplContributions
 from nlosrender.scene.build import BuiltScene
 

@@ -26,6 +26,7 @@ from nlosrender.engine.launch.launch_params import LaunchParams
 from nlosrender.engine.launch.passes import Passes, PassSize, Snapshot
 from nlosrender.engine.launch.pilot_points import Pilot, spread
 from nlosrender.engine.launch.sensor_footprint import SensorFootprint
+from nlosrender.engine.launch.time_steps import StepKernel, TimeSteps
 from nlosrender.engine.launch.wall_points import laser_points
 from nlosrender.engine.virtual_lights.visibility.masks import VisibilityMasks, WallTiles
 from nlosrender.engine.virtual_lights.vpls.gather import NO_SLOT, VplTable, gather_contributions
@@ -38,7 +39,7 @@ from nlosrender.engine.virtual_lights.vpls.light_histograms import (
     gather_histograms,
 )
 from nlosrender.engine.virtual_lights.vpls.sampler import Vpls, VplSampler
-from nlosrender.engine.virtual_lights.vpls.step_sums import MIN_STEPS, PARTS, StepKernel, StepSums, TimeSteps
+from nlosrender.engine.virtual_lights.vpls.step_sums import PARTS, StepSums, in_steps
 from nlosrender.engine.virtual_lights.vpls.subpaths import (
     ProposalLasers,
     SubpathPlan,
@@ -159,8 +160,8 @@ class VplBounces:
         lengths = self.tuning.bins_per_step if self.shares_subpaths else self.tuning.bins_smoothed
         if not self.shares_subpaths and pilot.relative_error(done, known_squares) * math.sqrt(done) <= goal:
             lengths = ()
-        lengths = tuple(bins for bins in lengths if bins * MIN_STEPS <= self.device.time_axis.n_bins)
-        return TimeSteps.of_pilot(pilot, lengths, done, known_squares, is_rounded=self.shares_subpaths)
+        lengthened = in_steps if self.shares_subpaths else None
+        return TimeSteps.of_pilot(pilot, lengths, done, known_squares, lengthened)
 
     def split(
         self, patches: int, largest: float, share_squares: float, steps: list[TimeSteps], done: int, target: float

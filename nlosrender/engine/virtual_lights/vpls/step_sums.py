@@ -6,9 +6,7 @@ at a part of the cost. docs/virtual-lights.md, 7.7.
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import replace
 
 import drjit as dr
 import mitsuba as mi
@@ -16,14 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import convolve1d
 
-from nlosrender.capture.relative_error import relative_l2_error
 from nlosrender.engine.launch.device_arrays import on_device
 from nlosrender.engine.launch.histogram import DeviceHistogram, HistogramShape
+from nlosrender.engine.launch.time_steps import bin_of_step, divided
 
 PARTS_BITS, BLOCK_BITS = 1, 3
 PARTS = 2**PARTS_BITS  # of a step, which delays are rounded to: light moves by at most half of one, by none on average
 BLOCK = 2**BLOCK_BITS  # steps that are added at once: 0.50 ns a step; 0.59 at 4
-MIN_STEPS = 4  # in the window
 SHARPENING = 1 / (12 * PARTS**2)  # of the second difference: half the variance of two roundings to parts of a step
 
 
@@ -92,96 +89,7 @@ class StepSums:
         if bins == 1:
             return here
         before, after = (self._step(line, mi.Int32(step) + k, active) for k in (-1, 1))
-        return _bin_of_step(before, here, after, (mi.Float(number) + 0.5) / bins - 0.5, bins)
-
-
-class StepKernel:
-    """Replaces the bins of a step by those of ``StepSums``: of light that was added bin by bin.
-
-    Parameters
-    ----------
-    bins_per_step
-        Bins in a step. Those of a last, shorter step stay as they are.
-    """
-
-    def __init__(self, bins_per_step: int):
-        self.bins_per_step = bins_per_step
-
-    def smoothed(self, values: mi.Float64, row: int) -> mi.Float64:
-        """Return rows of ``row`` entries, the last for light outside the window; see ``TemporalKernel.smoothed``."""
-        bins, steps = self.bins_per_step, (row - 1) // self.bins_per_step
-        if bins == 1 or steps < MIN_STEPS:
-            return values
-        line, step = divided(dr.arange(mi.UInt32, dr.width(values) // row * steps), steps)
-        sums = mi.Float64(0)
-        for number in range(bins):
-            sums += dr.gather(mi.Float64, values, line * row + step * bins + number)
-        dr.eval(sums)
-        line, entry = divided(dr.arange(mi.UInt32, dr.width(values)), row)
-        step, number = divided(entry, bins)
-        is_whole, step, x = step < steps, mi.Int32(step), (mi.Float64(number) + 0.5) / bins - 0.5
-        neighbours = (mi.UInt32(dr.clip(step + k, 0, steps - 1)) for k in (-1, 0, 1))
-        before, here, after = (dr.gather(mi.Float64, sums, line * steps + one, is_whole) for one in neighbours)
-        return dr.select(is_whole, _bin_of_step(before, here, after, x, bins), values)
-
-
-def _bin_of_step(before: Any, here: Any, after: Any, x: Any, bins: int) -> Any:
-    """Return the light of a bin at ``x``, -1/2 to 1/2 of the step: docs/virtual-lights.md, (20b)."""
-    slope, curvature = (after - before) / 2, after - 2 * here + before
-    # over the step: |x| is at most 1/2, and |x^2 / 2 - 1/24| at most 1/12
-    lowest = here - dr.abs(slope) / 2 - dr.abs(curvature) / 12
-    bent = slope * x + curvature * (dr.square(x) / 2 + 1 / (24 * bins**2) - 1 / 24)
-    return (here + dr.select(lowest >= 0, bent, 0)) / bins
-
-
-@dataclass(frozen=True)
-class TimeSteps:
-    """Time steps that light may be added in, and what a pilot says of them."""
-
-    bins: int  # in a step
-    error: float  # of the pilot, relative to H
-    change: float = 0.0  # that they bring about, relative to H
-
-    @classmethod
-    def of_pilot(
-        cls, pilot: DeviceHistogram, lengths: tuple[int, ...], done: int, known_squares: float, *, is_rounded: bool
-    ) -> list[TimeSteps]:
-        """Return steps of one bin, and those of so many.
-
-        Products of the halves of the replicas have no noise in the mean.
-
-        Parameters
-        ----------
-        pilot
-            Sums over ``done`` units in steps of one bin.
-        lengths
-            Bins per step.
-        known_squares
-            Of what else H holds.
-        is_rounded
-            Whether delays are rounded to parts of a step (``StepSums``) or light is smoothed (``StepKernel``).
-        """
-        row = pilot.shape.row
-        halves = pilot.halves(done)
-        inside = dr.arange(mi.UInt32, dr.width(halves[0])) % row < row - 1
-
-        def squares(one: mi.Float64, other: mi.Float64) -> float:
-            return float(dr.sum(dr.select(inside, one * other, 0))[0])
-
-        def error_of(one: mi.Float64, other: mi.Float64) -> float:
-            difference, mean = (one - other) / 2, (one + other) / 2
-            return relative_l2_error(squares(difference, difference), squares(mean, mean) + known_squares)
-
-        truth = max(squares(*halves), 0.0) + known_squares
-        result = [cls(1, error_of(*halves))]
-        for bins in lengths:
-            kernel = StepKernel(bins)
-            longer = in_steps(pilot, bins).halves(done) if is_rounded else [kernel.smoothed(one, row) for one in halves]
-            dr.eval(longer)
-            changes = [after - before for after, before in zip(longer, halves, strict=True)]
-            change = math.sqrt(max(squares(*changes), 0.0) / max(truth, 1e-300))
-            result.append(cls(bins, error_of(*longer), change))
-        return result
+        return bin_of_step(before, here, after, (mi.Float(number) + 0.5) / bins - 0.5, bins)
 
 
 def in_steps(histogram: DeviceHistogram, bins_per_step: int) -> DeviceHistogram:
@@ -204,10 +112,3 @@ def _rows(histogram: DeviceHistogram) -> NDArray[np.float64]:
     shape = histogram.shape
     lanes = np.asarray(histogram.sums.numpy()).reshape(shape.lanes, -1)[:, : shape.rows_per_lane * shape.row]
     return lanes.reshape(-1, shape.row)[:, :-1]
-
-
-def divided(index: mi.UInt32, by: int) -> tuple[mi.UInt32, mi.UInt32]:
-    """Return quotient and rest."""
-    divisor = dr.opaque(mi.UInt32, by)
-    quotient = index // divisor
-    return quotient, index - quotient * divisor
