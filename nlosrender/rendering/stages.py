@@ -191,7 +191,7 @@ def describe_file(
         max_bounces=config.render.max_bounces,
         split_bounces=config.render.split_bounces,
         account_first_and_last_bounces=capture.account_first_and_last_bounces,
-        hidden_bounds=built.hidden_bounds,
+        hidden_bounds=built.unseen_bounds,
         pose=built.wall.pose,
         frame=config.output.frame,
         planar_wall=built.wall.is_planar,

@@ -52,6 +52,11 @@ class EngineScene:
     warnings: tuple[str, ...] = ()  # about what was left out, or is likely a mistake
     meshes: tuple[MeshReport, ...] = ()  # of mesh files
 
+    @property
+    def unseen_bounds(self) -> Bounds | None:
+        """Box around what is to be found [m, local frame]: all hidden geometry; None when there is none."""
+        return self.hidden_bounds
+
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class BuiltScene(EngineScene):
@@ -151,6 +156,12 @@ class SceneWithoutWall(BuiltScene):
     @cached_property
     def sampled_shapes(self) -> tuple[mi.Shape, ...]:
         return tuple(shape for number, shape in enumerate(self.scene.shapes()) if number not in self._walls)
+
+    @property
+    def unseen_bounds(self) -> Bounds | None:
+        """Box around the surfaces on which no point lies; of all where each has one."""
+        unit = self.metres_per_engine_unit
+        return joined_bounds([shape_bounds(shape, unit) for shape in self.sampled_shapes]) or self.hidden_bounds
 
     @property
     def lit_shapes(self) -> tuple[mi.Shape, ...]:

@@ -214,6 +214,19 @@ def test_points_of_pixels_and_their_normals() -> None:
     np.testing.assert_allclose(shifted[:-1, 1:], mean, atol=1e-3)
 
 
+def test_the_hidden_volume_leaves_out_what_the_camera_sees() -> None:
+    """It is the box of the surfaces without points, which reconstruction looks in; of all where each has some."""
+    items = [{**item, "bsdf": WHITE} for item in CORNER]
+    ball = {"type": "sphere", "center": [-0.6, 0.2, 2.1], "radius": 0.2}  # behind the camera
+    aim = {"laser_position": [-0.7, 0, 1.2], "laser_target": [0.3, -0.2, 0]}
+    alone, hiding = (
+        scene_of(seen("single", *items, *more, wall=NO_WALL, camera=EYE, capture=aim)) for more in ((), (ball,))
+    )
+    np.testing.assert_array_equal(alone.unseen_bounds, alone.hidden_bounds)
+    low, high = np.array(hiding.unseen_bounds) + EYE["look_at"]
+    np.testing.assert_allclose([low, high], [[-0.8, 0, 1.9], [-0.4, 0.4, 2.3]], atol=1e-6)
+
+
 def test_pixels_that_see_nothing_are_empty() -> None:
     """A pixel beside all surfaces has no light, and the others have theirs as if it were not there."""
     wide = {**EYE, "fov_deg": 100}
