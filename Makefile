@@ -32,6 +32,8 @@ render: install ## Render configs/z-letter.yaml to out/: an HDF5 capture and a p
 	$(BIN)/nlosrender render configs/z-letter.yaml -o out/z-letter.hdf5 --overwrite
 	@echo "picture: $$($(BIN)/nlosrender plot out/z-letter.hdf5)"
 
+# Bytecode is kept, whatever the environment says: without it each of the processes that tests start compiles the package.
+test: export PYTHONDONTWRITEBYTECODE =
 test: $(VENV)/.dev ## Run the default test suite.
 	$(BIN)/python -m pytest -n logical --maxprocesses 4 --dist worksteal -m 'not slow and not peers and not stress'
 

@@ -96,9 +96,11 @@ def test_a_room_that_has_no_mesh_yet_says_what_makes_it(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("path", sorted((PROJECT / "configs").rglob("*.yaml")), ids=lambda path: path.stem)
 def test_every_configuration_is_valid_or_names_the_command_that_makes_its_mesh(path: Path) -> None:
-    """On a fresh clone nothing else is missing."""
+    """On a fresh clone nothing else is missing; files do not go by the draw, so that 30 random captures tell it."""
     document = load_document(path)
     if document.tree.get("sweep") is not None:
+        if (drawn := document.tree["sweep"].get("random")) is not None:
+            drawn["count"] = 30
         assert sweep_of(document) is not None
         return
     with contextlib.suppress(ConfigError):
