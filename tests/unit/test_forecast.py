@@ -47,7 +47,7 @@ def test_an_unpacked_file_has_exactly_the_size_forecast(scan_type, variance, tmp
     h5py = pytest.importorskip("h5py")
     config = configured(flat_wall(PLATE, scan=scan_type, sensors=(101, 97), lasers=(2, 3), bins=(0.0, 0.5, 29)))
     wall, _ = stages.place_scene(config)
-    built = SimpleNamespace(wall=wall, hidden_bounds=BOX)
+    built = SimpleNamespace(wall=wall, hidden_bounds=BOX, unseen_bounds=BOX)
     capture, time_axis = stages.describe_capture(config, wall, built)
     header = stages.describe_file(config, built, capture, time_axis)
     size = forecast_size(header.sizes, header.confocal, (0.0, 0.5), compression="none", variance=variance)
