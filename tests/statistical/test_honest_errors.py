@@ -144,6 +144,10 @@ def better(budget: Any) -> Any:
         patch_scale=budget.patch_scale / FINER if budget.patch_scale else None,
         rounds=LONGER * budget.rounds if budget.rounds else None,
         spp=LONGER * budget.spp if budget.spp else None,
+        bins_per_step=None,  # time steps of a bin: what longer ones change is error
+        steps_variance=None,
+        bins_per_step_of_paths=None,
+        steps_variance_of_paths=None,
     )
 
 
