@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from nlosrender.engine.interface import Budget
-from nlosrender.engine.launch.pilot_points import SENSORS_PER_AXIS, Pilot, pilot_of, scattered
+from nlosrender.engine.launch.pilot_points import Pilot, pilot_of, scattered
 from nlosrender.engine.launch.schedule import DEFAULT_TARGET
 from nlosrender.engine.virtual_lights.refinement import (
     Gathered,
@@ -47,7 +47,7 @@ def calibrated_lights(
         ), share_squares
     if further is not None:
         share = max(share for share in tuning.third_shares if share**2 < share_squares * tuning.most_of_third)
-    few = _pilot_of_patches(third, pilot)
+    few = _pilot_of_patches(third)
     gather = cache(lambda scale: third.gather(few, scale))  # a smaller share goes on from these
     known_squares = device.exact_squares(few)
     share_of_places = 0.0
@@ -101,21 +101,20 @@ def _with_patches(budget: Budget, refined: Refined) -> Budget:
     return replace(budget, patch_scale=refined.patch_scale, difference_divisor=refined.divisor)
 
 
-def _pilot_of_patches(third: ThirdBounce, pilot: Pilot) -> Pilot:
-    """Return the pilot that patches are tried on: few points, unless some surface is nearer than they are apart.
+def _pilot_of_patches(third: ThirdBounce) -> Pilot:
+    """Return the pilot that patches are tried on: few points, more where some surface is nearer than they are apart.
 
     Only some of the points see such a surface close up, or what lies behind it. Then it has up to one in 16 points of
     the capture: three resolutions of more cost as much as the render.
     """
-    built, tessellator = third.device.built, third.tessellator
-    nearest = tessellator.nearest
+    capture, built, tessellator = third.device.capture, third.device.built, third.tessellator
+    nearest, (few, more) = tessellator.nearest, third.tuning.patch_pilot_sensors
     if built.wall.is_planar and built.hidden_bounds is not None:  # what faces away from it, too
         nearest = built.hidden_bounds[0][2] / built.metres_per_engine_unit
-    is_far = nearest > 2 * tessellator.reach / third.tuning.patch_pilot_sensors
-    few, grid = third.tuning.patch_pilot_sensors, third.device.capture.sensor_grid.lattice
-    if not is_far and max(grid.nx, grid.ny) >= 4 * SENSORS_PER_AXIS:
-        return pilot
-    return pilot_of(third.device.capture, few if is_far else max(few, -(-max(grid.nx, grid.ny) // 4)), scattered)
+    if nearest <= 2 * tessellator.reach / few:
+        lattice = capture.sensor_grid.lattice
+        few = max(few, min(more, -(-max(lattice.nx, lattice.ny) // 4)))
+    return pilot_of(capture, few, scattered)
 
 
 def _patch_scale_in_time(third: ThirdBounce, time_limit_s: float, target: float) -> float:
