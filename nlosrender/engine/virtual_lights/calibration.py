@@ -73,16 +73,17 @@ def calibrated_lights(
             mean = histogram.on_host(histogram.statistics(done)[0])
             mixed = 2 * float(np.einsum("csltb,csltb->", mean[..., :-1], gathered.values[..., :-1]))
         error = histogram.relative_error(done, squares + mixed)
-    steps = further.time_steps(histogram, done, squares + mixed, math.sqrt(share_squares - share**2) * target)
-    finer, step = further.split(gathered.n_patches, share, share_squares, steps, done, target)
+    forecast = further.forecast
+    steps = forecast.time_steps(histogram, done, squares + mixed, math.sqrt(share_squares - share**2) * target)
+    finer, step = forecast.split(gathered.n_patches, share, share_squares, steps, done, target)
     if finer < share:
         share = finer
         refined = refined_to(share * target, third.tessellator, gather, known_squares, refined.patch_scale)
     # patches come in steps: what they leave of their share is spent on rounds
     third_squares, of_steps = min(share, refined.error / target) ** 2 + share_of_places**2, (step.change / target) ** 2
     goal_squares = share_squares - third_squares - of_steps
-    rounds = further.rounds_needed(step.error, done, math.sqrt(goal_squares) * target)
-    of_vpls = (further.error_after(step.error, done, rounds) / target) ** 2
+    rounds = forecast.rounds_needed(step.error, done, math.sqrt(goal_squares) * target)
+    of_vpls = (forecast.error_after(step.error, done, rounds) / target) ** 2
     steps_variance = of_steps / max(of_vpls, 1e-12) if of_steps else 0.0
     budget = replace(budget, rounds=rounds, bins_per_step=step.bins, steps_variance=steps_variance)
     return _with_patches(budget, refined), third_squares + of_steps + min(of_vpls, goal_squares)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 import time
 from collections.abc import Callable
@@ -26,7 +25,7 @@ from nlosrender.engine.launch.launch_params import LaunchParams
 from nlosrender.engine.launch.passes import Passes, PassSize, Snapshot
 from nlosrender.engine.launch.pilot_points import Pilot, spread
 from nlosrender.engine.launch.sensor_footprint import SensorFootprint
-from nlosrender.engine.launch.time_steps import StepKernel, TimeSteps
+from nlosrender.engine.launch.time_steps import StepKernel
 from nlosrender.engine.launch.wall_points import laser_points
 from nlosrender.engine.virtual_lights.visibility.masks import VisibilityMasks, WallTiles
 from nlosrender.engine.virtual_lights.vpls.gather import NO_SLOT, VplTable, gather_contributions
@@ -38,8 +37,9 @@ from nlosrender.engine.virtual_lights.vpls.light_histograms import (
     deposit_shared,
     gather_histograms,
 )
+from nlosrender.engine.virtual_lights.vpls.round_forecast import RoundForecast
 from nlosrender.engine.virtual_lights.vpls.sampler import Vpls, VplSampler
-from nlosrender.engine.virtual_lights.vpls.step_sums import PARTS, StepSums, in_steps
+from nlosrender.engine.virtual_lights.vpls.step_sums import PARTS, StepSums
 from nlosrender.engine.virtual_lights.vpls.subpaths import (
     ProposalLasers,
     SubpathPlan,
@@ -144,6 +144,13 @@ class VplBounces:
         )
 
     @property
+    def forecast(self) -> RoundForecast:
+        """How many rounds a target takes."""
+        rays_per_vpl = 1 + self.contributions_per_vpl * self.is_confocal
+        units = self.max_units, self.pilot_units
+        return RoundForecast(self.tuning, self.vpls_per_round, *units, self.shares_subpaths, rays_per_vpl)
+
+    @property
     def contributions_per_round(self) -> int:
         """Contributions that every sensor point receives per round, at most."""
         return self.vpls_per_round * (self.subpaths if self.shares_subpaths else self.contributions_per_vpl)
@@ -151,72 +158,6 @@ class VplBounces:
     def pilot_replicas(self, sensors: int) -> int:
         """Return the replicas of a pilot of so many sensor points; groups that share must be as in the render."""
         return self.options.replicas if self.shares_subpaths else max(2, self.tuning.pilot_lanes // sensors // 2 * 2)
-
-    def time_steps(self, pilot: DeviceHistogram, done: int, known_squares: float, goal: float) -> list[TimeSteps]:
-        """Return what a pilot of ``done`` units says of the time steps that may be taken; one bin first.
-
-        ``goal``: the error that they are to reach. Smoothing saves nothing where one round does.
-        """
-        lengths = self.tuning.bins_per_step if self.shares_subpaths else self.tuning.bins_smoothed
-        if not self.shares_subpaths and pilot.relative_error(done, known_squares) * math.sqrt(done) <= goal:
-            lengths = ()
-        lengthened = in_steps if self.shares_subpaths else None
-        return TimeSteps.of_pilot(pilot, lengths, done, known_squares, lengthened)
-
-    def split(
-        self, patches: int, largest: float, share_squares: float, steps: list[TimeSteps], done: int, target: float
-    ) -> tuple[float, TimeSteps]:
-        """Return the one of ``third_shares``, and time steps, that take the fewest rays in all, then the least error.
-
-        docs/virtual-lights.md, 8.
-
-        Parameters
-        ----------
-        patches
-            That the ``largest`` share takes: their number goes with the error to the power of -4/3.
-        share_squares
-            Part of the target's square that third bounce and VPLs share.
-        steps
-            What a pilot of ``done`` units says of time steps.
-        target
-            Target error.
-        """
-        tuning, rays_per_vpl = self.tuning, 1 + self.contributions_per_vpl * self.is_confocal
-
-        def rays_and_squares(of_third: float, step: TimeSteps) -> tuple[float, float]:
-            left = share_squares - of_third**2 - (step.change / target) ** 2
-            if left <= 0 or step.change > tuning.share_of_steps * target:
-                return math.inf, math.inf
-            cost = tuning.connection_cost + tuning.histogram_cost / step.bins if self.shares_subpaths else rays_per_vpl
-            finer = patches * (largest / of_third) ** (4 / 3)
-            rounds = self.rounds_needed(step.error, done, math.sqrt(left) * target)
-            squares = self.error_after(step.error, done, rounds) ** 2 + step.change**2
-            return finer * 4 / 3 + self.vpls_per_round * cost * rounds, squares
-
-        shares = [share for share in tuning.third_shares if share <= largest]
-        return min(itertools.product(shares, steps), key=lambda both: rays_and_squares(*both))
-
-    def rounds_needed(self, error: float, done: int, target: float) -> int:
-        """Return how many units bring the ``error`` of a pilot of ``done`` units to ``target``.
-
-        It falls as 1 / sqrt(rounds), and faster with the units of one round, where VPLs are stratified. At most
-        ``max_rounds``, where no light has been found as well.
-        """
-        tuning = self.tuning
-        if not math.isfinite(error):
-            return tuning.max_rounds
-        largest = self.max_units / self.pilot_units
-        of_round = error * math.sqrt(done / self.pilot_units)
-        units = self.pilot_units * min((of_round / target) ** (1 / tuning.order_of_units), largest)
-        of_largest = of_round * largest**-tuning.order_of_units
-        units *= max((of_largest / target) ** 2, 1)
-        return min(max(1, math.ceil(units)), tuning.max_rounds)
-
-    def error_after(self, error: float, done: int, units: int) -> float:
-        """Return the error after so many ``units``, by the law of ``rounds_needed``."""
-        in_round = min(units, self.max_units) / self.pilot_units
-        of_round = error * math.sqrt(done / self.pilot_units) * in_round**-self.tuning.order_of_units
-        return of_round * math.sqrt(in_round * self.pilot_units / units)
 
     def histogram(self, batch: Batch | Pilot, replicas: int) -> DeviceHistogram:
         """Return an empty histogram of a batch: bounce slots from the fourth bounce on."""
