@@ -34,6 +34,10 @@ class Budget:
     patch_scale: float | None = None  # of the virtual lights: size of patches over that at the coarsest resolution
     # of the virtual lights: the difference of their two resolutions over the error of the finer one; None: a bound
     difference_divisor: float | None = None
+    # of the virtual lights: sensor points along rows and columns from one node of the lattice that visibility is
+    # interpolated on to the next, and rays from each of them to a patch; None: every sensor point sends its own
+    visibility_step: int | None = None
+    rays_per_node: int | None = None
     rounds: int | None = None  # of the virtual lights: rounds of VPL subpaths
     # of the virtual lights: bins in a time step of the light of VPLs, and what such steps change, squared, over its
     # variance; the same of the paths beside them

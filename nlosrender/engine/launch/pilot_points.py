@@ -41,6 +41,11 @@ class Pilot:
     sensors: Selection
     lasers: Selection
 
+    def every(self, stride: int) -> Pilot:
+        """Return the pilot of every ``stride``-th sensor point, confocal or with the same lasers."""
+        sensors = Selection(self.sensors.indices[::stride])
+        return Pilot(sensors, sensors if self.lasers is self.sensors else self.lasers)
+
 
 def pilot_of(
     capture: Capture,

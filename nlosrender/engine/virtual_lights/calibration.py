@@ -22,8 +22,8 @@ from nlosrender.engine.virtual_lights.refinement import (
     estimated_error,
     finer_scale,
     footprint_error,
-    refined_to,
 )
+from nlosrender.engine.virtual_lights.visibility_trials import VisibilityTrials
 
 if TYPE_CHECKING:
     from nlosrender.engine.virtual_lights.third_bounce import ThirdBounce
@@ -50,12 +50,13 @@ def calibrated_lights(
     few = _pilot_of_patches(third)
     gather = cache(lambda scale: third.gather(few, scale))  # a smaller share goes on from these
     known_squares = device.exact_squares(few)
+    refine = VisibilityTrials(third, few, gather, known_squares).refined_to
     share_of_places = 0.0
     if device.footprint is not None:
         share_of_places = tuning.share_of_places * share
         places = _places_of_footprint(third, few, share_of_places * target, known_squares)
         budget, share = replace(budget, footprint_places=places), math.sqrt(share**2 - share_of_places**2)
-    refined = refined_to(share * target, third.tessellator, gather, known_squares)
+    refined = refine(share * target)
     if further is None:
         return _with_patches(budget, refined), (refined.error / target) ** 2 + share_of_places**2
     if further.shares_subpaths:
@@ -78,7 +79,7 @@ def calibrated_lights(
     finer, step = forecast.split(gathered.n_patches, share, share_squares, steps, done, target)
     if finer < share:
         share = finer
-        refined = refined_to(share * target, third.tessellator, gather, known_squares, refined.patch_scale)
+        refined = refine(share * target, refined.patch_scale)
     # patches come in steps: what they leave of their share is spent on rounds
     third_squares, of_steps = min(share, refined.error / target) ** 2 + share_of_places**2, (step.change / target) ** 2
     goal_squares = share_squares - third_squares - of_steps
@@ -99,7 +100,13 @@ def _places_of_footprint(third: ThirdBounce, few: Pilot, target: float, known_sq
 
 
 def _with_patches(budget: Budget, refined: Refined) -> Budget:
-    return replace(budget, patch_scale=refined.patch_scale, difference_divisor=refined.divisor)
+    return replace(
+        budget,
+        patch_scale=refined.patch_scale,
+        difference_divisor=refined.divisor,
+        visibility_step=None if refined.lattice is None else refined.lattice.step,
+        rays_per_node=None if refined.lattice is None else refined.lattice.rays,
+    )
 
 
 def _pilot_of_patches(third: ThirdBounce) -> Pilot:

@@ -27,7 +27,7 @@ from nlosrender.engine.virtual_lights.cost import gather_batch_bytes, virtual_li
 from nlosrender.engine.virtual_lights.elements.tessellator import Tessellator, is_mirror, wall_sees_itself
 from nlosrender.engine.virtual_lights.gather.lighting import GatherSettings
 from nlosrender.engine.virtual_lights.reciprocity import is_reciprocal
-from nlosrender.engine.virtual_lights.refinement import difference_divisor
+from nlosrender.engine.virtual_lights.refinement import Lattice, difference_divisor
 from nlosrender.engine.virtual_lights.third_bounce import ThirdBounce
 from nlosrender.engine.virtual_lights.tuning import DEFAULT_TUNING, VirtualLightTuning
 from nlosrender.engine.virtual_lights.vpls.rounds import VplBounces
@@ -69,7 +69,6 @@ class VirtualLightEngine:
             needs_visibility=not nothing_occludes(built),
             has_one_laser=capture.n_lasers == 1,
             is_multiplexed=capture.laser_weights is not None,
-            laser_rays=tuning.laser_rays,
         )
         all_lambertian = self.settings.is_diffuse and all(is_lambertian(shape.bsdf()) for shape in built.lit_shapes)
         has_vpls = self.has_further_bounces and self._mirrors_once
@@ -193,7 +192,11 @@ class VirtualLightEngine:
         scale = budget.patch_scale or self.third.tuning.coarsest_scale
         shared = 0.5 if self.has_further_bounces else 1.0
         self.third.footprint_places = budget.footprint_places or self.third.tuning.footprint_places[1]
-        coarse, fine = self.third.pair(batch, scale, passes.stage("third bounce", 0, shared))
+        stage = passes.stage("third bounce", 0, shared)
+        lattice = None
+        if budget.visibility_step is not None and budget.rays_per_node is not None:
+            lattice = Lattice(budget.visibility_step, budget.rays_per_node)
+        coarse, fine = self.third.pair(batch, scale, stage, lattice)
         left = budget.time_limit_s
         if left is not None:
             left = max(0.0, left - (time.perf_counter() - begun))

@@ -6,8 +6,8 @@ A render has two resolutions, its pilot a third, finer one: docs/virtual-lights.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -17,6 +17,15 @@ from nlosrender.capture.relative_error import relative_l2_error
 
 if TYPE_CHECKING:
     from nlosrender.engine.virtual_lights.elements.tessellator import Tessellator
+    from nlosrender.engine.virtual_lights.tuning import VirtualLightTuning
+
+
+@dataclass(frozen=True)
+class Lattice:
+    """Sensor lattice that visibility is interpolated on, see ``SensorLattice``."""
+
+    step: int  # sensor points along rows and columns from one node to the next
+    rays: int  # from a node to points of each patch: 1 or ``SHADOW_RAYS``
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,6 +51,18 @@ class Refined:
     gathered: Gathered
     error: float  # relative L2, as estimated
     divisor: float | None  # turns the difference from the coarser resolution into it; None: ``difference_divisor``
+    finer: float | None = None  # patch scale that the error was measured against; None: it is extrapolated
+    is_paused: bool = False  # not fine enough yet, see ``pauses``
+    lattice: Lattice | None = None
+
+
+@dataclass(frozen=True)
+class _Level:
+    """A resolution that was tried."""
+
+    patch_scale: float
+    n_patches: int
+    error: float
 
 
 def estimated_error(coarse: Gathered, fine: Gathered, known_squares: float = 0.0) -> float:
@@ -96,6 +117,8 @@ def refined_to(
     gather: Callable[[float], Gathered],
     known_squares: float,
     start: float | None = None,
+    pauses: Callable[[Gathered, float], bool] | None = None,
+    points_left: float = 0.0,
 ) -> Refined:
     """Return the resolution whose estimated error is at most ``target``.
 
@@ -112,9 +135,13 @@ def refined_to(
         Sum of the squares of exact light at these points [(engine unit)^-4].
     start
         Patch scale to begin with; None: the coarsest.
+    pauses
+        Asked, with its error, whether the search ends at a resolution that is not fine enough; None: never.
+    points_left
+        Of the capture, over those that ``gather`` gathers at: what one patch fewer saves.
     """
     tuning = tessellator.tuning
-    levels: list[tuple[int, float]] = []  # numbers of patches and their errors, coarse to fine
+    levels: list[_Level] = []  # coarse to fine
     coarsest = min(finer_scale(tessellator, tuning.coarsest_compared, tuning.refinement), tuning.coarsest_scale)
     patch_scale = start or coarsest
     while True:
@@ -125,25 +152,97 @@ def refined_to(
         noise = tuning.difference_margin**2 * _squares(gather(finer).values - fine.values)
         error = _relative(noise, fine, known_squares)
         earlier = next(
-            (error for count, error in reversed(levels) if count <= fine.n_patches / tuning.stagnation_ratio), math.inf
+            (one.error for one in reversed(levels) if one.n_patches <= fine.n_patches / tuning.stagnation_ratio),
+            math.inf,
         )
         is_stuck = tuning.stagnation * earlier < error
         is_beyond = fine.n_patches * error / target > tuning.max_patches
         if error <= target or (error < tuning.max_regular_error and (is_stuck or is_beyond)):
             coarse = gather(coarser_scale(tessellator, patch_scale))  # the one that the render itself will have
             divisor = math.sqrt(_squares(fine.values - coarse.values) / noise) if noise > 0 else None
-            return Refined(patch_scale, fine, error, divisor)
+            refined = Refined(patch_scale, fine, error, divisor, finer)
+            if levels and (between := _between(levels[-1], refined, target, tessellator, points_left)) is not None:
+                again = refined_to(target, tessellator, gather, known_squares, between, lambda *_: True)
+                return refined if again.is_paused else again
+            return refined
+        if pauses is not None and pauses(fine, error):
+            return Refined(patch_scale, fine, error, None, is_paused=True)
         more = (tuning.refinement_margin * error / target) ** (1 / _order(levels, fine.n_patches, error, tuning.orders))
-        levels.append((fine.n_patches, error))
-        patch_scale = finer_scale(tessellator, patch_scale, min(max(more, tuning.min_refinement), tuning.refinement))
+        more, better = min(max(more, tuning.min_refinement), tuning.refinement), gather(finer)
+        less_noise = noise * (better.n_patches / fine.n_patches) ** (-2 * tuning.slowest_order)
+        expected = _relative(less_noise, better, known_squares)
+        if expected <= target and not _pays(fine.n_patches * more, better.n_patches, tuning, points_left):
+            coarse = gather(coarser_scale(tessellator, finer))
+            divisor = math.sqrt(_squares(better.values - coarse.values) / less_noise)
+            return Refined(finer, better, expected, divisor)
+        levels.append(_Level(patch_scale, fine.n_patches, error))
+        patch_scale = finer_scale(tessellator, patch_scale, more)
 
 
-def _order(levels: list[tuple[int, float]], n_patches: int, error: float, bounds: tuple[float, float]) -> float:
+def _pays(wanted: float, n_patches: int, tuning: VirtualLightTuning, points_left: float) -> bool:
+    """Return whether it pays to try a resolution of ``wanted`` patches where one of ``n_patches`` will do.
+
+    The pilot gathers it and a finer one, at points too far apart for their rays to stay together.
+    """
+    trial = tuning.pilot_cost * (1 + tuning.refinement) * wanted
+    return wanted < n_patches and (n_patches - wanted) * (1 + 1 / tuning.refinement) * points_left > trial
+
+
+def _between(
+    coarser: _Level, refined: Refined, target: float, tessellator: Tessellator, points_left: float
+) -> float | None:
+    """Return a scale between one that is too coarse and a fine one that may meet the target; None: no trial pays."""
+    tuning, n_patches = tessellator.tuning, refined.gathered.n_patches
+    if not 0 < refined.error < coarser.error or n_patches <= coarser.n_patches:
+        return None
+    order = math.log(coarser.error / refined.error) / math.log(n_patches / coarser.n_patches)
+    wanted = n_patches * (tuning.refinement_margin * refined.error / target) ** (1 / order)
+    if wanted >= n_patches / tuning.min_refinement or not _pays(wanted, n_patches, tuning, points_left):
+        return None
+    between = finer_scale(tessellator, coarser.patch_scale, max(wanted / coarser.n_patches, 1.0))
+    return between if tessellator.count(between) < n_patches / tuning.min_refinement else None
+
+
+def with_lattice(
+    refined: Refined,
+    target: float,
+    lattices: Sequence[Lattice],
+    gather: Callable[[float, Lattice | None], NDArray[np.float64]],
+) -> Refined:
+    """Return the same resolution with visibility interpolated on the first lattice that leaves its error in bounds.
+
+    That is the ``target``, or the error of ``refined`` where that is larger. By what factor interpolation changes the
+    error, a few points tell against the finer patch scale, or without one against rays of their own.
+
+    Parameters
+    ----------
+    refined, target
+        As ``refined_to`` returned and took them.
+    lattices
+        The widest first.
+    gather
+        Returns the values of a patch scale and a lattice at some of the pilot's points; None: as ``refined`` has them.
+    """
+    if refined.divisor is None or not lattices:
+        return refined
+    own = gather(refined.patch_scale, None)
+    better = own if refined.finer is None else gather(refined.finer, None)
+    noise = refined.error**2 * _squares(own) if refined.finer is None else _squares(better - own)
+    for lattice in lattices if noise > 0 else ():
+        squares = _squares(better - gather(refined.patch_scale, lattice))
+        factor = math.sqrt(squares / noise + (refined.finer is None))
+        if refined.error * factor <= max(target, refined.error):
+            factor = max(factor, 1.0)
+            return replace(refined, error=refined.error * factor, divisor=refined.divisor / factor, lattice=lattice)
+    return refined
+
+
+def _order(levels: list[_Level], n_patches: int, error: float, bounds: tuple[float, float]) -> float:
     """Return the power of the number of patches that the error falls by from the last level on, within bounds."""
-    if not levels or levels[-1][0] >= n_patches:
+    if not levels or levels[-1].n_patches >= n_patches:
         return 1.0
-    count, earlier = levels[-1]
-    return float(np.clip(math.log(earlier / error) / math.log(n_patches / count), *bounds))
+    last = levels[-1]
+    return float(np.clip(math.log(last.error / error) / math.log(n_patches / last.n_patches), *bounds))
 
 
 def _relative(noise: float, fine: Gathered, known_squares: float) -> float:

@@ -34,7 +34,8 @@ from nlosrender.engine.virtual_lights.gather.lighting import (
     light_patches,
     pack_patches,
 )
-from nlosrender.engine.virtual_lights.refinement import Gathered, coarser_scale
+from nlosrender.engine.virtual_lights.gather.sensor_lattice import SensorLattice
+from nlosrender.engine.virtual_lights.refinement import Gathered, Lattice, coarser_scale
 from nlosrender.engine.virtual_lights.tuning import VirtualLightTuning
 from nlosrender.engine.virtual_lights.visibility.masks import (
     VisibilityMasks,
@@ -104,8 +105,10 @@ class ThirdBounce:
         self.footprint_places = self.tuning.footprint_places[1]  # as ``Budget.footprint_places``
         self._saved: dict[tuple[float, bool], LitPatches] = {}  # per patch scale, and whether lit by mirror
 
-    def gather(self, batch: Batch | Pilot, patch_scale: float, passes: Passes | None = None) -> Gathered:
-        """Gather a batch at one resolution."""
+    def gather(
+        self, batch: Batch | Pilot, patch_scale: float, passes: Passes | None = None, lattice: Lattice | None = None
+    ) -> Gathered:
+        """Gather a batch at one resolution; ``lattice``: that visibility is interpolated on."""
         passes = passes or Passes()
         patches = self.tessellator.patches(patch_scale)  # made here once: the tessellator keeps small resolutions only
         deviation = None
@@ -123,9 +126,8 @@ class ThirdBounce:
         elif self.is_reciprocal and isinstance(batch, Batch):
             values = self._by_reciprocity(batch, patch_scale, patches, passes)
         else:
-            values = self._sums(
-                batch, patch_scale, patches, passes.stage("sums", 0, 0.25 if self.mirror else 1)
-            ).on_host()
+            stage = passes.stage("sums", 0, 0.25 if self.mirror else 1)
+            values = self._sums(batch, patch_scale, patches, stage, lattice=lattice).on_host()
             if self.mirror is not None:
                 mirrored = self._mirrored(batch, patch_scale, patches, passes)
                 values = np.concatenate([values, *mirrored], axis=1)
@@ -192,6 +194,7 @@ class ThirdBounce:
         lasers: NDArray[np.int64] | None = None,
         way: tuple[bool, bool] = (False, False),
         half: int = 0,
+        lattice: Lattice | None = None,
     ) -> BlockHistogram:
         """Gather the ``patches`` that all sensor points share, then what regions have of their own.
 
@@ -204,7 +207,7 @@ class ThirdBounce:
         histogram = BlockHistogram(shape, lanes.order)
         work = GatherPasses(self.settings, histogram, passes, self.device.options.schedule.first_gather_pairs)
         if footprint is None:
-            self._gather_from(lanes, batch, shape, patch_scale, patches, work, way)
+            self._gather_from(lanes, batch, shape, patch_scale, patches, work, way, lattice)
             return histogram
         places = footprint.turned_places(range(half, self.footprint_places // 4, 2))
         for some in places.reshape(-1, shape.replicas, 2):
@@ -222,14 +225,23 @@ class ThirdBounce:
         patches: Patches,
         work: GatherPasses,
         way: tuple[bool, bool],
+        lattice: Lattice | None = None,
     ) -> None:
         """Add what the sensor points of ``lanes`` gather; parameters as of ``_sums``."""
         lit_by, seen_by = (self.mirror if by_mirror else None for by_mirror in way)
+        sensors = np.tile(self.device.sensor_indices(batch)[lanes.order].astype(np.int64), shape.replicas)
+
+        def sensor_lattice(chosen: NDArray[np.integer] | slice, slices: NDArray[np.integer]) -> SensorLattice | None:
+            if lattice is None:
+                return None
+            return SensorLattice.of(self.device, sensors[chosen], slices, lattice, self.lanes)
+
         if len(patches):
             wall_tiles = self._wall_tiles(batch)
-            packed = self._shared_lights(lanes.params, shape, patch_scale, patches, wall_tiles, lit_by)
+            packed = self._shared_lights(lanes.params, shape, patch_scale, patches, wall_tiles, lit_by, lattice)
             tile = wall_tiles.tile_bit(mi.UInt32(0), lanes.params.sensors.interaction.p)
-            work.gather(lanes.params, packed, lanes.index, lanes.slice_index, tile, seen_by)
+            nodes = sensor_lattice(slice(None), lanes.slice_index.numpy())
+            work.gather(lanes.params, packed, lanes.index, lanes.slice_index, tile, seen_by, nodes)
         for labels, near in self.tessellator.regional_patches(patch_scale, np.unique(lanes.regions).tolist()):
             places = PatchRegions.of([len(one) for one in near])
             if not len(places.numbers):  # nothing is close to the wall there
@@ -239,10 +251,27 @@ class ThirdBounce:
             slice_index = np.searchsorted(labels, lanes.regions[chosen]) * slices + chosen // shape.sensors % slices
             index = on_device(mi.UInt32, chosen)
             some, wall_tiles = lanes.params.gather_lanes(index), self._wall_tiles(batch, labels)
-            lit_patches = self._light_by_lasers(some, shape, Patches.joined(near), places, wall_tiles, lit_by)
-            packed = pack_patches(self.settings, some, lit_patches, slices, some.lasers_per_lane, lit_by)
+            asked_of = replace(wall_tiles, n_points=0) if lattice else wall_tiles
+            lit_patches = self._light_by_lasers(some, shape, Patches.joined(near), places, asked_of, lit_by)
+            packed = pack_patches(self.settings, some, lit_patches, slices, some.lasers_per_lane, lit_by, lattice)
             tile = wall_tiles.tile_bit(on_device(mi.UInt32, slice_index // slices), some.sensors.interaction.p)
-            work.gather(some, packed, index, on_device(mi.UInt32, slice_index), tile, seen_by)
+            nodes = sensor_lattice(chosen, slice_index)
+            work.gather(some, packed, index, on_device(mi.UInt32, slice_index), tile, seen_by, nodes)
+
+    @property
+    def lattices(self) -> tuple[Lattice, ...]:
+        """Lattices that visibility may be interpolated on, the widest first, one ray from each node to a patch.
+
+        None where neighbours in the grid need not see alike (lists, a camera's pixels), in footprints and by way of a
+        mirror, and where a ray serves many laser points.
+        """
+        built, grid, settings = self.device.built, self.device.capture.sensor_grid, self.settings
+        if not settings.needs_visibility or not (settings.is_confocal or settings.has_one_laser) or grid.is_list:
+            return ()
+        if self.mirror is not None or self.device.footprint is not None or built.pixels is not None:
+            return ()
+        widest = min(grid.nx, grid.ny) // self.tuning.min_lattice
+        return tuple(Lattice(step, 1) for step in self.tuning.visibility_steps if step <= widest)
 
     def shadow_ray_targets(self, batch: Batch | Pilot, patch_scale: float) -> ShadowRayTargets:
         """Return the patches that the gather of a batch goes through, in its order; those all sensor points share."""
@@ -268,20 +297,32 @@ class ThirdBounce:
         patches: Patches,
         wall_tiles: WallTiles,
         lit_by: FlatMirrors | None,
+        lattice: Lattice | None = None,
     ) -> PackedPatches:
         """Return what all sensor points gather; lit patches are saved where other batches have the same lasers."""
         key = patch_scale, lit_by is not None
         lit_patches = self._saved.get(key)
         if lit_patches is None:
             places = PatchRegions.of([len(patches)])
-            lit_patches = self._light_by_lasers(params, shape, patches, places, wall_tiles, lit_by)
-        elif self.settings.needs_visibility and not lit_patches.is_cleared:  # so far few points have looked
+            asked_of = replace(wall_tiles, n_points=0) if lattice else wall_tiles  # nodes send rays without masks
+            lit_patches = self._light_by_lasers(params, shape, patches, places, asked_of, lit_by)
+        elif (
+            self.settings.needs_visibility and not lattice and not lit_patches.is_cleared
+        ):  # so far few points have looked
             lit_patches = lit_patches.cleared(MaskQuery(self.masks, wall_tiles))
         if self.settings.lights_once and len(patches) <= self.tuning.max_kept_patches:
             # a batch gathers two resolutions
             others = [(other, lit) for other, lit in self._saved.items() if other != key]
             self._saved = dict([*others, (key, lit_patches)][-2 if self.mirror is None else -4 :])
-        return pack_patches(self.settings, params, lit_patches, self._slices(shape), params.lasers_per_lane, lit_by)
+        return pack_patches(
+            self.settings,
+            params,
+            lit_patches,
+            self._slices(shape),
+            params.lasers_per_lane,
+            lit_by,
+            lattice,
+        )
 
     def _light_by_lasers(
         self,
@@ -311,12 +352,14 @@ class ThirdBounce:
         n_points = count_sensors(capture, batch) // len(self.tessellator.regions.near)
         return WallTiles.around(groups, n_points, footprint_margin(built, capture))
 
-    def pair(self, batch: Batch | Pilot, patch_scale: float, passes: Passes | None = None) -> tuple[Gathered, Gathered]:
-        """Gather a batch at ``patch_scale`` and at the coarser resolution it is compared with."""
+    def pair(
+        self, batch: Batch | Pilot, patch_scale: float, passes: Passes | None = None, lattice: Lattice | None = None
+    ) -> tuple[Gathered, Gathered]:
+        """Gather a batch at ``patch_scale`` and at the coarser resolution it is compared with; see ``gather``."""
         passes, coarser = passes or Passes(), coarser_scale(self.tessellator, patch_scale)
         share = 1 / (1 + self.tuning.refinement)
-        coarse = self.gather(batch, coarser, passes.stage("coarse", 0, share))
-        return coarse, self.gather(batch, patch_scale, passes.stage("fine", share, 1))
+        coarse = self.gather(batch, coarser, passes.stage("coarse", 0, share), lattice)
+        return coarse, self.gather(batch, patch_scale, passes.stage("fine", share, 1), lattice)
 
     def shape(self, batch: Batch | Pilot) -> HistogramShape:
         """Return the histogram's shape; its ``replicas`` are slices: lanes that share the patches of a sensor point, or

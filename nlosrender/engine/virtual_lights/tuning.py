@@ -84,9 +84,16 @@ class VirtualLightTuning:
     # ---- Visibility (5) --------------------------------------------------------------------------------------------
     # Sensor points that share a mask: a patch's mask costs what it saves 210 (bunny) to 260 of them (letters).
     min_mask_sensors: int = 256
-    # Shadow rays from the only laser to each patch. Noise 0.25 / 0.18 / 0.15 % of 8 seeds at half / as is / twice, 0.42
-    # % at 1 (screen of 4,496 patches); lighting is paid once a capture.
-    laser_rays: int = 4
+    # Steps of the sensor lattice (5.8), tried in this order. Confocal, 2 %, CPU s without and with it: folded balls of
+    # 49,000 triangles before 64 x 64 points 11.5 and 6.0, before 256 x 256 points 116 and 38; bunny 0.47 and 0.38.
+    visibility_steps: tuple[int, ...] = (8, 4, 2)
+    # Of the error, noise of the shadow rays from which on nodes send several to each patch (chosen).
+    noise_share: float = 0.4
+    # Nodes that are left along each side, so that a shadow covers some (chosen).
+    min_lattice: int = 16
+    # Pairs of patch and sensor point below which trying costs what is saved: letters before 64 x 64 points, 4.6
+    # million, take 0.30 instead of 0.27 s CPU; a bunny, 11 million, 0.38 instead of 0.47.
+    min_lattice_pairs: int = 2**23
 
     # ---- Gather ----------------------------------------------------------------------------------------------------
     # Squared lookups of a textured patch, of more than ``few_patches`` and of fewer. A checkerboard of 40 x 40 on 314
@@ -120,10 +127,16 @@ class VirtualLightTuning:
     # room: 7.3, 4.4, 3.5 % with 7263, 18749, 27894 patches), matt surfaces -1.25 (6.4), lobes -2 while patches are
     # wider than they are (bunny, GGX 0.2: 24, 2.7 and 0.4 % with 2693, 7529 and 22023 patches).
     orders: tuple[float, float] = (0.6, 2.0)
+    # Power by which the error of a resolution is extrapolated that is not compared with a finer one: 0.35 on a sheet of
+    # noise, 1.9 and 1.5 % with 2300 and 4800 patches.
+    slowest_order: float = 0.35
     # On the patches that an extrapolated error asks for, in steps of ``min_refinement`` at least: one more level costs
     # more than 10 % of the patches.
     refinement_margin: float = 1.1
     min_refinement: float = 1.25
+    # Seconds per patch and point of the pilot over those of the render: 120 and 18 ns on folded balls of 49,000
+    # triangles, 216 and 17 ns in the furnished room; and an extrapolation often takes two trials.
+    pilot_cost: float = 16.0
 
     # ---- Bounces 4 and up (7) --------------------------------------------------------------------------------------
     # Of all replicas together. Plates 4.9 / 3.0 / 2.4, room 42 / 29 / 28 at half / as is / twice: what a round costs

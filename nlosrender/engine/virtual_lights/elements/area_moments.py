@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import coo_matrix, csr_matrix
 
+from nlosrender.engine.virtual_lights.elements.patches import SHADOW_RAYS
 from nlosrender.engine.virtual_lights.elements.struct_of_arrays import StructOfArrays
 from nlosrender.engine.virtual_lights.elements.triangles import centroids
 from nlosrender.engine.virtual_lights.tuning import VirtualLightTuning
@@ -52,7 +53,7 @@ class AreaMoments(StructOfArrays):
     light: Float64  # (n, 9) area times geometric normal times shading normal, transposed
     lit_places: Float64  # (n, 15) see ``_lit_places``, or (n, 0)
     boxes: Float64  # (n,) how many boxes of scale 1 they cover
-    representative: Int64  # (n,) a member, drawn by area
+    representatives: Int64  # (n, SHADOW_RAYS) members, each drawn by area
 
     @classmethod
     def of(
@@ -81,7 +82,7 @@ class AreaMoments(StructOfArrays):
             light=light,
             lit_places=_lit_places(light, places, upright) if with_lit_places else np.empty((len(areas), 0)),
             boxes=covered_boxes(normals, areas, allowed, tuning),
-            representative=index,
+            representatives=np.repeat(index[:, None], SHADOW_RAYS, axis=1),
         )
 
     @property
@@ -99,6 +100,7 @@ class AreaMoments(StructOfArrays):
         members = self._members(patch_scale, tuning)
         first = members.indices[members.indptr[:-1]]
         places = members @ self.places
+        draws = _drawn(members, self.areas, generator)
         return AreaMoments(
             shapes=self.shapes[first],
             scales=self.scales[first],
@@ -109,7 +111,9 @@ class AreaMoments(StructOfArrays):
             light=members @ self.light,
             lit_places=members @ self.lit_places,
             boxes=members @ self.boxes,
-            representative=self.representative[_drawn(members, self.areas, generator)],
+            representatives=np.stack(
+                [column[drawn] for column, drawn in zip(self.representatives.T, draws.T, strict=True)], axis=1
+            ),
         )
 
     def _members(self, patch_scale: float, tuning: VirtualLightTuning) -> csr_matrix:
@@ -243,8 +247,14 @@ def _without_slivers(codes: UInt64, is_sliver: NDArray[np.bool_], offsets: Float
 
 
 def _drawn(members: csr_matrix, areas: Float64, generator: np.random.Generator) -> Int64:
-    """Draw one member of every box with probability in proportion to its area."""
+    """Draw members of every box (n, SHADOW_RAYS), each with probability in proportion to its area.
+
+    Stratified, the strata in a random cyclic order: neighbours in the mesh are rarely drawn together.
+    """
     starts, ends = members.indptr[:-1], members.indptr[1:]
     cumulative = np.append(0.0, np.cumsum(areas[members.indices]))
-    position = cumulative[starts] + generator.random(len(starts)) * (cumulative[ends] - cumulative[starts])
-    return members.indices[np.clip(np.searchsorted(cumulative, position, side="right") - 1, starts, ends - 1)]
+    strata = (np.arange(SHADOW_RAYS) + generator.integers(SHADOW_RAYS, size=(len(starts), 1))) % SHADOW_RAYS
+    share = (strata + generator.random(strata.shape)) / SHADOW_RAYS
+    position = cumulative[starts, None] + share * (cumulative[ends] - cumulative[starts])[:, None]
+    chosen = np.searchsorted(cumulative, position, side="right") - 1
+    return members.indices[np.clip(chosen, starts[:, None], ends[:, None] - 1)].astype(np.int64)

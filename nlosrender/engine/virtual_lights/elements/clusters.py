@@ -9,8 +9,8 @@ from above, would be 3 times too bright with the sum of the A_i for A, 1.5 times
 A_i n_i: docs/virtual-lights.md, 4.3. Laser points in several places leave no such r: there three facets stand for a
 rough cluster, whose normals make up M.
 
-Visibility is that of one member, drawn by area: two sheets in one cluster still hide each other, on average, and the
-difference of two resolutions shows the noise of the draw.
+Visibility is that of one member, or a few, drawn by area: two sheets in one cluster still hide each other, on average,
+and the difference of two resolutions shows the noise of the draw.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ class Merger:
         tuning: VirtualLightTuning,
     ):
         self.elements, self.normals, self.light, self.tuning = elements, normals, light, tuning
-        self._is_one_point = is_one_point
+        self._is_one_point, self._centroids = is_one_point, centroids(elements.corners)
         self._ratios = ratios
         self._element_moments = AreaMoments.of(
             elements, normals, areas, allowed, tuning, with_lit_places=not is_one_point
@@ -91,7 +91,7 @@ class Merger:
         level = 2.0 ** (math.floor(math.log2(patch_scale)) - self.tuning.moment_halvings)
         moments = self._with_larger(self._moments_of(level), level, patch_scale)
         merged = moments.merged(patch_scale, np.random.default_rng(seed), self.tuning)
-        representative, plane = merged.representative, BoxPlane.of(merged.places, merged.upright)
+        representative, plane = merged.representatives[:, 0], BoxPlane.of(merged.places, merged.upright)
         centres = _from_box(plane.mean, merged.upright)
         areas, normals = self._as_one(merged, self.light - centres)
         barycentric = centroids(self.elements.weights[representative])[:, 1:]
@@ -104,8 +104,8 @@ class Merger:
             primitives=self.elements.primitives[representative],
             barycentric=barycentric,
             corner_barycentric=np.repeat(barycentric[:, None], 3, axis=1),
-            members=centroids(self.elements.corners[representative]),
-            member_normals=self.normals[representative],
+            members=(self._centroids[merged.representatives] - centres[:, None]).astype(np.float32),
+            member_normals=self.normals[merged.representatives].astype(np.float32),
             is_cluster=np.ones(len(merged), bool),
         )
         if self._is_one_point:
@@ -114,7 +114,12 @@ class Merger:
         facets = Facets.of(merged.select(is_rough))
         rough = clusters.select(np.repeat(np.flatnonzero(is_rough), 3))
         rough = replace(
-            rough, areas=facets.areas, centres=facets.centres, normals=facets.normals, corners=facets.corners
+            rough,
+            areas=facets.areas,
+            centres=facets.centres,
+            normals=facets.normals,
+            corners=facets.corners,
+            members=(rough.members + (rough.centres - facets.centres)[:, None]).astype(np.float32),
         )
         return Patches.joined([clusters.select(~is_rough), rough])
 

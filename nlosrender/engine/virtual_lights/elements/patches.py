@@ -12,6 +12,12 @@ from nlosrender.engine.virtual_lights.elements.struct_of_arrays import StructOfA
 from nlosrender.engine.virtual_lights.elements.triangles import normals_and_areas
 from nlosrender.scene.pose import Float64
 
+# Points of a patch where shadow rays end: all rays of the only laser, one of each sensor point or all of each node of
+# a lattice. Noise 0.25 / 0.18 / 0.15 % of 8 seeds at half / as is / twice, 0.42 % at 1 (screen of 4,496 patches).
+SHADOW_RAYS = 4
+
+Float32 = NDArray[np.float32]
+
 if TYPE_CHECKING:
     from nlosrender.engine.virtual_lights.elements.subdivision import Elements
 
@@ -42,8 +48,8 @@ class Patches(StructOfArrays):
     primitives: NDArray[np.uint32]  # (n,) triangle of a mesh, 0 on analytic shapes
     barycentric: Float64  # (n, 2) of the centre within that triangle
     corner_barycentric: Float64  # (n, 3, 2) of the corners; of clusters, and off meshes, the centre's
-    members: Float64  # (n, 3) where shadow rays of a cluster end; elsewhere the centre
-    member_normals: Float64  # (n, 3) geometric, there
+    members: Float32  # (n, SHADOW_RAYS, 3) from the centre to where shadow rays of a cluster end; elsewhere 0
+    member_normals: Float32  # (n, SHADOW_RAYS, 3) geometric, there; elsewhere 0
     is_cluster: NDArray[np.bool_]  # (n,)
 
     @classmethod
@@ -87,8 +93,8 @@ class Patches(StructOfArrays):
             primitives=primitives,
             barycentric=corner_barycentric.mean(axis=1),
             corner_barycentric=corner_barycentric,
-            members=centres,
-            member_normals=normals,
+            members=np.zeros((count, SHADOW_RAYS, 3), np.float32),
+            member_normals=np.zeros((count, SHADOW_RAYS, 3), np.float32),
             is_cluster=np.zeros(count, bool),
         )
 

@@ -15,7 +15,7 @@ from nlosrender.engine.launch.morton import morton_order
 from nlosrender.engine.launch.plain_diffuse import is_uniform_diffuse
 from nlosrender.engine.launch.ray_offsets import off_the_surface
 from nlosrender.engine.launch.sequences import recurrence_steps
-from nlosrender.engine.virtual_lights.elements.patches import Patches, SurfacePoints, split_weights
+from nlosrender.engine.virtual_lights.elements.patches import SHADOW_RAYS, Patches, SurfacePoints, split_weights
 from nlosrender.engine.virtual_lights.elements.round_shapes import RoundShape
 from nlosrender.engine.virtual_lights.tuning import DEFAULT_TUNING, VirtualLightTuning
 from nlosrender.engine.virtual_lights.visibility.masks import Surface
@@ -87,6 +87,35 @@ class Curvature:
         return outward - dr.dot(outward, self.axis) * self.axis
 
 
+@dataclass
+class RayEnds:
+    """Where shadow rays end, one per patch."""
+
+    point: mi.Vector3f  # of the surface, from the centre's float32 position
+    offset: mi.Vector3f  # ray offset along the normal there, see ``off_the_surface``
+    normal: mi.Vector3f  # of a cluster's member geometric, else the shading normal: for the visibility mask
+
+
+def facing(is_cluster: mi.Bool, normal: mi.Vector3f, to_end: mi.Vector3f, is_diffuse: bool) -> mi.Float:
+    """Return how much a shadow ray's end counts towards the visible share of a patch: on a member of a cluster, its
+    cosine; ends on one plane count alike.
+
+    What faces a point is hidden from it less often than what is turned away: without the cosines, clusters of a deep
+    carpet were 3 % too dark.
+
+    Parameters
+    ----------
+    normal
+        Of any length.
+    to_end
+        From the laser or sensor point.
+    is_diffuse
+        Lambertian surfaces reflect in front only.
+    """
+    cosine = dr.dot(dr.normalize(normal), dr.normalize(to_end))
+    return dr.select(is_cluster, dr.maximum(-cosine, 0) if is_diffuse else dr.abs(cosine), 1)
+
+
 @dataclass(frozen=True, eq=False)
 class DevicePatches:
     """Patches on the device, engine units; one lane per patch."""
@@ -98,38 +127,40 @@ class DevicePatches:
     is_near: bool  # some patch is so near to a laser or sensor point that the residual counts
     corners: list[mi.Vector3f]  # three, from the centre
     curvature: Curvature | None  # None: all are flat
-    members: mi.Vector4f  # from the centre to where shadow rays of clusters end, and 1 for a cluster, else 0
-    has_clusters: bool
+    is_cluster: mi.Float  # 1 or 0
+    members: list[RayEnds]  # of clusters, from the centres' float64 positions; none where there are no clusters
     areas: mi.Vector3f  # geometric normal times area
     interaction: mi.SurfaceInteraction3f  # at the centres
     middles: list[mi.SurfaceInteraction3f]  # in the middle of the edge before each corner; none of Lambertian patches
     reflectance: mi.Spectrum  # of Lambertian patches
-    member_normals: mi.Vector3f  # geometric, where shadow rays end
-    offset: mi.Vector3f  # ray offset there, see ``off_the_surface``; on curved patches in the middle
+    offset: mi.Vector3f  # ray offset at the centre, see ``off_the_surface``
 
-    def points(self, index: mi.UInt32) -> mi.Vector3f:
-        """Return points of the surface, one per patch, from the centres' float32 positions: where shadow rays end.
+    @property
+    def has_clusters(self) -> bool:
+        """Whether any patch is one."""
+        return bool(self.members)
 
-        ``index`` chooses a low-discrepancy point of a patch; a cluster has one, its member's.
+    def ends(self, index: mi.UInt32) -> RayEnds:
+        """Return where shadow rays end, one per patch.
+
+        ``index`` chooses a low-discrepancy point of a patch, or one of a cluster's members. On a curved patch the ray
+        offset is along the normal at that point, not the centre's, for a grazing ray may come from behind the latter.
         """
         u, v = spread_numbers(self.start, index)
-        inside = point_inside(self.corners, u, v)
+        inside, offset = point_inside(self.corners, u, v), self.offset
         if self.curvature is not None:
             inside = self.curvature.onto_surface(inside)
-        return self.rounding_residual + dr.select(self.members.w > 0, self.members.xyz, inside)
+            offset = self.curvature.turned(offset, inside)
+        end = RayEnds(inside, offset, mi.Vector3f(self.interaction.sh_frame.n))
+        for k, member in enumerate(self.members):
+            end = dr.select((self.is_cluster > 0) & (index % SHADOW_RAYS == k), member, end)
+        end.point += self.rounding_residual
+        return end
 
-    def offset_at(self, points: mi.Vector3f) -> mi.Vector3f:
-        """Return the ray offset along the normal at ``points``, as ``points`` returns them.
-
-        On a curved patch a grazing ray may come from behind the normal at its centre.
-        """
-        return self.offset if self.curvature is None else self.curvature.turned(self.offset, points)
-
-    def surface(self, points: mi.Vector3f) -> Surface:
-        """Return the surface at ``points``, as ``points`` returns them: for its visibility mask."""
+    def surface(self, ends: RayEnds) -> Surface:
+        """Return the surface where rays end: for its visibility mask."""
         interaction = self.interaction
-        other_normals = dr.select(self.members.w > 0, self.member_normals, mi.Vector3f(interaction.sh_frame.n))
-        return Surface(mi.Point3f(interaction.p + points), mi.Vector3f(interaction.n), other_normals)
+        return Surface(mi.Point3f(interaction.p + ends.point), mi.Vector3f(interaction.n), ends.normal)
 
 
 def upload_patches(
@@ -157,7 +188,7 @@ def upload_patches(
     start = mi.Vector2u(*mi.sample_tea_32(mi.UInt32(seed), mi.UInt32(0)))
     dr.make_opaque(start)
     curvature = Curvature.of(built, patches)
-    offset = off_the_surface(built, patches.members, patches.member_normals, patches.shapes) - patches.members
+    offset = off_the_surface(built, patches.centres, patches.normals, patches.shapes) - patches.centres
     result = DevicePatches(
         regions=regions,
         number=on_device(mi.UInt32, regions.numbers),
@@ -166,16 +197,31 @@ def upload_patches(
         is_near=is_near,
         corners=[to_vectors(patches.corners[:, k] - patches.centres) for k in range(3)],
         curvature=curvature,
-        members=mi.Vector4f(*to_points(patches.members - patches.centres), is_cluster),
-        has_clusters=bool(patches.is_cluster.any()),
+        is_cluster=is_cluster,
+        members=_members(built, patches),
         areas=to_vectors(patches.normals * patches.areas[:, None]),
         interaction=interaction,
         middles=[] if is_diffuse else _middles(built, patches, interaction, is_cluster > 0, curvature),
         reflectance=reflectance,
-        member_normals=to_vectors(patches.member_normals),
         offset=to_vectors(offset),
     )
     dr.eval(result)
+    return result
+
+
+def _members(built: BuiltScene, patches: Patches) -> list[RayEnds]:
+    """Return the members of clusters where shadow rays end; of other patches what is there is not asked for."""
+    chosen = np.flatnonzero(patches.is_cluster)
+    if not len(chosen):
+        return []
+    centres, shapes = patches.centres[chosen], patches.shapes[chosen]
+    result = []
+    for k in range(SHADOW_RAYS):
+        places, normals = patches.members[chosen, k], patches.member_normals[chosen, k].astype(np.float64)
+        offsets = off_the_surface(built, centres + places, normals, shapes) - (centres + places)
+        columns = np.zeros((3, len(patches), 3))
+        columns[:, chosen] = places, offsets, normals
+        result.append(RayEnds(*(to_vectors(column) for column in columns)))
     return result
 
 

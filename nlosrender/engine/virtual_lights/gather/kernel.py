@@ -24,6 +24,7 @@ from nlosrender.engine.launch.second_bounce import on_one_plane
 from nlosrender.engine.launch.wall_points import WallPoints
 from nlosrender.engine.virtual_lights.gather.delay_distribution import Delays, PatchDelays, deposit_patch
 from nlosrender.engine.virtual_lights.gather.lighting import ROWS, GatherSettings, PackedPatches
+from nlosrender.engine.virtual_lights.gather.sensor_lattice import SensorLattice
 from nlosrender.engine.virtual_lights.visibility.shadow_rays import is_visible, mirrored_share
 from nlosrender.scene.build import SceneWithoutWall
 
@@ -62,6 +63,7 @@ class GatherPasses:
         slice_index: mi.UInt32,
         tile: mi.UInt64,
         mirror: FlatMirrors | None,
+        lattice: SensorLattice | None = None,
     ) -> None:
         """Gather the next group; parameters as for ``gather_third_bounce``."""
         group, self._group = self._group, self._group + 1
@@ -71,9 +73,14 @@ class GatherPasses:
         done = self._skipped if group == self._first_group else 0
         while done < longest:
             steps = min(self._size.steps, longest - done)
+            if lattice is not None:
+                steps = min(steps, lattice.most_steps)
             self._size.begin()
-            cut = (dr.opaque(mi.UInt32, number) for number in (done, steps))
-            gather_third_bounce(self._settings, params, packed, self._histogram, lane, slice_index, tile, *cut, mirror)
+            cut = [dr.opaque(mi.UInt32, number) for number in (done, steps)]
+            seen = None if lattice is None else lattice.visibility(self._settings, params.built, packed, *cut)
+            gather_third_bounce(
+                self._settings, params, packed, self._histogram, lane, slice_index, tile, *cut, mirror, lattice, seen
+            )
             dr.eval(self._histogram.sums, self._histogram.outside)
             dr.sync_thread()
             self._size.end()
@@ -99,6 +106,8 @@ def gather_third_bounce(
     skipped: mi.UInt32,
     most: mi.UInt32,
     mirror: FlatMirrors | None,
+    lattice: SensorLattice | None = None,
+    seen: mi.UInt32 | None = None,
 ) -> None:
     """Deposit the third bounce: lane by lane over ``most`` patches of its slice, after the first ``skipped`` ones.
 
@@ -118,98 +127,114 @@ def gather_third_bounce(
         Opaque.
     mirror
         By way of which the sensor points see the patches of Lambertian surfaces; None: straight.
+    lattice, seen
+        That visibility is interpolated on, and what ``SensorLattice.visibility`` returns; None: each point sends rays.
     """
-    built, sensors = params.built, params.sensors
-    sensor, sensor_bsdf = sensors.interaction, built.bsdf_at(sensors.interaction)
-    context = mi.BSDFContext()
-    n_lasers, count = params.n_lasers, packed.count
-    own_laser = params.lasers.gather(params.first_laser)
-
+    n_lasers, own_laser = params.n_lasers, params.lasers.gather(params.first_laser)
     end = dr.gather(mi.UInt32, packed.first, slice_index + 1)
 
     # ---- State ------------------------------------------------------------------------------------------------------
     patch = dr.gather(mi.UInt32, packed.first, slice_index) + skipped
     end = dr.select(n_lasers > 0, dr.minimum(end, patch + most), patch)  # by reciprocity a lane may have no laser
+    entry = mi.UInt32(0) if lattice is None else mi.UInt32(lattice.of_lane)
 
     while dr.hint(
         patch < end,
-        exclude=[
-            end,
-            settings,
-            params,
-            packed,
-            histogram,
-            built,
-            sensors,
-            sensor,
-            sensor_bsdf,
-            own_laser,
-            tile,
-            mirror,
-        ],
+        exclude=[end, settings, params, packed, histogram, lane, own_laser, tile, mirror, lattice, seen],
     ):
-        # ---- The patch as the sensor point sees it ------------------------------------------------------------------
-        rows = [dr.gather(mi.Vector4f, packed.packed, patch * ROWS + k) for k in range(ROWS)]
-        a, b, c, centre, shown, offset = (mi.Point3f(row.x, row.y, row.z) for row in rows)
-        areas = mi.Vector3f(rows[0].w, rows[1].w, rows[2].w)
-        point = centre + shown
-        a, b, c, centre = (image_in(mirror, corner) for corner in (a, b, c, centre))
-        areas = turned_in(mirror, areas)
-        from_sensor = centre - sensor.p
-        to_patch = from_sensor
-        if dr.hint(packed.rounding_residual is not None, mode="scalar"):
-            to_patch = from_sensor + turned_in(mirror, _rounding_residual(packed, patch))
-        distance2 = dr.squared_norm(to_patch)
-        direction = to_patch * dr.rsqrt(distance2)
-        received = sensor_bsdf.eval(context, sensor, sensor.to_local(direction))
-        weight = received * (dr.abs(dr.dot(areas, direction)) / distance2)
-        active = dr.any(weight > 0)
-        if dr.hint(isinstance(built, SceneWithoutWall), mode="scalar"):
-            active &= ~on_one_plane(built, sensor, dr.normalize(areas), to_patch)
-        cosine = mi.Float(0)
-        if dr.hint(settings.is_diffuse, mode="scalar"):
-            cosine = -dr.dot(turned_in(mirror, dr.gather(mi.Normal3f, packed.shading, patch)), direction)
-            active &= cosine > 0
-
-        is_cluster = None
-        if dr.hint(packed.has_clusters, mode="scalar"):
-            is_cluster = rows[3].w > 0
-
-        # ---- Visibility ---------------------------------------------------------------------------------------------
-        if dr.hint(mirror is not None, mode="scalar"):
-            weight *= mirrored_share(built, mirror, sensor, point, mi.Vector3f(offset), active)
-            active = dr.any(weight > 0)
-        elif dr.hint(settings.needs_visibility, mode="scalar"):
-            # in front of the plane through the point that is looked at, not through the centre
-            to_surface = from_sensor + shown
-            mask = dr.select(dr.dot(areas, to_surface) < 0, dr.gather(mi.UInt64, packed.mask, patch), 0)
-            active = is_visible(built, sensor, to_surface, mi.Vector3f(offset), active, mask, tile)
-
-        # ---- Reflect towards the lasers and deposit -----------------------------------------------------------------
-        delays = PatchDelays.from_point(sensor.p, centre, (a, b, c), params.bins_per_unit)
-        seen = _SeenPatch(patch, weight, is_cluster, to_patch - from_sensor, active)
-        if dr.hint(settings.is_confocal, mode="scalar"):
-            # of the laser point: the laser stands elsewhere than the sensor, and may not see it
-            lit = own_laser.interaction
-            light = built.bsdf_at(lit).eval(context, lit, lit.to_local(direction)) / distance2
-            if dr.hint(settings.is_diffuse, mode="scalar"):
-                light *= dr.gather(mi.Spectrum, packed.reflectance, patch) * cosine
-            delays += delays
-            _deposit(settings, packed, histogram, sensors, own_laser, lane, mi.UInt32(0), light, delays, seen)
-        elif dr.hint(params.lasers_per_lane == 1, mode="scalar"):
-            light, legs = packed.from_laser(patch)
-            delays += legs
-            _deposit(settings, packed, histogram, sensors, own_laser, lane, mi.UInt32(0), light, delays, seen)
+        if dr.hint(lattice is None, mode="scalar"):
+            _gather_patch(settings, params, packed, histogram, lane, own_laser, tile, mirror, patch, None)
         else:
-            laser = mi.UInt32(0)
-            while dr.hint(
-                laser < n_lasers, exclude=[settings, params, packed, histogram, sensors, delays, patch, count, seen]
-            ):
-                points = params.lasers.gather(laser)
-                light, legs = packed.from_laser(laser * count + patch)
-                _deposit(settings, packed, histogram, sensors, points, lane, laser, light, legs + delays, seen)
-                laser += 1
+            assert lattice is not None
+            share = lattice.share(seen, entry)
+            if dr.hint(share > 0, exclude=[settings, params, packed, histogram, lane, own_laser, tile, mirror, patch]):
+                _gather_patch(settings, params, packed, histogram, lane, own_laser, tile, mirror, patch, share)
+            entry += lattice.stride
         patch += 1
+
+
+@dr.syntax
+def _gather_patch(
+    settings: GatherSettings,
+    params: LaunchParams,
+    packed: PackedPatches,
+    histogram: BlockHistogram,
+    lane: mi.UInt32,
+    own_laser: WallPoints,
+    tile: mi.UInt64,
+    mirror: FlatMirrors | None,
+    patch: mi.UInt32,
+    share: mi.Float | None,
+) -> None:
+    """Deposit what one patch sends each lane's sensor point; ``share`` of it is seen, None: a shadow ray tells."""
+    built, sensors = params.built, params.sensors
+    sensor, sensor_bsdf = sensors.interaction, built.bsdf_at(sensors.interaction)
+    context = mi.BSDFContext()
+    n_lasers, count = params.n_lasers, packed.count
+
+    # ---- The patch as the sensor point sees it ----------------------------------------------------------------------
+    rows = [dr.gather(mi.Vector4f, packed.packed, patch * ROWS + k) for k in range(ROWS)]
+    a, b, c, centre, shown, offset = (mi.Point3f(row.x, row.y, row.z) for row in rows)
+    areas = mi.Vector3f(rows[0].w, rows[1].w, rows[2].w)
+    point = centre + shown
+    a, b, c, centre = (image_in(mirror, corner) for corner in (a, b, c, centre))
+    areas = turned_in(mirror, areas)
+    from_sensor = centre - sensor.p
+    to_patch = from_sensor
+    if dr.hint(packed.rounding_residual is not None, mode="scalar"):
+        to_patch = from_sensor + turned_in(mirror, _rounding_residual(packed, patch))
+    distance2 = dr.squared_norm(to_patch)
+    direction = to_patch * dr.rsqrt(distance2)
+    received = sensor_bsdf.eval(context, sensor, sensor.to_local(direction))
+    weight = received * (dr.abs(dr.dot(areas, direction)) / distance2)
+    active = dr.any(weight > 0)
+    if dr.hint(isinstance(built, SceneWithoutWall), mode="scalar"):
+        active &= ~on_one_plane(built, sensor, dr.normalize(areas), to_patch)
+    cosine = mi.Float(0)
+    if dr.hint(settings.is_diffuse, mode="scalar"):
+        cosine = -dr.dot(turned_in(mirror, dr.gather(mi.Normal3f, packed.shading, patch)), direction)
+        active &= cosine > 0
+
+    is_cluster = None
+    if dr.hint(packed.has_clusters, mode="scalar"):
+        is_cluster = rows[3].w > 0
+
+    # ---- Visibility ---------------------------------------------------------------------------------------------
+    if dr.hint(mirror is not None, mode="scalar"):
+        weight *= mirrored_share(built, mirror, sensor, point, mi.Vector3f(offset), active)
+        active = dr.any(weight > 0)
+    elif dr.hint(share is not None, mode="scalar"):
+        weight *= share
+    elif dr.hint(settings.needs_visibility, mode="scalar"):
+        # in front of the plane through the point that is looked at, not through the centre
+        to_surface = from_sensor + shown
+        mask = dr.select(dr.dot(areas, to_surface) < 0, dr.gather(mi.UInt64, packed.mask, patch), 0)
+        active = is_visible(built, sensor, to_surface, mi.Vector3f(offset), active, mask, tile)
+
+    # ---- Reflect towards the lasers and deposit -----------------------------------------------------------------
+    delays = PatchDelays.from_point(sensor.p, centre, (a, b, c), params.bins_per_unit)
+    seen = _SeenPatch(patch, weight, is_cluster, to_patch - from_sensor, active)
+    if dr.hint(settings.is_confocal, mode="scalar"):
+        # of the laser point: the laser stands elsewhere than the sensor, and may not see it
+        lit = own_laser.interaction
+        light = built.bsdf_at(lit).eval(context, lit, lit.to_local(direction)) / distance2
+        if dr.hint(settings.is_diffuse, mode="scalar"):
+            light *= dr.gather(mi.Spectrum, packed.reflectance, patch) * cosine
+        delays += delays
+        _deposit(settings, packed, histogram, sensors, own_laser, lane, mi.UInt32(0), light, delays, seen)
+    elif dr.hint(params.lasers_per_lane == 1, mode="scalar"):
+        light, legs = packed.from_laser(patch)
+        delays += legs
+        _deposit(settings, packed, histogram, sensors, own_laser, lane, mi.UInt32(0), light, delays, seen)
+    else:
+        laser = mi.UInt32(0)
+        while dr.hint(
+            laser < n_lasers, exclude=[settings, params, packed, histogram, sensors, delays, patch, count, seen]
+        ):
+            points = params.lasers.gather(laser)
+            light, legs = packed.from_laser(laser * count + patch)
+            _deposit(settings, packed, histogram, sensors, points, lane, laser, light, legs + delays, seen)
+            laser += 1
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,8 +14,10 @@ from nlosrender.engine.launch.flat_mirrors import FlatMirrors, image_in, turned_
 from nlosrender.engine.launch.launch_params import LaunchParams
 from nlosrender.engine.launch.second_bounce import on_one_plane
 from nlosrender.engine.launch.wall_points import WallPoints
+from nlosrender.engine.virtual_lights.elements.patches import SHADOW_RAYS
 from nlosrender.engine.virtual_lights.gather.delay_distribution import PatchDelays
-from nlosrender.engine.virtual_lights.tuning import DEFAULT_TUNING
+from nlosrender.engine.virtual_lights.gather.device_patches import RayEnds, facing
+from nlosrender.engine.virtual_lights.refinement import Lattice
 from nlosrender.engine.virtual_lights.visibility.shadow_rays import is_visible, mirrored_share
 from nlosrender.scene.build import BuiltScene, SceneWithoutWall
 
@@ -35,7 +37,6 @@ class GatherSettings:
     needs_visibility: bool  # something may lie between wall and patches
     has_one_laser: bool  # in the whole capture, however it is cut
     is_multiplexed: bool = False  # all lasers light every batch, at once
-    laser_rays: int = DEFAULT_TUNING.laser_rays
 
     @property
     def lights_once(self) -> bool:
@@ -61,6 +62,9 @@ class PackedPatches:
     laser_light: mi.Spectrum
     delays: mi.Float  # four an index: from the laser point to each corner [bins]
     middle_delays: mi.Float  # to the centre
+    # of ``sensor_lattice``, eight for each of SHADOW_RAYS points of a patch: the way from its centre, the first of
+    # ``LitPatches.end_weights``, the ray offset, and the second; None: one ray is enough
+    ends: mi.Float | None
     has_clusters: bool
     count: mi.UInt32  # of lit patches, opaque
     first: mi.UInt32  # of slice k: its patches are first[k] to first[k + 1]
@@ -83,10 +87,10 @@ class MaskQuery:
         """Whether enough sensor points share a mask."""
         return self.masks.pay_off(self.wall_tiles.n_points)
 
-    def of(self, patches: DevicePatches, shadow_target: mi.Vector3f, active: mi.Bool) -> mi.UInt64:
+    def of(self, patches: DevicePatches, ends: RayEnds, active: mi.Bool) -> mi.UInt64:
         """Return the masks of patches where rays end, see ``VisibilityMasks.of``."""
         where = on_device(mi.UInt32, patches.regions.regions)
-        return self.masks.of(patches.surface(shadow_target), self.wall_tiles, where, active)
+        return self.masks.of(patches.surface(ends), self.wall_tiles, where, active)
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,7 +100,10 @@ class LitPatches:
     patches: DevicePatches
     laser_light: mi.Spectrum  # index = laser * n_patches + patch; see ``PackedPatches``
     is_lit: mi.Bool  # by any of the lasers
-    shadow_target: mi.Vector3f  # from the centres to where the sensor points' shadow rays end
+    # SHADOW_RAYS: by which the only laser lights the points where rays end, over the share of the patch that it lights,
+    # 0 in shadow, and the same without shadow and share
+    end_weights: list[mi.Vector2f]
+    ends: RayEnds  # of the sensor points' shadow rays, one each
     mask: mi.UInt64  # there, see ``VisibilityMasks.of``
     is_cleared: bool  # masks have been asked for: enough sensor points share them
 
@@ -104,7 +111,7 @@ class LitPatches:
         """Return the same with visibility masks, if they pay off."""
         if not mask_query.pays_off:
             return self
-        return replace(self, mask=mask_query.of(self.patches, self.shadow_target, self.is_lit), is_cleared=True)
+        return replace(self, mask=mask_query.of(self.patches, self.ends, self.is_lit), is_cleared=True)
 
 
 def light_patches(
@@ -120,9 +127,10 @@ def light_patches(
     ``mirror``: by way of which the light comes; None: straight.
     """
     count = dr.width(patches.areas)
-    shadow_target, all_lit = patches.points(patches.number), dr.full(mi.Bool, True, count)
-    dr.eval(shadow_target)
-    lit = LitPatches(patches, mi.Spectrum(0), all_lit, shadow_target, dr.zeros(mi.UInt64, count), is_cleared=False)
+    ends, all_lit, no_mask = patches.ends(patches.number), dr.full(mi.Bool, True, count), dr.zeros(mi.UInt64, count)
+    end_weights = [dr.full(mi.Vector2f, 1, count) for _ in range(SHADOW_RAYS)]
+    dr.eval(ends)
+    lit = LitPatches(patches, mi.Spectrum(0), all_lit, end_weights, ends, no_mask, is_cleared=False)
     if settings.needs_visibility and not settings.has_one_laser:
         lit = lit.cleared(mask_query)
     if not settings.is_confocal:
@@ -139,6 +147,7 @@ def pack_patches(
     slices_per_region: int,
     n_lasers: int,
     mirror: FlatMirrors | None = None,
+    lattice: Lattice | None = None,
 ) -> PackedPatches:
     """Return what the gather reads: the patches that are lit, sorted by slice (see ``PatchRegions.in_slices``)."""
     patches, laser_light = lit_patches.patches, lit_patches.laser_light
@@ -162,10 +171,9 @@ def pack_patches(
     a, b, c = _corners(patches, lit)
     areas = dr.gather(mi.Vector3f, patches.areas, lit)
     interaction = dr.gather(mi.SurfaceInteraction3f, patches.interaction, lit)
-    is_cluster = dr.gather(mi.Vector4f, patches.members, lit).w
-    target = dr.gather(mi.Vector3f, lit_patches.shadow_target, lit)
-    offset = dr.gather(mi.Vector3f, patches.offset_at(lit_patches.shadow_target), lit)
-    rows = [(a, areas.x), (b, areas.y), (c, areas.z), (interaction.p, is_cluster), (target, 0), (offset, 0)]
+    is_cluster = dr.gather(mi.Float, patches.is_cluster, lit)
+    end = dr.gather(RayEnds, lit_patches.ends, lit)
+    rows = [(a, areas.x), (b, areas.y), (c, areas.z), (interaction.p, is_cluster), (end.point, 0), (end.offset, 0)]
     packed = dr.zeros(mi.Float, 4 * ROWS * dr.width(lit))
     lane = dr.arange(mi.UInt32, dr.width(lit))
     for k, (point, fourth) in enumerate(rows):
@@ -184,6 +192,7 @@ def pack_patches(
         laser_light=laser_light,
         delays=delays,
         middle_delays=middle_delays,
+        ends=_packed_ends(lit_patches, lit) if lattice and lattice.rays > 1 else None,
         has_clusters=patches.has_clusters,
         count=n_lit,
         first=first,
@@ -205,7 +214,7 @@ def _light_by_lasers(
     Shadow rays of sensor points end where they did, or at a point that the only laser lights. Of Lambertian patches
     the result is the light that leaves.
     """
-    patches, shadow_target = dark.patches, dark.shadow_target
+    patches, ends, end_weights = dark.patches, dark.ends, dark.end_weights
     built = params.built
     n_patches = dr.width(patches.areas)
     index = dr.arange(mi.UInt32, n_patches * n_lasers)
@@ -232,57 +241,76 @@ def _light_by_lasers(
         active &= (cosine > 0) | mi.has_flag(flags, mi.BSDFFlags.BackSide)
     seen = mi.Spectrum(1)
     if settings.has_one_laser and (settings.needs_visibility or mirror is not None):
-        seen, shadow_target = _lit_fraction(settings, built, patches, lit, centre, active, mirror)
+        seen, end_weights, ends = _lit_fraction(settings.is_diffuse, built, patches, lit, centre, active, mirror)
     elif mirror is not None:
-        target = dr.gather(mi.Vector3f, shadow_target, patch)
-        offset = dr.gather(mi.Vector3f, patches.offset_at(shadow_target), patch)
-        seen = mirrored_share(built, mirror, lit, centre + target, offset, active)
+        end = dr.gather(RayEnds, ends, patch)
+        seen = mirrored_share(built, mirror, lit, centre + end.point, end.offset, active)
     elif settings.needs_visibility:
         # the very point where the sensor points' rays end: what hides a part of a patch from both hides the same part
-        to_surface = to_rounded + dr.gather(mi.Vector3f, shadow_target, patch)
-        offset = dr.gather(mi.Vector3f, patches.offset_at(shadow_target), patch)
+        end = dr.gather(RayEnds, ends, patch)
+        to_surface = to_rounded + end.point
         tile = mask_query.wall_tiles.tile_bit(mi.UInt32(0), lit.p)
         is_before = dr.dot(dr.gather(mi.Vector3f, patches.areas, patch), to_surface) < 0  # the plane through that point
         mask = dr.select(is_before, dr.gather(mi.UInt64, dark.mask, patch), 0)
-        seen = dr.select(is_visible(built, lit, to_surface, offset, active, mask, tile), mi.Spectrum(1), 0)
+        seen = dr.select(is_visible(built, lit, to_surface, end.offset, active, mask, tile), mi.Spectrum(1), 0)
     laser_light = dr.select(active, laser_light * seen, 0)
     brightest = dr.zeros(mi.Float, n_patches)
     dr.scatter_reduce(dr.ReduceOp.Max, brightest, dr.max(laser_light), patch)
     is_lit = brightest > 0
-    dr.eval(laser_light, is_lit, shadow_target)
-    return replace(dark, laser_light=laser_light, is_lit=is_lit, shadow_target=shadow_target)
+    dr.eval(laser_light, is_lit, ends, end_weights)
+    return replace(dark, laser_light=laser_light, is_lit=is_lit, ends=ends, end_weights=end_weights)
 
 
 def _lit_fraction(
-    settings: GatherSettings,
+    is_diffuse: bool,
     built: BuiltScene,
     patches: DevicePatches,
     laser: mi.SurfaceInteraction3f,
     centre: mi.Point3f,
     active: mi.Bool,
     mirror: FlatMirrors | None,
-) -> tuple[mi.Spectrum, mi.Vector3f]:
-    """Return the share of the only laser's light that each patch has, and a lit point where sensor points' rays end.
+) -> tuple[mi.Spectrum, list[mi.Vector2f], RayEnds]:
+    """Return the share of the only laser's light that each patch has, weights of ends that are lit, and one of them.
 
     The fractions that laser and sensor point see are not independent where one edge throws both shadows. One point,
     drawn among those in light by reservoir sampling, makes their product right on average: docs/virtual-lights.md, 5.
     """
-    n_seen, chosen, share = mi.UInt32(0), mi.Vector3f(0), mi.Spectrum(0)
-    for k in range(settings.laser_rays):
-        index = patches.number * settings.laser_rays + k
-        point = patches.points(index)
-        offset = patches.offset_at(point)
+    weights: list[mi.Vector2f] = []
+    chosen, share, total, lit = dr.zeros(RayEnds), mi.Spectrum(0), mi.Float(0), mi.Float(0)
+    for k in range(SHADOW_RAYS):
+        index = patches.number * SHADOW_RAYS + k
+        end = patches.ends(index)
         if mirror is None:
-            is_lit = is_visible(built, laser, centre - laser.p + point, offset, active)
+            seen = mi.Spectrum(
+                dr.select(is_visible(built, laser, centre - laser.p + end.point, end.offset, active), 1, 0)
+            )
         else:
-            reflected = mirrored_share(built, mirror, laser, centre + point, offset, active)
-            share += reflected
-            is_lit = dr.any(reflected > 0)
-        n_seen += dr.select(is_lit, mi.UInt32(1), 0)
-        # reservoir of one: the n-th lit point replaces the one before with probability 1 / n
-        takes = is_lit & (mi.sample_tea_float32(index, patches.start.x) * mi.Float(n_seen) < 1)
-        chosen = dr.select(takes, point, chosen)
-    return (mi.Spectrum(n_seen) if mirror is None else share) / settings.laser_rays, chosen
+            seen = mirrored_share(built, mirror, laser, centre + end.point, end.offset, active)
+        to_end = centre + end.point - image_in(mirror, laser.p)
+        weight = facing(patches.is_cluster > 0, end.offset, to_end, is_diffuse)
+        total += weight
+        share += weight * seen
+        lit_weight = dr.select(dr.any(seen > 0), weight, 0)
+        lit += lit_weight
+        weights.append(mi.Vector2f(lit_weight, weight))
+        # reservoir of one: a lit point replaces the one before with its part of all weights so far
+        chosen = dr.select(mi.sample_tea_float32(index, patches.start.x) * lit < lit_weight, end, chosen)
+    over_share = dr.select(lit > 0, mi.Vector2f(total / lit, 1), mi.Vector2f(0, 1))
+    return dr.select(total > 0, share / total, 0), [weight * over_share for weight in weights], chosen
+
+
+def _packed_ends(lit_patches: LitPatches, lit: mi.UInt32) -> mi.Float:
+    """Return ``PackedPatches.ends`` of the patches with numbers ``lit``."""
+    patches, packed = lit_patches.patches, dr.zeros(mi.Float, 8 * SHADOW_RAYS * dr.width(lit))
+    lane = dr.arange(mi.UInt32, dr.width(lit))
+    for k, weights in enumerate(lit_patches.end_weights):
+        end = dr.gather(RayEnds, patches.ends(patches.number * SHADOW_RAYS + k), lit)
+        row = 2 * (lane * SHADOW_RAYS + k)
+        weight = dr.gather(mi.Vector2f, weights, lit)
+        dr.scatter(packed, mi.Vector4f(*end.point, weight.x), row)
+        dr.scatter(packed, mi.Vector4f(*end.offset, weight.y), row + 1)
+    dr.eval(packed)
+    return packed
 
 
 def _corners(patches: DevicePatches, index: mi.UInt32) -> tuple[mi.Point3f, mi.Point3f, mi.Point3f]:
