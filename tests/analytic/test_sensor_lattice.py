@@ -130,7 +130,10 @@ def test_how_a_capture_is_cut_changes_no_bit(scan: str, monkeypatch: pytest.Monk
 
 @pytest.mark.parametrize(("slits", "target"), [(0, 0.01), (4, 0.03)], ids=["plate", "slits"])
 def test_the_stated_error_holds_that_of_interpolation(slits: int, target: float) -> None:
-    """The true one is at most twice as large: half the patches' size, and rays of each point's own, leave less than a third of it."""
+    """The true one is at most twice as large.
+
+    Truth has patches of half the size and rays of each point's own: less than a third of the error.
+    """
     from nlosrender.engine.interface import Budget
 
     bars = [FRONT | {"center": [-0.3 + 0.2 * k, 0, 0.1], "width": 0.1} for k in range(slits)]

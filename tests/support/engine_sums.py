@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -54,9 +54,13 @@ def finer(engine: Any, target_error: float) -> Any:
 
     What is stated is the error of all bins together. Of single sums it is a few times that, one to a few percent, which
     paths of minutes resolve; a ninth of it is below their noise. Calibrated, not scaled: the divisor of differences is
-    that of two resolutions.
+    that of two resolutions. Light above the third bounce is in bins of its own, not in time steps: what these change is
+    part of the error of all bins together, and of some of them more than paths resolve.
     """
-    return engine.calibrate(Budget(target_error=target_error / 9))
+    budget = engine.calibrate(Budget(target_error=target_error / 9))
+    return replace(
+        budget, bins_per_step=None, steps_variance=None, bins_per_step_of_paths=None, steps_variance_of_paths=None
+    )
 
 
 def rows(values: Array) -> Array:
