@@ -21,3 +21,8 @@ def _is_plain(shape: mi.Shape) -> bool:
 def is_uniform_diffuse(bsdf: mi.BSDF) -> bool:
     """Return whether a BSDF is Mitsuba's ``diffuse`` of one reflectance, without a texture."""
     return bsdf.class_name() == "SmoothDiffuse" and [key for key, _ in mi.traverse(bsdf)] == ["reflectance.value"]
+
+
+def is_two_sided_diffuse(bsdf: mi.BSDF) -> bool:
+    """Return whether a BSDF is Mitsuba's ``twosided`` of one ``diffuse`` of one reflectance, without a texture."""
+    return bsdf.class_name() == "TwoSidedBRDF" and [key for key, _ in mi.traverse(bsdf)] == ["brdf_0.reflectance.value"]

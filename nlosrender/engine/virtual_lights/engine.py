@@ -21,6 +21,7 @@ from nlosrender.engine.launch.occlusion import nothing_occludes
 from nlosrender.engine.launch.omissions import omitted_by_time_gate, omitted_triangles, omitted_visibility
 from nlosrender.engine.launch.passes import Passes
 from nlosrender.engine.launch.pilot_points import pilot_of
+from nlosrender.engine.launch.plain_diffuse import is_two_sided_diffuse
 from nlosrender.engine.launch.schedule import DEFAULT_TARGET
 from nlosrender.engine.virtual_lights.calibration import calibrated_lights
 from nlosrender.engine.virtual_lights.cost import gather_batch_bytes, virtual_light_estimate
@@ -63,14 +64,17 @@ class VirtualLightEngine:
         self.options = device.options
         built, capture = self.built, self.capture
         shapes = (*built.hidden_shapes, *([built.wall_shape] if wall_sees_itself(built) else []))
+        bsdfs = [shape.bsdf() for shape in shapes if not is_mirror(shape.bsdf())]
+        self._is_one_sided = all(is_lambertian(bsdf) for bsdf in bsdfs)  # and Lambertian
         self.settings = GatherSettings(
             is_confocal=capture.scan_type == "confocal",
-            is_diffuse=all(is_lambertian(shape.bsdf()) for shape in shapes if not is_mirror(shape.bsdf())),
+            is_diffuse=all(is_lambertian(bsdf) or is_two_sided_diffuse(bsdf) for bsdf in bsdfs),
+            has_two_sided=any(is_two_sided_diffuse(bsdf) for bsdf in bsdfs),
             needs_visibility=not nothing_occludes(built),
             has_one_laser=capture.n_lasers == 1,
             is_multiplexed=capture.laser_weights is not None,
         )
-        all_lambertian = self.settings.is_diffuse and all(is_lambertian(shape.bsdf()) for shape in built.lit_shapes)
+        all_lambertian = self._is_one_sided and all(is_lambertian(shape.bsdf()) for shape in built.lit_shapes)
         has_vpls = self.has_further_bounces and self._mirrors_once
         mirror = device.lone_mirror if has_vpls else None
         bin_width = self.time_axis.bin_width_opl / built.metres_per_engine_unit
@@ -90,7 +94,7 @@ class VirtualLightEngine:
                 device,
                 self.tessellator,
                 masks,
-                self.settings.is_diffuse,
+                self._is_one_sided,
                 may_share=can_share and all_lambertian and has_vpls and mirror is None,
                 with_delta=has_vpls,
             )
@@ -108,7 +112,7 @@ class VirtualLightEngine:
         built, mirror = self.built, self.device.lone_mirror
         if not any(_has_delta_lobe(shape.bsdf()) for shape in built.scene.shapes()):
             return True
-        if mirror is None or self.settings.is_confocal or not self.settings.is_diffuse:
+        if mirror is None or self.settings.is_confocal or not self._is_one_sided:
             return False
         if not built.wall.is_planar:
             return wall_sees_itself(built)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from nlosrender.engine.launch.device_arrays import columns, on_device
 from nlosrender.engine.launch.morton import morton_order
-from nlosrender.engine.launch.plain_diffuse import is_uniform_diffuse
+from nlosrender.engine.launch.plain_diffuse import is_two_sided_diffuse, is_uniform_diffuse
 from nlosrender.engine.launch.ray_offsets import off_the_surface
 from nlosrender.engine.launch.sequences import recurrence_steps
 from nlosrender.engine.virtual_lights.elements.patches import SHADOW_RAYS, Patches, SurfacePoints, split_weights
@@ -96,7 +96,7 @@ class RayEnds:
     normal: mi.Vector3f  # of a cluster's member geometric, else the shading normal: for the visibility mask
 
 
-def facing(is_cluster: mi.Bool, normal: mi.Vector3f, to_end: mi.Vector3f, is_diffuse: bool) -> mi.Float:
+def facing(is_cluster: mi.Bool, normal: mi.Vector3f, to_end: mi.Vector3f, is_one_sided: mi.Bool) -> mi.Float:
     """Return how much a shadow ray's end counts towards the visible share of a patch: on a member of a cluster, its
     cosine; ends on one plane count alike.
 
@@ -109,11 +109,11 @@ def facing(is_cluster: mi.Bool, normal: mi.Vector3f, to_end: mi.Vector3f, is_dif
         Of any length.
     to_end
         From the laser or sensor point.
-    is_diffuse
-        Lambertian surfaces reflect in front only.
+    is_one_sided
+        Whether the surface reflects in front only.
     """
     cosine = dr.dot(dr.normalize(normal), dr.normalize(to_end))
-    return dr.select(is_cluster, dr.maximum(-cosine, 0) if is_diffuse else dr.abs(cosine), 1)
+    return dr.select(is_cluster, dr.select(is_one_sided, dr.maximum(-cosine, 0), dr.abs(cosine)), 1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,6 +128,7 @@ class DevicePatches:
     corners: list[mi.Vector3f]  # three, from the centre
     curvature: Curvature | None  # None: all are flat
     is_cluster: mi.Float  # 1 or 0
+    is_two_sided: mi.Float  # of Lambertian patches, 1 or 0
     members: list[RayEnds]  # of clusters, from the centres' float64 positions; none where there are no clusters
     areas: mi.Vector3f  # geometric normal times area
     interaction: mi.SurfaceInteraction3f  # at the centres
@@ -198,6 +199,7 @@ def upload_patches(
         corners=[to_vectors(patches.corners[:, k] - patches.centres) for k in range(3)],
         curvature=curvature,
         is_cluster=is_cluster,
+        is_two_sided=on_device(mi.Float, _of_shapes(built, patches, is_two_sided_diffuse)),
         members=_members(built, patches),
         areas=to_vectors(patches.normals * patches.areas[:, None]),
         interaction=interaction,

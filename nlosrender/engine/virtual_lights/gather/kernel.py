@@ -193,6 +193,12 @@ def _gather_patch(
     cosine = mi.Float(0)
     if dr.hint(settings.is_diffuse, mode="scalar"):
         cosine = -dr.dot(turned_in(mirror, dr.gather(mi.Normal3f, packed.shading, patch)), direction)
+        if dr.hint(settings.has_two_sided, mode="scalar"):
+            is_behind = (rows[4].w > 0) & (cosine < 0)
+            cosine = dr.select(is_behind, -cosine, cosine)
+            if dr.hint(not settings.is_confocal, mode="scalar"):
+                # light on the back is negative: for sensor points on that side it is positive
+                weight = dr.select(is_behind, -weight, weight)
         active &= cosine > 0
 
     is_cluster = None
@@ -202,7 +208,7 @@ def _gather_patch(
     # ---- Visibility ---------------------------------------------------------------------------------------------
     if dr.hint(mirror is not None, mode="scalar"):
         weight *= mirrored_share(built, mirror, sensor, point, mi.Vector3f(offset), active)
-        active = dr.any(weight > 0)
+        active = dr.any(weight != 0)
     elif dr.hint(share is not None, mode="scalar"):
         weight *= share
     elif dr.hint(settings.needs_visibility, mode="scalar"):

@@ -34,6 +34,7 @@ class GatherSettings:
 
     is_confocal: bool
     is_diffuse: bool  # every hidden BSDF is Lambertian: reflectance and a cosine are all there is
+    has_two_sided: bool  # some Lambertian surface reflects on both sides
     needs_visibility: bool  # something may lie between wall and patches
     has_one_laser: bool  # in the whole capture, however it is cut
     is_multiplexed: bool = False  # all lasers light every batch, at once
@@ -49,7 +50,8 @@ class PackedPatches:
     """What the gather's loop reads: patches that are lit, packed so that one load brings four numbers."""
 
     # 24 a patch: three corners, each with one component of normal times area; the centre, and 1 for a cluster; from it
-    # to the point of the surface where shadow rays end, and 0; the ray offset along the normal there, and 0
+    # to the point of the surface where shadow rays end, and 1 for a two-sided surface; the ray offset along the normal
+    # there, and 0
     packed: mi.Float
     mask: mi.UInt64  # of that point, see ``VisibilityMasks.of``
     rounding_residual: mi.Float | None  # four a patch: float64 minus float32 centre; None: negligible
@@ -58,7 +60,7 @@ class PackedPatches:
     middles: list[mi.SurfaceInteraction3f]  # in the middle of each edge; none of Lambertian patches
     reflectance: mi.Spectrum  # confocal Lambertian patches: reflectance / pi
     # index = laser * count + patch: light that arrives, per area perpendicular to it; of Lambertian patches the light
-    # that leaves; empty for confocal captures
+    # that leaves, negative on the back of two-sided ones; empty for confocal captures
     laser_light: mi.Spectrum
     delays: mi.Float  # four an index: from the laser point to each corner [bins]
     middle_delays: mi.Float  # to the centre
@@ -173,7 +175,8 @@ def pack_patches(
     interaction = dr.gather(mi.SurfaceInteraction3f, patches.interaction, lit)
     is_cluster = dr.gather(mi.Float, patches.is_cluster, lit)
     end = dr.gather(RayEnds, lit_patches.ends, lit)
-    rows = [(a, areas.x), (b, areas.y), (c, areas.z), (interaction.p, is_cluster), (end.point, 0), (end.offset, 0)]
+    sides = dr.gather(mi.Float, patches.is_two_sided, lit)
+    rows = [(a, areas.x), (b, areas.y), (c, areas.z), (interaction.p, is_cluster), (end.point, sides), (end.offset, 0)]
     packed = dr.zeros(mi.Float, 4 * ROWS * dr.width(lit))
     lane = dr.arange(mi.UInt32, dr.width(lit))
     for k, (point, fourth) in enumerate(rows):
@@ -234,14 +237,15 @@ def _light_by_lasers(
     if isinstance(built, SceneWithoutWall):
         active &= ~on_one_plane(built, lit, dr.gather(mi.Normal3f, patches.interaction.n, patch), to_patch)
     if settings.is_diffuse:
-        laser_light *= dr.maximum(cosine, 0) * dr.gather(mi.Spectrum, patches.reflectance, patch) * dr.inv_pi
-        active &= dr.any(laser_light > 0)
+        cosine = dr.select(dr.gather(mi.Float, patches.is_two_sided, patch) > 0, cosine, dr.maximum(cosine, 0))
+        laser_light *= cosine * dr.gather(mi.Spectrum, patches.reflectance, patch) * dr.inv_pi
+        active &= dr.any(laser_light != 0)
     else:
         flags = dr.gather(mi.SurfaceInteraction3f, patches.interaction, patch).bsdf().flags()
         active &= (cosine > 0) | mi.has_flag(flags, mi.BSDFFlags.BackSide)
     seen = mi.Spectrum(1)
     if settings.has_one_laser and (settings.needs_visibility or mirror is not None):
-        seen, end_weights, ends = _lit_fraction(settings.is_diffuse, built, patches, lit, centre, active, mirror)
+        seen, end_weights, ends = _lit_fraction(settings, built, patches, lit, centre, active, mirror)
     elif mirror is not None:
         end = dr.gather(RayEnds, ends, patch)
         seen = mirrored_share(built, mirror, lit, centre + end.point, end.offset, active)
@@ -255,14 +259,14 @@ def _light_by_lasers(
         seen = dr.select(is_visible(built, lit, to_surface, end.offset, active, mask, tile), mi.Spectrum(1), 0)
     laser_light = dr.select(active, laser_light * seen, 0)
     brightest = dr.zeros(mi.Float, n_patches)
-    dr.scatter_reduce(dr.ReduceOp.Max, brightest, dr.max(laser_light), patch)
+    dr.scatter_reduce(dr.ReduceOp.Max, brightest, dr.max(dr.abs(laser_light)), patch)
     is_lit = brightest > 0
     dr.eval(laser_light, is_lit, ends, end_weights)
     return replace(dark, laser_light=laser_light, is_lit=is_lit, ends=ends, end_weights=end_weights)
 
 
 def _lit_fraction(
-    is_diffuse: bool,
+    settings: GatherSettings,
     built: BuiltScene,
     patches: DevicePatches,
     laser: mi.SurfaceInteraction3f,
@@ -287,7 +291,8 @@ def _lit_fraction(
         else:
             seen = mirrored_share(built, mirror, laser, centre + end.point, end.offset, active)
         to_end = centre + end.point - image_in(mirror, laser.p)
-        weight = facing(patches.is_cluster > 0, end.offset, to_end, is_diffuse)
+        is_one_sided = settings.is_diffuse & (patches.is_two_sided == 0)
+        weight = facing(patches.is_cluster > 0, end.offset, to_end, is_one_sided)
         total += weight
         share += weight * seen
         lit_weight = dr.select(dr.any(seen > 0), weight, 0)

@@ -153,9 +153,10 @@ def _trace_rays(
     ):
         row = dr.gather(mi.Vector4f, packed.packed, patch * ROWS + 3)
         from_sensor = mi.Point3f(row.x, row.y, row.z) - sensor.p
-        in_front = mi.Bool(True)
+        in_front, is_two_sided = mi.Bool(True), dr.gather(mi.Vector4f, packed.packed, patch * ROWS + 4).w > 0
         if dr.hint(settings.is_diffuse, mode="scalar"):
             in_front = dr.dot(dr.gather(mi.Normal3f, packed.shading, patch), from_sensor) < 0
+            in_front |= is_two_sided
         if dr.hint(lattice.rays == 1, mode="scalar"):
             shown, offset = (dr.gather(mi.Vector4f, packed.packed, patch * ROWS + k).xyz for k in (4, 5))
             is_seen = is_visible(built, sensor, from_sensor + shown, offset, in_front)
@@ -167,7 +168,7 @@ def _trace_rays(
                     dr.gather(mi.Vector4f, packed.ends, 2 * (patch * SHADOW_RAYS + k) + part) for part in range(2)
                 )
                 to_end = from_sensor + place.xyz
-                cosine = facing(is_cluster, offset.xyz, to_end, settings.is_diffuse) ** power
+                cosine = facing(is_cluster, offset.xyz, to_end, settings.is_diffuse & ~is_two_sided) ** power
                 total += offset.w * cosine
                 weight = place.w * cosine
                 is_seen = is_visible(built, sensor, to_end, offset.xyz, in_front & (weight > 0))
