@@ -32,7 +32,7 @@ class VirtualLightTuning:
     # rough cluster has three facets. 2 % of 32 x 32 points, confocal, CPU s at 0.5 / 0.35 / 0.25 / 0.15: folded ball of
     # 49,000 triangles 12.0 / 7.9 / 5.2 / 4.8, another 5.7 / 4.4 / 4.3 / 3.3; wavy sheet 0.23 / - / 0.43 / 2.3.
     merge_ratio: float = 0.25
-    # Of one gather; 400 bytes each, 0.8 GB. Beyond it paths reach the error sooner (chosen, 6.5).
+    # Of one gather; 500 bytes each, 1 GB. Beyond it paths reach the error sooner (chosen, 6.5).
     max_patches: int = 2_000_000
     # Of a resolution that is kept for the next batch: 80 MB, and two resolutions are kept.
     max_kept_patches: int = 200_000
