@@ -398,3 +398,16 @@ def test_a_time_limit_that_the_gather_uses_up_still_gives_all_bounces() -> None:
     histogram = engine.render(plan.batches[0], Budget(time_limit_s=1e-6), Passes(shares.append))
     assert (histogram.mean.sum(axis=(0, 2, 3, 4))[1:] > 0).all()
     assert all(0 <= share <= 1 for share in shares)
+
+
+def test_what_the_wall_cannot_see_sends_nothing() -> None:
+    """A plate behind the wall, and one that turns its back: bounces 3 to 5 are zero, and their error, too."""
+    plate = {"type": "rectangle", "width": 1.0, "height": 0.8, "normal": [0, 0, 1]}
+    for depth in (-0.5, 0.5):
+        shown = render(
+            flat_wall(
+                plate | {"center": [0, 0, depth]}, engine="virtual_lights", max_bounces=5, spp=None, target_error=0.05
+            )
+        )
+        assert not shown.mean.any()
+        assert not shown.variance.any()

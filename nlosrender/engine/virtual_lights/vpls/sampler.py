@@ -92,6 +92,8 @@ class VplSampler:
 
     def _densities(self, tessellator: Tessellator, centres: Float64, nearness: Float64) -> Float64:
         """Return the density of elements at ``centres`` without a time gate; ``nearness``: 1 / (d (d + R))."""
+        if not len(centres):  # no surface may be seen
+            return nearness
         grid, tuning = tessellator.capture.sensor_grid, tessellator.tuning
         some = list(spread(grid, tuning.density_sensors_per_axis).indices)
         sensors = grid.positions.reshape(-1, 3)[some] / tessellator.built.metres_per_engine_unit
