@@ -53,10 +53,14 @@ def test_a_bin_loses_nothing_of_a_billion_deposits(first: float, then: float, ti
 @pytest.mark.stress
 @pytest.mark.parametrize("engine", ENGINES)
 def test_bounces_sum_to_the_total(engine: str, ledger: Ledger) -> None:
-    """Split or not, the light is the same."""
+    """Split or not, the light is the same: to rounding by paths, to the stated errors where pilots choose the work.
+
+    A pilot of split bounces does not know how they add up within a bin, and may choose other time steps.
+    """
     settings = {"engine": engine, "max_bounces": 5, "sensors": (3, 2)}
     split, whole = (render(scene(PLATE, SIDE, split_bounces=each, **settings)) for each in (True, False))
-    ledger.check(f"bounces sum to the total ({engine})", relative_difference(split.total, whole.total), 1e-6)
+    tolerance = 1e-6 if engine == "path" else split.error_estimate + whole.error_estimate
+    ledger.check(f"bounces sum to the total ({engine})", relative_difference(split.total, whole.total), tolerance)
 
 
 @pytest.mark.parametrize("engine", BOTH)
