@@ -401,7 +401,7 @@ def test_a_time_limit_that_the_gather_uses_up_still_gives_all_bounces() -> None:
 
 
 def test_what_the_wall_cannot_see_sends_nothing() -> None:
-    """A plate behind the wall, and one that turns its back: bounces 3 to 5 are zero, and their error, too."""
+    """A plate behind the wall, and one that faces away from it: bounces 3 to 5 and their variances are zero."""
     plate = {"type": "rectangle", "width": 1.0, "height": 0.8, "normal": [0, 0, 1]}
     for depth in (-0.5, 0.5):
         shown = render(

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from support.engines import in_bins
 from support.varied_scenes import SIDE, SLANTED, TRAPS, Item, Stage, Trap, ball, diffuse, plate, room
 
 from nlosrender.engine.backend.start import start_backend
@@ -140,14 +141,10 @@ def compared(point: str, target: float, result: Any, truth: Array, truth_varianc
 def better(budget: Any) -> Any:
     """Return a budget for the truth."""
     return replace(
-        budget,
+        in_bins(budget),  # what longer time steps change is error
         patch_scale=budget.patch_scale / FINER if budget.patch_scale else None,
         rounds=LONGER * budget.rounds if budget.rounds else None,
         spp=LONGER * budget.spp if budget.spp else None,
-        bins_per_step=None,  # time steps of a bin: what longer ones change is error
-        steps_variance=None,
-        bins_per_step_of_paths=None,
-        steps_variance_of_paths=None,
     )
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -11,6 +11,7 @@ from scipy import stats
 
 from nlosrender.engine.interface import Budget
 from support.agreement import grouped, t_limit
+from support.engines import in_bins
 from support.varied_scenes import Repeated
 
 Array = NDArray[np.float64]
@@ -57,10 +58,7 @@ def finer(engine: Any, target_error: float) -> Any:
     that of two resolutions. Light above the third bounce is in bins of its own, not in time steps: what these change is
     part of the error of all bins together, and of some of them more than paths resolve.
     """
-    budget = engine.calibrate(Budget(target_error=target_error / 9))
-    return replace(
-        budget, bins_per_step=None, steps_variance=None, bins_per_step_of_paths=None, steps_variance_of_paths=None
-    )
+    return in_bins(engine.calibrate(Budget(target_error=target_error / 9)))
 
 
 def rows(values: Array) -> Array:

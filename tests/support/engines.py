@@ -1,4 +1,4 @@
-"""Engines made anew with other options."""
+"""Engines made anew with other options, and budgets."""
 
 from __future__ import annotations
 
@@ -18,3 +18,10 @@ def with_options(engine: Any, **options: Any) -> Any:
     if engine.name == "path":
         return type(engine)(device)
     return type(engine)(device, type(engine.paths)(device, first_bounce=4), engine.third.lanes)
+
+
+def in_bins(budget: Any) -> Any:
+    """Return a budget that adds light above the third bounce in bins, not in longer time steps."""
+    return replace(
+        budget, bins_per_step=None, steps_variance=None, bins_per_step_of_paths=None, steps_variance_of_paths=None
+    )

@@ -30,7 +30,7 @@ from nlosrender.readable import readable_size
 if TYPE_CHECKING:
     from nlosrender.engine.virtual_lights.engine import VirtualLightEngine
 
-PATCH_BYTES = 500  # float64 on the host, while they are cut and joined, and float32 on the device
+PATCH_BYTES = 500  # float64 on the host while patches are cut and joined, and float32 on the device
 PILOT_DEPOSITS = 5e8  # of the gather, patches times bins they cover: chosen for a fraction of a second
 MAX_PILOTS = 20.0  # pilots' worth of deposits for one sensor point above which no pilot is run: chosen for about 10 s
 

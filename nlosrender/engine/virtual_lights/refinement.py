@@ -40,7 +40,7 @@ class Gathered:
     @property
     def squares(self) -> float:
         """Sum of squares inside the time window."""
-        return _squares(self.values)
+        return squares_inside(self.values)
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,10 +64,14 @@ class _Level:
     n_patches: int
     error: float
 
+    def order(self, n_patches: int, error: float) -> float:
+        """Return the power of the number of patches that the error falls by from here to a finer resolution."""
+        return math.log(self.error / error) / math.log(n_patches / self.n_patches)
+
 
 def estimated_error(coarse: Gathered, fine: Gathered, known_squares: float = 0.0) -> float:
     """Return the relative L2 error of the finer resolution, with ``known_squares`` of other bounces beside it."""
-    noise = _squares(fine.values - coarse.values) / difference_divisor(coarse, fine) ** 2
+    noise = squares_inside(fine.values - coarse.values) / difference_divisor(coarse, fine) ** 2
     return _relative(noise, fine, known_squares)
 
 
@@ -107,7 +111,7 @@ def coarser_scale(tessellator: Tessellator, patch_scale: float) -> float:
 
 def footprint_error(gathered: Gathered, known_squares: float = 0.0) -> float:
     """Return the relative L2 error of the mean over a footprint, as the two halves of its places differ."""
-    noise = 0.0 if gathered.footprint_deviation is None else _squares(gathered.footprint_deviation)
+    noise = 0.0 if gathered.footprint_deviation is None else squares_inside(gathered.footprint_deviation)
     return _relative(noise, gathered, known_squares)
 
 
@@ -144,12 +148,19 @@ def refined_to(
     levels: list[_Level] = []  # coarse to fine
     coarsest = min(finer_scale(tessellator, tuning.coarsest_compared, tuning.refinement), tuning.coarsest_scale)
     patch_scale = start or coarsest
+
+    def refined_at(scale: float, noise: float, error: float, finer: float | None) -> Refined:
+        fine, coarse = gather(scale), gather(coarser_scale(tessellator, scale))  # the pair that a render gathers
+        divisor = math.sqrt(squares_inside(fine.values - coarse.values) / noise) if noise > 0 else None
+        return Refined(scale, fine, error, divisor, finer)
+
     while True:
         fine, finer = gather(patch_scale), finer_scale(tessellator, patch_scale, tuning.refinement)
         if tessellator.count(finer) > tuning.max_patches:
             coarse = gather(coarser_scale(tessellator, patch_scale))
             return Refined(patch_scale, fine, estimated_error(coarse, fine, known_squares), None)
-        noise = tuning.difference_margin**2 * _squares(gather(finer).values - fine.values)
+        better = gather(finer)
+        noise = tuning.difference_margin**2 * squares_inside(better.values - fine.values)
         error = _relative(noise, fine, known_squares)
         earlier = next(
             (one.error for one in reversed(levels) if one.n_patches <= fine.n_patches / tuning.stagnation_ratio),
@@ -158,9 +169,7 @@ def refined_to(
         is_stuck = tuning.stagnation * earlier < error
         is_beyond = fine.n_patches * error / target > tuning.max_patches
         if error <= target or (error < tuning.max_regular_error and (is_stuck or is_beyond)):
-            coarse = gather(coarser_scale(tessellator, patch_scale))  # the one that the render itself will have
-            divisor = math.sqrt(_squares(fine.values - coarse.values) / noise) if noise > 0 else None
-            refined = Refined(patch_scale, fine, error, divisor, finer)
+            refined = refined_at(patch_scale, noise, error, finer)
             if levels and (between := _between(levels[-1], refined, target, tessellator, points_left)) is not None:
                 again = refined_to(target, tessellator, gather, known_squares, between, lambda *_: True)
                 return refined if again.is_paused else again
@@ -168,13 +177,11 @@ def refined_to(
         if pauses is not None and pauses(fine, error):
             return Refined(patch_scale, fine, error, None, is_paused=True)
         more = (tuning.refinement_margin * error / target) ** (1 / _order(levels, fine.n_patches, error, tuning.orders))
-        more, better = min(max(more, tuning.min_refinement), tuning.refinement), gather(finer)
+        more = min(max(more, tuning.min_refinement), tuning.refinement)
         less_noise = noise * (better.n_patches / fine.n_patches) ** (-2 * tuning.slowest_order)
         expected = _relative(less_noise, better, known_squares)
         if expected <= target and not _pays(fine.n_patches * more, better.n_patches, tuning, points_left):
-            coarse = gather(coarser_scale(tessellator, finer))
-            divisor = math.sqrt(_squares(better.values - coarse.values) / less_noise)
-            return Refined(finer, better, expected, divisor)
+            return refined_at(finer, less_noise, expected, None)
         levels.append(_Level(patch_scale, fine.n_patches, error))
         patch_scale = finer_scale(tessellator, patch_scale, more)
 
@@ -195,7 +202,7 @@ def _between(
     tuning, n_patches = tessellator.tuning, refined.gathered.n_patches
     if not 0 < refined.error < coarser.error or n_patches <= coarser.n_patches:
         return None
-    order = math.log(coarser.error / refined.error) / math.log(n_patches / coarser.n_patches)
+    order = coarser.order(n_patches, refined.error)
     wanted = n_patches * (tuning.refinement_margin * refined.error / target) ** (1 / order)
     if wanted >= n_patches / tuning.min_refinement or not _pays(wanted, n_patches, tuning, points_left):
         return None
@@ -227,9 +234,9 @@ def with_lattice(
         return refined
     own = gather(refined.patch_scale, None)
     better = own if refined.finer is None else gather(refined.finer, None)
-    noise = refined.error**2 * _squares(own) if refined.finer is None else _squares(better - own)
+    noise = refined.error**2 * squares_inside(own) if refined.finer is None else squares_inside(better - own)
     for lattice in lattices if noise > 0 else ():
-        squares = _squares(better - gather(refined.patch_scale, lattice))
+        squares = squares_inside(better - gather(refined.patch_scale, lattice))
         factor = math.sqrt(squares / noise + (refined.finer is None))
         if refined.error * factor <= max(target, refined.error):
             factor = max(factor, 1.0)
@@ -241,8 +248,7 @@ def _order(levels: list[_Level], n_patches: int, error: float, bounds: tuple[flo
     """Return the power of the number of patches that the error falls by from the last level on, within bounds."""
     if not levels or levels[-1].n_patches >= n_patches:
         return 1.0
-    last = levels[-1]
-    return float(np.clip(math.log(last.error / error) / math.log(n_patches / last.n_patches), *bounds))
+    return float(np.clip(levels[-1].order(n_patches, error), *bounds))
 
 
 def _relative(noise: float, fine: Gathered, known_squares: float) -> float:
@@ -250,7 +256,7 @@ def _relative(noise: float, fine: Gathered, known_squares: float) -> float:
     return relative_l2_error(noise, fine.squares + noise + known_squares)
 
 
-def _squares(values: NDArray[np.float64]) -> float:
-    """Return the sum of the squares inside the time window, without a copy of it."""
+def squares_inside(values: NDArray[np.float64]) -> float:
+    """Return the sum of the squares of (channel, bounce, laser, sensor, row) inside the time window, without a copy."""
     inside = values[..., :-1]
     return float(np.einsum("abcde,abcde->", inside, inside))

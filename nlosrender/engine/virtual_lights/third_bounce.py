@@ -65,6 +65,7 @@ class _Lanes:
     params: LaunchParams  # what they read
     index: mi.UInt32
     slice_index: mi.UInt32  # of the patches that all sensor points share
+    sensors: NDArray[np.int64]  # (lanes,) flat index in the sensor grid
     order: NDArray[np.int64]  # (sensors,) the sensor point of each lane of a slice, numbered as in the batch
     regions: NDArray[np.int64]  # (lanes,)
 
@@ -229,18 +230,11 @@ class ThirdBounce:
     ) -> None:
         """Add what the sensor points of ``lanes`` gather; parameters as of ``_sums``."""
         lit_by, seen_by = (self.mirror if by_mirror else None for by_mirror in way)
-        sensors = np.tile(self.device.sensor_indices(batch)[lanes.order].astype(np.int64), shape.replicas)
-
-        def sensor_lattice(chosen: NDArray[np.integer] | slice, slices: NDArray[np.integer]) -> SensorLattice | None:
-            if lattice is None:
-                return None
-            return SensorLattice.of(self.device, sensors[chosen], slices, lattice, self.lanes)
-
         if len(patches):
             wall_tiles = self._wall_tiles(batch)
             packed = self._shared_lights(lanes.params, shape, patch_scale, patches, wall_tiles, lit_by, lattice)
             tile = wall_tiles.tile_bit(mi.UInt32(0), lanes.params.sensors.interaction.p)
-            nodes = sensor_lattice(slice(None), lanes.slice_index.numpy())
+            nodes = self._nodes(lattice, lanes.sensors, lanes.slice_index.numpy())
             work.gather(lanes.params, packed, lanes.index, lanes.slice_index, tile, seen_by, nodes)
         for labels, near in self.tessellator.regional_patches(patch_scale, np.unique(lanes.regions).tolist()):
             places = PatchRegions.of([len(one) for one in near])
@@ -251,12 +245,17 @@ class ThirdBounce:
             slice_index = np.searchsorted(labels, lanes.regions[chosen]) * slices + chosen // shape.sensors % slices
             index = on_device(mi.UInt32, chosen)
             some, wall_tiles = lanes.params.gather_lanes(index), self._wall_tiles(batch, labels)
-            asked_of = replace(wall_tiles, n_points=0) if lattice else wall_tiles
-            lit_patches = self._light_by_lasers(some, shape, Patches.joined(near), places, asked_of, lit_by)
+            lit_patches = self._light_by_lasers(some, shape, Patches.joined(near), places, wall_tiles, lit_by, lattice)
             packed = pack_patches(self.settings, some, lit_patches, slices, some.lasers_per_lane, lit_by, lattice)
             tile = wall_tiles.tile_bit(on_device(mi.UInt32, slice_index // slices), some.sensors.interaction.p)
-            nodes = sensor_lattice(chosen, slice_index)
+            nodes = self._nodes(lattice, lanes.sensors[chosen], slice_index)
             work.gather(some, packed, index, on_device(mi.UInt32, slice_index), tile, seen_by, nodes)
+
+    def _nodes(
+        self, lattice: Lattice | None, sensors: NDArray[np.int64], slices: NDArray[np.integer]
+    ) -> SensorLattice | None:
+        """Return the lattice of lanes with ``sensors`` and ``slices`` (lanes,); None: every point sends rays."""
+        return None if lattice is None else SensorLattice.of(self.device, sensors, slices, lattice, self.lanes)
 
     @property
     def lattices(self) -> tuple[Lattice, ...]:
@@ -304,25 +303,16 @@ class ThirdBounce:
         lit_patches = self._saved.get(key)
         if lit_patches is None:
             places = PatchRegions.of([len(patches)])
-            asked_of = replace(wall_tiles, n_points=0) if lattice else wall_tiles  # nodes send rays without masks
-            lit_patches = self._light_by_lasers(params, shape, patches, places, asked_of, lit_by)
-        elif (
-            self.settings.needs_visibility and not lattice and not lit_patches.is_cleared
-        ):  # so far few points have looked
+            lit_patches = self._light_by_lasers(params, shape, patches, places, wall_tiles, lit_by, lattice)
+        elif self.settings.needs_visibility and not lattice and not lit_patches.is_cleared:
+            # saved by a pilot, whose points were too few for masks
             lit_patches = lit_patches.cleared(MaskQuery(self.masks, wall_tiles))
         if self.settings.lights_once and len(patches) <= self.tuning.max_kept_patches:
             # a batch gathers two resolutions
             others = [(other, lit) for other, lit in self._saved.items() if other != key]
             self._saved = dict([*others, (key, lit_patches)][-2 if self.mirror is None else -4 :])
-        return pack_patches(
-            self.settings,
-            params,
-            lit_patches,
-            self._slices(shape),
-            params.lasers_per_lane,
-            lit_by,
-            lattice,
-        )
+        slices = self._slices(shape)
+        return pack_patches(self.settings, params, lit_patches, slices, params.lasers_per_lane, lit_by, lattice)
 
     def _light_by_lasers(
         self,
@@ -332,14 +322,16 @@ class ThirdBounce:
         places: PatchRegions,
         wall_tiles: WallTiles,
         lit_by: FlatMirrors | None,
+        lattice: Lattice | None,
     ) -> LitPatches:
         is_near = self.tessellator.nearest < self.tuning.near_distance
         on_device = upload_patches(
             self.device.built, patches, places, self.device.options.seed, is_near, self.settings.is_diffuse, self.tuning
         )
-        return light_patches(
-            self.settings, params, on_device, MaskQuery(self.masks, wall_tiles), params.lasers_per_lane, lit_by
-        )
+        if lattice is not None:  # its few nodes send rays without masks
+            wall_tiles = replace(wall_tiles, n_points=0)
+        masks = MaskQuery(self.masks, wall_tiles)
+        return light_patches(self.settings, params, on_device, masks, params.lasers_per_lane, lit_by)
 
     def _wall_tiles(self, batch: Batch | Pilot, regions: list[int] | None = None) -> WallTiles:
         """Return what patches are seen from: all points, or the sensor points of some regions."""
@@ -388,7 +380,7 @@ class ThirdBounce:
         dr.eval(lane, slice_index)
         if lasers is not None:
             params = replace(params, n_lasers=on_device(mi.UInt32, np.tile(lasers[order], shape.replicas)))
-        regions = np.zeros(shape.lanes, np.int64)
+        sensors, regions = np.tile(indices[order].astype(np.int64), shape.replicas), np.zeros(shape.lanes, np.int64)
         if self.tessellator.regions is not None:
-            regions = np.tile(self.tessellator.regions.labels[indices][order], shape.replicas)
-        return _Lanes(params, lane, slice_index, order, regions)
+            regions = self.tessellator.regions.labels[sensors]
+        return _Lanes(params, lane, slice_index, sensors, order, regions)

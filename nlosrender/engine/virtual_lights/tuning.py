@@ -87,9 +87,9 @@ class VirtualLightTuning:
     # Steps of the sensor lattice (5.8), tried in this order. Confocal, 2 %, CPU s without and with it: folded balls of
     # 49,000 triangles before 64 x 64 points 11.5 and 6.0, before 256 x 256 points 116 and 38; bunny 0.47 and 0.38.
     visibility_steps: tuple[int, ...] = (8, 4, 2)
-    # Of the error, noise of the shadow rays from which on nodes send several to each patch (chosen).
+    # Share of the error that is noise of single shadow rays, above which nodes trace several to each patch (chosen).
     noise_share: float = 0.4
-    # Nodes that are left along each side, so that a shadow covers some (chosen).
+    # Fewest nodes along a side of the sensor grid, so that a shadow covers several (chosen).
     min_lattice: int = 16
     # Pairs of patch and sensor point below which trying costs what is saved: letters before 64 x 64 points, 4.6
     # million, take 0.30 instead of 0.27 s CPU; a bunny, 11 million, 0.38 instead of 0.47.

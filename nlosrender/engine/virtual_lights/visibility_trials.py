@@ -20,6 +20,7 @@ from nlosrender.engine.virtual_lights.refinement import (
     Lattice,
     Refined,
     refined_to,
+    squares_inside,
     with_lattice,
 )
 
@@ -27,7 +28,7 @@ if TYPE_CHECKING:
     from nlosrender.engine.launch.pilot_points import Pilot
     from nlosrender.engine.virtual_lights.third_bounce import ThirdBounce
 
-POINTS_PER_CELL = 5  # of the pilot, one of which gets a cell of the sensor lattice around it
+POINTS_PER_CELL = 5  # every so many of the pilot's points, one is tried with a lattice cell around it
 ALL_RAYS = Lattice(1, SHADOW_RAYS)  # each of the pilot's points is a node
 
 
@@ -58,13 +59,11 @@ class VisibilityTrials:
 
         ``target`` and ``start``: as of ``refinement.refined_to``.
         """
-        tessellator, rest = self._third.tessellator, (self._known_squares, start)
-        refined = refined_to(target, tessellator, self._gather, *rest, self._is_noise_of_rays, self._points_left)
-        gather, base = self._gather, None
+        gather, rays = self._gather, 1
+        refined = self._search(target, gather, start, self._is_noise_of_rays)
         if refined.is_paused:
-            gather, base, rest = self._of_nodes, ALL_RAYS, (self._known_squares, refined.patch_scale)
-            refined = refined_to(target, tessellator, gather, *rest, points_left=self._points_left)
-        refined = replace(refined, lattice=base)
+            gather, rays = self._of_nodes, SHADOW_RAYS
+            refined = replace(self._search(target, gather, refined.patch_scale), lattice=ALL_RAYS)
         if not self._pays_off(refined.gathered):
             return refined
 
@@ -73,8 +72,17 @@ class VisibilityTrials:
                 return gather(scale).values[:, :, :, ::POINTS_PER_CELL]
             return self._third.gather(self._some, scale, lattice=lattice).values
 
-        rays = 1 if base is None else base.rays
         return with_lattice(refined, target, [replace(lattice, rays=rays) for lattice in self._third.lattices], at_some)
+
+    def _search(
+        self,
+        target: float,
+        gather: Callable[[float], Gathered],
+        start: float | None,
+        pauses: Callable[[Gathered, float], bool] | None = None,
+    ) -> Refined:
+        tessellator, known_squares = self._third.tessellator, self._known_squares
+        return refined_to(target, tessellator, gather, known_squares, start, pauses, self._points_left)
 
     def _pays_off(self, gathered: Gathered) -> bool:
         """Return whether a lattice may be used, and saves more than these trials cost."""
@@ -84,7 +92,8 @@ class VisibilityTrials:
     def _is_noise_of_rays(self, gathered: Gathered, error: float) -> bool:
         """Return whether most of the error is noise of single shadow rays: several to each patch take it away.
 
-        Patches that are smaller have less of it, by the square root of their number.
+        It falls as one over the square root of the number of patches: what was measured is not measured again while it
+        stays below half of the limit by that law.
         """
         most = self._third.tuning.noise_share * error
         if not self._pays_off(gathered):
@@ -92,7 +101,7 @@ class VisibilityTrials:
         if self._noise is not None and self._noise[1] * math.sqrt(self._noise[0] / gathered.n_patches) < 0.5 * most:
             return False
         values = self._third.gather(self._some, gathered.patch_scale, lattice=ALL_RAYS).values
-        squares = replace(gathered, values=values).squares + self._third.device.exact_squares(self._some)
-        noise = replace(gathered, values=values - gathered.values[:, :, :, ::POINTS_PER_CELL])
-        self._noise = gathered.n_patches, math.sqrt(noise.squares / max(squares, 1e-300))
+        squares = squares_inside(values) + self._third.device.exact_squares(self._some)
+        noise = squares_inside(values - gathered.values[:, :, :, ::POINTS_PER_CELL])
+        self._noise = gathered.n_patches, math.sqrt(noise / max(squares, 1e-300))
         return self._noise[1] > most

@@ -100,7 +100,6 @@ class AreaMoments(StructOfArrays):
         members = self._members(patch_scale, tuning)
         first = members.indices[members.indptr[:-1]]
         places = members @ self.places
-        draws = _drawn(members, self.areas, generator)
         return AreaMoments(
             shapes=self.shapes[first],
             scales=self.scales[first],
@@ -111,9 +110,7 @@ class AreaMoments(StructOfArrays):
             light=members @ self.light,
             lit_places=members @ self.lit_places,
             boxes=members @ self.boxes,
-            representatives=np.stack(
-                [column[drawn] for column, drawn in zip(self.representatives.T, draws.T, strict=True)], axis=1
-            ),
+            representatives=np.take_along_axis(self.representatives, _drawn(members, self.areas, generator), axis=0),
         )
 
     def _members(self, patch_scale: float, tuning: VirtualLightTuning) -> csr_matrix:

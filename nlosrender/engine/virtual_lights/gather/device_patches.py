@@ -97,11 +97,10 @@ class RayEnds:
 
 
 def facing(is_cluster: mi.Bool, normal: mi.Vector3f, to_end: mi.Vector3f, is_one_sided: mi.Bool) -> mi.Float:
-    """Return how much a shadow ray's end counts towards the visible share of a patch: on a member of a cluster, its
-    cosine; ends on one plane count alike.
+    """Return the weight of a shadow ray's end in the visible share of a patch: a cluster member's cosine, else 1.
 
-    What faces a point is hidden from it less often than what is turned away: without the cosines, clusters of a deep
-    carpet were 3 % too dark.
+    Members that face a laser or sensor point are hidden from it less often than others: without the cosines, clusters
+    of a deep carpet were 1.8 % too dark.
 
     Parameters
     ----------
@@ -159,7 +158,7 @@ class DevicePatches:
         return end
 
     def surface(self, ends: RayEnds) -> Surface:
-        """Return the surface where rays end: for its visibility mask."""
+        """Return positions and normals of the rays' ends, as visibility masks take them."""
         interaction = self.interaction
         return Surface(mi.Point3f(interaction.p + ends.point), mi.Vector3f(interaction.n), ends.normal)
 
@@ -212,7 +211,7 @@ def upload_patches(
 
 
 def _members(built: BuiltScene, patches: Patches) -> list[RayEnds]:
-    """Return the members of clusters where shadow rays end; of other patches what is there is not asked for."""
+    """Return the cluster members where shadow rays end; zeros for patches that are no clusters."""
     chosen = np.flatnonzero(patches.is_cluster)
     if not len(chosen):
         return []

@@ -136,20 +136,20 @@ def gather_third_bounce(
     # ---- State ------------------------------------------------------------------------------------------------------
     patch = dr.gather(mi.UInt32, packed.first, slice_index) + skipped
     end = dr.select(n_lasers > 0, dr.minimum(end, patch + most), patch)  # by reciprocity a lane may have no laser
-    entry = mi.UInt32(0) if lattice is None else mi.UInt32(lattice.of_lane)
+    entry, stride = (0, 0) if lattice is None else (lattice.of_lane, lattice.stride)
+    entry = mi.UInt32(entry)  # of the lattice's visibility: patch by patch
 
     while dr.hint(
         patch < end,
-        exclude=[end, settings, params, packed, histogram, lane, own_laser, tile, mirror, lattice, seen],
+        exclude=[end, settings, params, packed, histogram, lane, own_laser, tile, mirror, lattice, seen, stride],
     ):
-        if dr.hint(lattice is None, mode="scalar"):
-            _gather_patch(settings, params, packed, histogram, lane, own_laser, tile, mirror, patch, None)
-        else:
-            assert lattice is not None
-            share = lattice.share(seen, entry)
-            if dr.hint(share > 0, exclude=[settings, params, packed, histogram, lane, own_laser, tile, mirror, patch]):
-                _gather_patch(settings, params, packed, histogram, lane, own_laser, tile, mirror, patch, share)
-            entry += lattice.stride
+        share = None if lattice is None else lattice.share(seen, entry)
+        if dr.hint(
+            share is None or share > 0,
+            exclude=[settings, params, packed, histogram, lane, own_laser, tile, mirror, patch],
+        ):
+            _gather_patch(settings, params, packed, histogram, lane, own_laser, tile, mirror, patch, share)
+        entry += stride
         patch += 1
 
 
@@ -205,19 +205,19 @@ def _gather_patch(
     if dr.hint(packed.has_clusters, mode="scalar"):
         is_cluster = rows[3].w > 0
 
-    # ---- Visibility ---------------------------------------------------------------------------------------------
+    # ---- Visibility -------------------------------------------------------------------------------------------------
     if dr.hint(mirror is not None, mode="scalar"):
         weight *= mirrored_share(built, mirror, sensor, point, mi.Vector3f(offset), active)
         active = dr.any(weight != 0)
     elif dr.hint(share is not None, mode="scalar"):
         weight *= share
     elif dr.hint(settings.needs_visibility, mode="scalar"):
-        # in front of the plane through the point that is looked at, not through the centre
+        # a mask holds in front of the tangent plane at the ray's end, not of the one at the patch's centre
         to_surface = from_sensor + shown
         mask = dr.select(dr.dot(areas, to_surface) < 0, dr.gather(mi.UInt64, packed.mask, patch), 0)
         active = is_visible(built, sensor, to_surface, mi.Vector3f(offset), active, mask, tile)
 
-    # ---- Reflect towards the lasers and deposit -----------------------------------------------------------------
+    # ---- Reflect towards the lasers and deposit ---------------------------------------------------------------------
     delays = PatchDelays.from_point(sensor.p, centre, (a, b, c), params.bins_per_unit)
     seen = _SeenPatch(patch, weight, is_cluster, to_patch - from_sensor, active)
     if dr.hint(settings.is_confocal, mode="scalar"):

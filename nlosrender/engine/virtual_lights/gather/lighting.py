@@ -281,6 +281,8 @@ def _lit_fraction(
     """
     weights: list[mi.Vector2f] = []
     chosen, share, total, lit = dr.zeros(RayEnds), mi.Spectrum(0), mi.Float(0), mi.Float(0)
+    is_cluster, is_one_sided = patches.is_cluster > 0, settings.is_diffuse & (patches.is_two_sided == 0)
+    origin = image_in(mirror, laser.p)
     for k in range(SHADOW_RAYS):
         index = patches.number * SHADOW_RAYS + k
         end = patches.ends(index)
@@ -290,9 +292,7 @@ def _lit_fraction(
             )
         else:
             seen = mirrored_share(built, mirror, laser, centre + end.point, end.offset, active)
-        to_end = centre + end.point - image_in(mirror, laser.p)
-        is_one_sided = settings.is_diffuse & (patches.is_two_sided == 0)
-        weight = facing(patches.is_cluster > 0, end.offset, to_end, is_one_sided)
+        weight = facing(is_cluster, end.offset, centre + end.point - origin, is_one_sided)
         total += weight
         share += weight * seen
         lit_weight = dr.select(dr.any(seen > 0), weight, 0)

@@ -1,9 +1,8 @@
 """Sensor lattice: visibility of patches from every n-th sensor point along rows and columns, bilinear in between.
 
-A shadow on the wall moves little from one sensor point to the next, so that rays from all of them would repeat what a
-few know. A node of the lattice sends rays to ``SHADOW_RAYS`` points of a patch, where a sensor point would send one:
-the share that is seen is less noisy, at fewer rays. Interpolation errs as the squared step; the pilot measures by how
-much: docs/virtual-lights.md, 5.8.
+The visibility of a patch changes slowly across the sensor grid, so that few sensor points, the nodes, need to trace
+shadow rays. There are so few that each may trace ``SHADOW_RAYS`` rays to a patch instead of one, for less noise. The
+interpolation error grows as the squared step; a pilot measures it: docs/virtual-lights.md, 5.8.
 """
 
 from __future__ import annotations
@@ -26,9 +25,9 @@ from nlosrender.engine.virtual_lights.refinement import Lattice
 from nlosrender.engine.virtual_lights.visibility.shadow_rays import is_visible
 from nlosrender.scene.build import BuiltScene
 
-# Visible share of a patch over what of it is lit; above 1 where what is lit faces the node more than the rest does.
+# Visible share of a patch over its lit share; above 1 where lit members of a cluster face the node more than others.
 MAX_SHARE = 2.0
-SHARES = 63  # that it is told by, over 1
+SHARES = 63  # quantisation of the share: steps from 0 to 1
 FRONT = 1 << 7  # bit of a node that lies in front of a patch, above its share
 CORNER_BITS = 8  # of a node in the number of a cell
 MAX_ENTRIES = 2**23  # pairs of cell and patch that are kept at once: 32 MB
@@ -47,7 +46,7 @@ class SensorLattice:
     n_cells: int
     stride: mi.UInt32  # ``n_cells``, opaque
     rays: int  # from each node to a patch
-    lanes_per_node: int  # that share the patches between them, so that the backend is busy
+    lanes_per_node: int  # each traces rays to every n-th patch: nodes alone are too few to occupy all threads
 
     @classmethod
     def of(
@@ -61,7 +60,7 @@ class SensorLattice:
         """Return the lattice of lanes with flat sensor indices and ``slices`` (lanes,).
 
         Nodes are every ``lattice.step``-th point of a row or column from the first one on, and the last one. ``lanes``
-        keep the backend busy.
+        occupy all threads.
         """
         grid, n_sensors = device.capture.sensor_grid, device.capture.n_sensors
         columns, across = _between_nodes(sensors % grid.nx, lattice.step, grid.nx)
@@ -111,7 +110,7 @@ class SensorLattice:
     def share(self, of_cells: mi.UInt32, entry: mi.UInt32) -> mi.Float:
         """Return the visible share of a patch's light, from ``entry`` of ``visibility``: bilinear.
 
-        Corners behind the patch do not count: what it turns away from says nothing about what hides it.
+        Corners behind a one-sided patch trace no rays: interpolation leaves them out.
         """
         bits, seen, front = dr.gather(mi.UInt32, of_cells, entry), mi.Float(0), mi.Float(0)
         for k, weight in enumerate(self.weights):
